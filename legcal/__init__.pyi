@@ -1,9 +1,6 @@
 from .calibration.camera_calibration.calibration import calibrate_camera as calibrate_camera
 from .calibration.evaluation import evaluate as evaluate
 from .calibration.examination import doctor as doctor
-from .calibration.fleet import FleetMachine as FleetMachine
-from .calibration.fleet import FleetOptions as FleetOptions
-from .calibration.fleet import calibrate_fleet as calibrate_fleet
 from .calibration.identify.identifiability import identifiability as identifiability
 from .calibration.location.document import Location as Location
 from .calibration.location.document import load_location as load_location

@@ -18,7 +18,6 @@ from legcal.calibration.documents import (
     Result,
 )
 from legcal.calibration.examination import ExaminationDocument
-from legcal.calibration.fleet import FleetDocument
 from legcal.calibration.identify.report import IdentifyDocument
 from legcal.calibration.location.document import LocationFile
 from legcal.calibration.measurement_noise.document import NoiseDocument
@@ -106,7 +105,6 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "result": Result,
     "check": CheckDocument,
     "evaluate": EvaluationDocument,
-    "fleet": FleetDocument,
     "detect": DetectionDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,

@@ -26,10 +26,10 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, joint_values, readings_at
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
+from legcal.machine.parameter_id import ARMS as ARM_KINDS
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
-    ARM_KINDS,
     geometries,
-    kind_of_parameter,
     moved_legs,
     parametrization_of,
     vector_of,
@@ -97,7 +97,7 @@ def test_an_arm_that_is_a_cylinder_is_a_line_of_the_first_rod_on_it(
     again = load_mechanism(write_model_with(machine, moved, home, tmp_path / "moved", {}))
     apart = vector_of(found, geometries(again), legs) - vector_of(found, moved, legs)
     np.testing.assert_allclose(apart, 0.0, atol=1e-12)
-    of_arms = [i for i, n in enumerate(found.names) if kind_of_parameter(n) in ARM_KINDS]
+    of_arms = [i for i, n in enumerate(found.names) if ParameterId.parse(n).kind in ARM_KINDS]
     assert len(of_arms) == 4 * len(arms)
     assert np.abs(vector_of(found, moved, legs)[of_arms]).min() > 1e-7
 

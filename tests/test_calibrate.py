@@ -522,7 +522,7 @@ def test_views_without_corners_are_named() -> None:
 def test_photographs_bring_the_platform_within_0_15_mm_and_0_03_deg(example_run: Run) -> None:
     """As much as the README and its evidence say, which processors change a little."""
     readme = (ROOT / "README.md").read_text()
-    evidence = (ROOT / "docs/accuracy.md").read_text()
+    evidence = (ROOT / "docs/evidence.md").read_text()
     number = r"\*{0,2}([\d.]+) (?:mm|deg)\*{0,2}"
     for label, model, limits, within in (
         ("nominal model", HEXAPOD / "models/hexapod.yaml", (5.0, 1.0), 0.01),

@@ -6,7 +6,6 @@ Python alone shows, and every kind and every fault of an image file.
 
 import re
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +32,7 @@ from legcal.errors import DatasetError, LegcalError, ModelError
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import image_size, inspect_image, read_image
+from legcal.vision.image_file import decode_image, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 
@@ -160,6 +159,17 @@ def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None
     )
 
 
+def test_a_standard_deviation_of_90_m_and_outlines_beside_axes_are_refused(folder: Folder) -> None:
+    folder.entry["encoder_sigma"] = 90
+    with pytest.raises(DatasetError, match=r"encoder_sigma.*90"):
+        load_dataset(folder.write())
+    folder.entry["encoder_sigma"] = 2e-6
+    for name in ("axes.csv", "observations.csv"):
+        (folder.path / name).write_text("view\n")
+    with pytest.raises(DatasetError, match=r"axes\.csv"):
+        load_dataset(folder.write())
+
+
 @pytest.mark.parametrize("name", ["none", "images", "images/c1_1.png"])
 def test_what_is_no_dataset_is_refused(folder: Folder, name: str) -> None:
     with pytest.raises(DatasetError, match="the dataset could not be read: found no"):
@@ -252,17 +262,29 @@ def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folde
             dataset.image_reader([row])(0)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="needs memory files")
-def test_an_image_is_decoded_once(folder: Folder) -> None:
+def test_an_image_is_decoded_once_until_its_file_changes(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = list[Path]()
+
+    def decode(path: Path, camera: Camera, where: str) -> object:
+        decoded.append(path)
+        return decode_image(path, camera, where)
+
+    monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
     read = load_dataset(folder.write()).image_reader([0, 1])
     first = [read(k) for k in (0, 1)]
-    for path in (folder.path / "images").iterdir():
-        path.unlink()
     again = [read(k) for k in (0, 1)]
+    assert len(decoded) == 2
     assert all(one.dtype == np.float32 for one in again)
     np.testing.assert_array_equal(again, first)
     again[0][:] = 0.0
     np.testing.assert_array_equal(read(0), first[0])
+    decoded[0].write_bytes(decoded[1].read_bytes())
+    np.testing.assert_array_equal(read(0), first[1])
+    decoded[0].unlink()
+    with pytest.raises(DatasetError, match="needed the file there"):
+        read(0)
 
 
 # --- image files

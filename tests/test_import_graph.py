@@ -55,6 +55,7 @@ PUBLIC: dict[str, set[str]] = {
         "model",
         "model_builder",
         "model_writer",
+        "parameter_id",
         "parameters",
         "redundancy",
         "rods",
@@ -94,6 +95,7 @@ PUBLIC: dict[str, set[str]] = {
         "photograph_notes",
         "reading_units",
         "readings_sheet",
+        "reasons",
     },
     "recordings": {"importing"},
     "estimation": {
@@ -112,7 +114,6 @@ PUBLIC: dict[str, set[str]] = {
         "board_poses",
         "camera_search",
         "candidate_pairs",
-        "detection",
         "diagnostics",
         "free_poses",
         "image_quality",
@@ -132,7 +133,6 @@ PUBLIC: dict[str, set[str]] = {
         "documents",
         "evaluation",
         "examination",
-        "fleet",
         "identify.identifiability",
         "identify.predicted_observations",
         "identify.report",
@@ -164,7 +164,6 @@ PUBLIC: dict[str, set[str]] = {
     "report": {
         "calibration",
         "doctor",
-        "fleet",
         "identify",
         "images",
         "machine",
@@ -185,7 +184,6 @@ PUBLIC: dict[str, set[str]] = {
 OUTSIDE = {
     "__main__",
     "brief",
-    "cluster",
     "errors",
     "figures",
     "option_fields",

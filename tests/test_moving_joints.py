@@ -223,7 +223,7 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     )
     dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
     wanted = (
-        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--prior"
+        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--set"
     )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)

@@ -4,6 +4,8 @@ import contextlib
 import dataclasses
 import io
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -132,11 +134,17 @@ def test_the_examples_of_the_page_on_python_print_what_it_says(
 ) -> None:
     page = (ROOT / "docs" / "python.md").read_text()
     (tmp_path / "calibrated").symlink_to(example_run.output)
+    for machine in ("east", "west"):
+        simulated(tmp_path / "machines" / machine, "3-rpr", level=Level.OUTLINES, poses=6)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL)
     assert len(examples) == page.count("```python")
     for code, expected in examples:
+        if "__main__" in code:  # a program, whose processes import it
+            (tmp_path / "program.py").write_text(code)
+            assert subprocess.check_output([sys.executable, "program.py"], text=True) == expected
+            continue
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(code, names)

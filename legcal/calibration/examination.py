@@ -35,6 +35,7 @@ from legcal.data.holdout import dataset_at
 from legcal.data.image_causes import by_cause, images_in_words
 from legcal.data.measurements import few, few_views, reading_columns, row_names
 from legcal.data.photograph_notes import GOOD_QUALITY, compressed, notes_on_photographs
+from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.files.schema import Document
 from legcal.geometry.types import Array
@@ -443,7 +444,9 @@ def _look_at_photographs(
     found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
     if blurs:
         found.checks["photographs"] += f", blurred by {_median(blurs):.1f} px"
-    for what in left_out_notes(m, defects, dict.fromkeys(defects, TAKE_AGAIN)):
+    for what in left_out_notes(
+        m, {r: str(why) for r, why in defects.items()}, dict.fromkeys(defects, TAKE_AGAIN)
+    ):
         found.add("photographs", "warning", what)
     for same in (own for own in pixels.values() if len(own) > 1):
         several = len({int(m.pose[row]) for row in same}) > 1
@@ -559,7 +562,7 @@ def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Dete
             found.add("legs", "note", what)
     for name, one in figures.items():
         if name not in seen.unplaced and one["legs_found"] < FEW_LEGS * one["legs_visible"]:
-            why = next(iter(one["rejected"]), "no reason given")
+            why = reason_in_words(next(iter(one["rejected"]), Reason.OTHER))
             found.add(
                 "legs",
                 "warning",

@@ -22,11 +22,12 @@ from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few
 from legcal.data.outlines import Outlines, no_outlines, through_cameras
 from legcal.data.photograph_notes import compression_note
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.motions import components
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
-from legcal.perception.diagnostics import NOTHING_LIKE, is_visible, reject_images
+from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -118,7 +119,7 @@ class _SearchNearFit:
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
         still = hardly_shown(outlines, self.seen.unlike)
-        outlines = reject_images(outlines, dict.fromkeys(still, NOTHING_LIKE))
+        outlines = reject_images(outlines, dict.fromkeys(still, Rejection(Reason.OTHER_SCENE)))
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)

@@ -49,6 +49,7 @@ from legcal.data.overrides import Override, overrides_of_call
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
+from legcal.machine.parameter_id import ParameterId
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
@@ -175,7 +176,6 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
-        *pool.notes,
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -299,7 +299,7 @@ def _estimate(
 
 
 def _unused_share(estimate: Estimate) -> float:
-    """Return which part of the outlines that should be measured was not used."""
+    """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 
@@ -403,7 +403,7 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     twists = {
         name: Prior(parameter.nominal, TWIST_SIGMA)
         for name, parameter in known.by_name.items()
-        if name.endswith(".twist")
+        if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)
         and name not in choices.fixed
     }
@@ -455,7 +455,8 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
         return []
     views = dataset.measurements.views
     names, cameras = [view.name for view in views], [view.camera for view in views]
-    chosen = {name.rsplit(".", 1)[0] for name in (*choices.free, *choices.priors, *choices.fixed)}
+    stated = (*choices.free, *choices.priors, *choices.fixed)
+    chosen = {ParameterId.parse(name).owner for name in stated}
     known = {*chosen, *stated_covariances(names, cameras)}
     owner_of = dict(zip(names, shared_cameras(names, cameras), strict=True))
     exact = {name: owner for name, owner in owner_of.items() if owner not in known}

@@ -184,7 +184,7 @@ def identify(
         bool,
         typer.Option(
             "--hand-held",
-            help="Every image of a view is taken from a place of its own; with --board and --view.",
+            help="Hand-held camera: a new pose for every image of a view; with --board and --view.",
         ),
     ] = False,
     page: PageOption = None,

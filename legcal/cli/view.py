@@ -11,7 +11,6 @@ import typer
 
 from legcal.cli.options import loading, print_table
 from legcal.errors import printable
-from legcal.signals import forget_stop
 
 
 def view(
@@ -58,7 +57,6 @@ def view(
         window.run()
     except KeyboardInterrupt:  # the way to end it
         window.close()
-        forget_stop()
 
 
 def _has_screen() -> bool:

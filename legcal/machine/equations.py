@@ -325,7 +325,7 @@ def _of_alike(
 
 
 def _back(moved: JointMotion | None, vectors: Array) -> Array:
-    """Return gradients (k, ..., 3) by what is fixed in the base by what is at reading 0."""
+    """Turn gradients (k, ..., 3) by moved points into gradients by the points at reading 0."""
     return vectors if moved is None else np.einsum("kij,k...i->k...j", moved.by_A, vectors)
 
 

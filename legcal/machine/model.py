@@ -92,7 +92,7 @@ class Machine:
 
     @cached_property
     def reads(self) -> tuple[int, ...]:
-        """The leg whose motor moves each leg: its own, or the first on the same actuator."""
+        """Index of the leg whose encoder reads each leg: rods on one motor share one."""
         return reading_legs(self.legs)
 
     @property

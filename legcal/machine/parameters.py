@@ -7,7 +7,7 @@ inside a platform of several bodies, and twists where asked.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -28,9 +28,9 @@ from legcal.machine.leg import (
     with_platform_points,
 )
 from legcal.machine.model import Machine
+from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.rods import actuators_of, internal_joints_of
 
-ARM_KINDS = ("arm_axis", "arm_point")  # of parameters: the line of an arm
 _STEP = 1e-6  # [m or rad], of numerical derivatives
 # Of LegColumns, in this order
 _BLOCKS = (
@@ -38,7 +38,6 @@ _BLOCKS = (
     *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # of its actuator
     *((21, 22), (23, 24)),  # of the joint that carries B in the platform
 )
-_COORDINATES = ("x", "y", "z", "1", "2")  # of what is more than one number
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
@@ -115,17 +114,6 @@ def parametrize(
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
 
 
-def kind_of_parameter(name: str) -> str:
-    """Return what a parameter is, the name of its leg or motor (which may have dots) left out."""
-    parts = name.split(".")
-    return parts[-2] if len(parts) > 2 and parts[-1] in _COORDINATES else parts[-1]
-
-
-def owner_of_parameter(name: str, owners: Iterable[str]) -> str:
-    """Return which of some legs, or views, a parameter is of; "" if none. Names may have dots."""
-    return max((owner for owner in owners if name.startswith(f"{owner}.")), key=len, default="")
-
-
 def _local_name(leg: Leg, column: int) -> str:
     """Return the name of one of a leg's own numbers."""
     is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
@@ -165,7 +153,7 @@ def is_held_by_default(name: str) -> bool:
 
     That of an arm which is seen is estimated about where the model draws it.
     """
-    return kind_of_parameter(name) in ("twist", "gain", *ARM_KINDS)
+    return ParameterId.parse(name).kind in ("twist", "gain", *ARMS)
 
 
 def parametrization_of(machine: Machine, *, twists: bool = False) -> Parametrization:

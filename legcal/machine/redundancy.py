@@ -87,7 +87,7 @@ class Contradiction:
     allowed: float  # how far that of the first may be if readings agree [m]
 
     def in_words(self, machine: Machine) -> str:
-        """Return what is found, and what was needed."""
+        """Describe how far the redundant readings disagree, and how far they may."""
         legs = [machine.legs[j] for j in self.legs]
         first, *others = [leg.motor_label for leg in legs]
         also = zip(others, self.distances[1:], strict=True)

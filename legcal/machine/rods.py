@@ -169,7 +169,7 @@ def ends_in_base(
 
 
 def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
-    """Return whose reading each leg has: its own, or of rods on one actuator that of the first."""
+    """Return the index of the leg whose encoder reads each leg: rods on one motor share one."""
     first: dict[str | None, int] = {}
     return tuple(
         j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)

@@ -181,7 +181,7 @@ def plan(
             found = plan_session(task, report, stop, run)
         else:
             found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *counted, *_to_come(shot), *run.notes))
+        return replace(found, notes=(*found.notes, *counted, *_to_come(shot)))
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:

@@ -202,7 +202,7 @@ def _remedies(report: Identifiability) -> Table:
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
-    """Return what follows."""
+    """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in report.full.weak)
     determined = f"the joint fit determines {report.full.rank} of {report.full.of} parameters"
     lines: list[str | RenderableType] = []
@@ -214,7 +214,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         if report.scale:
             lines.append(
                 "But for the scale: calibrate refuses this machine until a length or radii are "
-                "stated (--length, --prior), or a board is seen."
+                "stated (--length, --set), or a board is seen."
             )
     else:
         lines.append(Text(f"NOT identifiable: {determined}.", style="bold"))

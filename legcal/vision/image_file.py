@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.cluster import file_of_task
 from legcal.errors import DatasetError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
@@ -243,12 +242,11 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
 
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
-    sent = file_of_task(path)
-    if sent is None and not os.path.isfile(path):
+    if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
         return b"", _problem(path, where, found, _COMPLETE, "correct the path or remove the row")
     try:
-        content = read_bytes(path, MAX_IMAGE) if sent is None else sent
+        content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")

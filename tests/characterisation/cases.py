@@ -211,11 +211,11 @@ def _calibrate() -> Iterable[Case]:
     yield case("literal-hexapod", "--criteria literal", "hexapod-axes", slow=True)
     yield case("points", "--criteria literal --transformation points", system=True)
     yield case("cross-product", "--criteria default --transformation cross_product", system=True)
-    prior = "--prior leg1.offset=231+-0.5mm --prior '*.radius.leg2_rod=8±0.1mm'"
-    yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.23075 --free 'c1.f?'")
-    yield case("contradicted", "--fix 'leg2.base.*'", "hexapod-outlines")
-    yield case("patterns", "--prior '*.base.?=0.3+-1' --free '*.radius.*'")
-    yield case("twists", "--free '*.twist'", "3-upu-axes", slow=True)
+    prior = "--set leg1.offset=231+-0.5mm --set '*.radius.leg2_rod=8±0.1mm'"
+    yield case("by-name", f"{prior} --set leg2.offset --set leg3.offset=0.23075 --set 'c1.f?=free'")
+    yield case("contradicted", "--set 'leg2.base.*'", "hexapod-outlines")
+    yield case("patterns", "--set '*.base.?=0.3+-1' --set '*.radius.*=free'")
+    yield case("twists", "--set '*.twist=free'", "3-upu-axes", slow=True)
     yield case("holdout", "--holdout 0.25")
     yield Case(
         "calibrate-text",

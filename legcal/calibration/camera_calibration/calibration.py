@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -218,7 +218,8 @@ def _search(board: Board, photographs: _Photographs, run: Run, progress: Report)
     """Return what every image shows of the board."""
     n, found = len(photographs.paths), list[SeenBoard]()
     progress(_STAGE, 0, n)
-    for seen in run(_CornerSearch(board, photographs), range(n)):
+    anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
+    for seen in run(_CornerSearch(board, anywhere), range(n)):
         found.append(seen)
         progress(_STAGE, len(found), n)
     return found

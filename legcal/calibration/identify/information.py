@@ -39,7 +39,8 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms, pose_equations
 from legcal.machine.leg import LegColumns
-from legcal.machine.parameters import ARM_KINDS, is_held_by_default, kind_of_parameter, parametrize
+from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.parameters import is_held_by_default, parametrize
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -154,7 +155,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     """Return what is known of the parameters of a session: fixed ones, and those with priors."""
     sigma: dict[int, float] = {}
     for i, name in enumerate(predicted.parametrization.names):
-        is_arm = kind_of_parameter(name) in ARM_KINDS  # :func:`prior_of_arms` knows of it
+        is_arm = ParameterId.parse(name).kind in ARMS  # :func:`prior_of_arms` knows of it
         if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
         elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):

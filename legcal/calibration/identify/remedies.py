@@ -151,7 +151,7 @@ class _Candidates:
         return marginal_rows(np.concatenate(by_view), np.arange(n_p))
 
     def analyses(self, size: int) -> list[Analysis]:
-        """Return what each view of so many legs says alone."""
+        """Analyse every possible view of *size* legs by itself."""
         if size not in self.of_size:
             views = self.windows(size)
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)

@@ -70,6 +70,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
 from legcal.machine.leg import Leg, radius_name
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import Parametrization, is_held_by_default
 from legcal.machine.rods import readings_of_rods
 from legcal.machine.ties import wholly_tied
@@ -533,11 +534,12 @@ def _intrinsics(
             covariance = known.covariance[np.ix_(at, at)]
             prior += GaussianPrior.of_covariance(numbers, known.mean[at], covariance)
         names += [own[k] for k in free]
-    keys = tuple(dict.fromkeys(name.rsplit(".", 1)[1] for name in names))
+    numbers_of = [ParameterId.parse(name) for name in names]
+    keys = tuple(dict.fromkeys(number.kind for number in numbers_of))
     number = {name: i for i, name in enumerate(names)}
     index = [[number.get(f"{owner}.{key}", -1) for key in keys] for owner in owners]
     unknown = np.array(index, dtype=np.intp).reshape(len(views), len(keys))
-    where = [(views.index(view), key) for view, key in (name.rsplit(".", 1) for name in names)]
+    where = [(views.index(number.owner), number.kind) for number in numbers_of]
     block = Variables(
         "cameras",
         unknown,

@@ -40,6 +40,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data.measurements import few
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
@@ -441,7 +442,7 @@ class Changes:
 
     @classmethod
     def of(cls, before: Fit, after: Fit) -> Changes:
-        """Return what lies between two fits to the same outlines."""
+        """Compare two successive fits to the same outlines."""
         n_changed = int(np.sum(after.accepted != before.accepted))
         return cls(_sizes(before), _sizes(after), n_changed, int(after.accepted.sum()))
 
@@ -494,25 +495,24 @@ def check_convergence(
             "outlines that are wrong."
         )
     return (
-        "The errors of the outlines have not quite converged, which leaves the uncertainty of the "
-        f"result that uncertain: {found}.",
+        "The noise of the outlines has not converged; the stated uncertainty may be wrong: "
+        f"{found}.",
     )
 
 
-DISAGREES = "disagrees with the fit"  # the beginning of a reason
 _ON_EDGE_PX = 1.5  # [px] at both ends
 _NEARER = 0.25  # of the distance from the outline that it was taken for
 
 
 def rejection_reasons(
     problem: FitProblem, state: State, rejected: IntArray, offsets: Array
-) -> list[str]:
+) -> list[Rejection]:
     """Return the reasons of rejection of outlines (m,): how far off, and which edge they lie on.
 
     *offsets* (n, 2) of all outlines are from where the fit puts them [px].
     """
     away = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
-    reasons = [f"{DISAGREES} by {distance:.1f} px" for distance in away.tolist()]
+    details = [f"{distance:.1f} px" for distance in away.tolist()]
     o, names = problem.outlines, problem.legs.names
     part = np.repeat(np.arange(len(o.parts)), len(EPSILON))
     edges = [
@@ -532,5 +532,5 @@ def rejection_reasons(
     for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
         if distances[nearest] < min(_ON_EDGE_PX, _NEARER * away[i]):
-            reasons[i] += f", lies on {edges[nearest]}"
-    return reasons
+            details[i] += f", lies on {edges[nearest]}"
+    return [Rejection(Reason.DISAGREES, detail) for detail in details]

@@ -23,7 +23,7 @@ from legcal.files.schema import Document
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg
-from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.diagnostics import is_out_of_sight
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import angles_of_direction
 
@@ -238,10 +238,7 @@ def leg_orientations(
         axes = axes_from_outlines(outlines, measurements, radii)
     except NotVisible:
         axes = None
-    shown = np.array(
-        [reason != OUTSIDE and not reason.startswith(HIDDEN) for reason in outlines.reason],
-        dtype=np.bool_,
-    )
+    shown = ~is_out_of_sight(outlines)
     found = []
     for group in repeats:
         camera = measurements.views[group.view].camera
