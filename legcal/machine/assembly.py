@@ -249,7 +249,7 @@ class _ClosingEquations:
         self.B = np.array([leg.B for leg in legs])
         lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
         spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
-        self.size = max(spread, 1e-3, *lengths)
+        self.size = max([spread, *lengths]) or 1.0
         turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
         self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
 
@@ -434,7 +434,9 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         low, high = (scale * end for end in actuator.travel)
         where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
         needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
-        outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
+        outside = [
+            max(low - scale * q, scale * q - high) > 1e-5 * (high - low) for q in (chosen, other)
+        ]
         if outside[0]:
             problems.append(
                 f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "

@@ -12,8 +12,9 @@ from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, internal_coordinates, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve
 
-POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
-AXIS_TOLERANCE = 2e-3  # [m, rad]: what axes may be off; no other posture of a leg is as near
+# Mean leg lengths and [rad]
+POSE_TOLERANCE = 2.5e-11, 1e-11  # of a pose at which the chain is closed
+AXIS_TOLERANCE = 5e-3, 2e-3  # what axes may be off; no other posture of a leg is as near
 RESTARTS = 60
 
 
@@ -25,7 +26,7 @@ def close_at(
     *,
     exact: bool = True,
 ) -> Array:
-    """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
+    """Return the configuration (nq,) that closes every loop with the platform at a pose.
 
     Sliders, and motors on which rods hang, are set from the pose, so that no leg is ever flipped;
     other joint angles are solved from ``start``, and from seeded random ones for legs that do not
@@ -46,35 +47,35 @@ def close_at(
     set_first = slider_columns(machine, range(machine.n_legs))[1]
     set_first += [chain.v_index(joint.joint) for joint in machine.internal_joints]
     angles[set_first] = False
-    # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
-    # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
-    metre = min(1.0, leg_scale(machine, T_base_platform))
-    configuration = _placed(machine, T_base_platform, start, tolerance)
+    # Gaps of legs count in leg lengths beside angles in radians.
+    metre = leg_scale(machine, T_base_platform)
+    configuration = _placed(machine, T_base_platform, start, tolerance, metre)
     rng = np.random.default_rng(20020701)
     for _ in range(restarts):
         equations, retract = closure_equations(machine, T_base_platform, metre, angles)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration = found.points[0]
-        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE
+        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE[1]
         if not stuck.any():
             break
         columns = np.zeros(chain.nv, dtype=np.bool_)
         columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
         step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
         configuration = chain.integrate(configuration, step)
-    everything = closure_equations(machine, T_base_platform, 1.0, angles)
+    everything = closure_equations(machine, T_base_platform, metre, angles)
     left = everything[0](configuration[None])[0][0]
     if np.abs(left).max(initial=0.0) >= CLOSED:
         angles[set_first] = True
         pose = T_base_platform if exact else None
         every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = closure_equations(machine, pose, 1.0, every)
+        equations, retract = closure_equations(machine, pose, metre, every)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration, left = found.points[0], found.values[0]
     off = _off(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
-        problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
-    elif max(off) > tolerance:
+        gap = worst_closure(machine, metre * left)
+        problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
+    elif off[0] > metre * tolerance[0] or off[1] > tolerance[1]:
         problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:
         return configuration
@@ -93,7 +94,11 @@ def worst_closure(machine: Machine, residual: Array) -> str:
 
 
 def _placed(
-    machine: Machine, T_base_platform: RigidTransform, start: Array | None, tolerance: float
+    machine: Machine,
+    T_base_platform: RigidTransform,
+    start: Array | None,
+    tolerance: tuple[float, float],
+    metre: float,
 ) -> Array:
     """Return a configuration with the platform and the sliders set."""
     chain = machine.chain
@@ -107,7 +112,7 @@ def _placed(
             T_base_platform,
         )
         off = _off(machine, T_base_platform, configuration)
-        if max(off) > tolerance:
+        if off[0] > metre * tolerance[0] or off[1] > tolerance[1]:
             raise _not_closed(
                 machine,
                 T_base_platform,

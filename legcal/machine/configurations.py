@@ -42,7 +42,7 @@ WALK = 6  # steps of a random walk between two configurations
 ON_THE_CHAIN = 7  # draws of eight, where following is quick
 MAX_FAILED = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
-TRAVEL_TOLERANCE = 1e-12  # [m]
+TRAVEL_TOLERANCE = 1e-11  # of the larger limit
 WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are reported
 WORKSPACE_SEED = 20020721
 
@@ -304,7 +304,8 @@ def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
 def _outside(machine: Machine, values: Array) -> BoolArray:
     """Return the same for joint values (..., n_legs)."""
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    outside = (values < lower - TRAVEL_TOLERANCE) | (values > upper + TRAVEL_TOLERANCE)
+    slack = TRAVEL_TOLERANCE * np.maximum(np.abs(lower), np.abs(upper))
+    outside = (values < lower - slack) | (values > upper + slack)
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 
@@ -332,7 +333,7 @@ def random_postures_of_legs(
     start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
     drive = _Drive(legs, frame_legs, start.R, start.t)
     at_home = drive.values(start.R, start.t)[0]
-    slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
+    slack = 2.5e-6 * drive.lengths(start.R, start.t).mean() + 0.05 * (travel[:, 1] - travel[:, 0])
     low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
     high = np.maximum(travel[:, 1], at_home) + slack
     found = start.R[:0], start.t[:0], drive.moving(start.R, start.t, None)[:0]

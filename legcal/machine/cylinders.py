@@ -19,7 +19,7 @@ from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.urdf import Urdf, origins_of, parse_robot
 
 PARALLEL = 1e-6
-COAXIAL = 1e-4  # [m], at both ends of a cylinder
+COAXIAL = 3e-4  # of the length of a cylinder, at both of its ends
 
 Half = tuple[Literal["base", "platform"], Array, Array]
 
@@ -68,7 +68,7 @@ def with_arms(
             for cylinder in shown
             if bodies.body_of[cylinder.link] == chain.bodies[0]
         ]
-        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > COAXIAL]
+        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > COAXIAL * arm.length]
         longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
         arms[actuator.joint] = replace(actuator, arm=longest)
     return tuple(
@@ -82,7 +82,7 @@ def with_arms(
 def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str) -> Arm:
     """Return a cylinder with ends (2, 3) as an arm, from the axis of its motor outwards."""
     near, far = _from_axis(ends, actuator)
-    first, last = ends if near <= far + COAXIAL else ends[::-1]
+    first, last = ends if near <= far + COAXIAL * cylinder.length else ends[::-1]
     line = Line(0.5 * (first + last), (last - first) / cylinder.length)
     return Arm(line, cylinder.length, cylinder.radius, cylinder.link, leg)
 
@@ -131,7 +131,7 @@ def _along(
         side, origin, u = halves[bodies.body_of[cylinder.link]]
         ends = _ends(cylinder, bodies) - origin
         along = ends @ u
-        if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL:
+        if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL * cylinder.length:
             start, end = sorted(float(x) for x in along)
             found.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
     return tuple(found)
@@ -178,7 +178,7 @@ def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) ->
                 offset = matrix_applied(chain.poses[k], _ends(cylinder, bodies)) - centre
                 height = float((offset @ normal).mean())
                 beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
-                if np.linalg.norm(beside, axis=1).max() < COAXIAL:
+                if np.linalg.norm(beside, axis=1).max() < COAXIAL * cylinder.length:
                     found.append((cylinder.length, height))
     if not found:
         return chain

@@ -821,19 +821,21 @@ def _impossible_legs(described: Description) -> list[str]:
     ]
     # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
+    every = [*(leg.A_base for leg in legs), *(leg.B_platform for leg in legs)]
+    extent = float(np.ptp(every, axis=0).max())
     for j, one in enumerate(legs):
         for two in legs[j + 1 :]:
             gap = max(
                 float(np.linalg.norm(one.A_base - two.A_base)),
                 float(np.linalg.norm(one.B_platform - two.B_platform)),
             )
-            if gap < 1e-6:
+            if gap < 1e-6 * extent:
                 problems.append(
                     f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
                     "found both between the same two points, needed different joints; correct "
                     "their rows."
                 )
-    if any(float(np.ptp([getattr(leg, s) for leg in legs], axis=0).max()) < 1e-6 for s in
+    if any(float(np.ptp([getattr(leg, s) for leg in legs], axis=0).max()) <= 1e-6 * extent for s in
            ("A_base", "B_platform")):  # fmt: skip
         problems.append(
             f"{described.source}: the joints could not be used: found all of one side in one "

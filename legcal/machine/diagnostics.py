@@ -8,7 +8,7 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.ties import ties_in_words
 
-_AT_MIDDLE = 1e-6  # [m, rad]
+_AT_MIDDLE = 1e-5  # of the travel
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
@@ -17,7 +17,10 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
     notes = []
     q = readings_at(machine, machine.home)
     if not home_is_given:
-        away = [q[j] - 0.5 * sum(machine.legs[j].travel) for j in machine.motors]
+        away = [
+            (q[j] - 0.5 * sum(machine.legs[j].travel)) / np.ptp(machine.legs[j].travel)
+            for j in machine.motors
+        ]
         middle = "with all legs at mid-travel"
         if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
             middle = "with all motors as near mid-travel as they are together"

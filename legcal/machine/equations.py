@@ -508,7 +508,7 @@ _WORDS = {
     EquationKind.TWIST: "twisted at its end",
     EquationKind.PLANE: "out of its plane",
 }
-_TOLERANCE = 1e-9  # [m]
+_TOLERANCE = 2.5e-9  # mean leg lengths
 
 
 def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
@@ -522,17 +522,18 @@ def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -
 def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> str | None:
     """Return which constraint a pose does not meet, in words; None where it meets all.
 
-    A residual counts as zero up to a nanometre, or up to that of the machine at home where
-    its axes are a little off (they may be, by up to a milliradian).
+    A residual counts as zero up to rounding, or up to that of the machine at home where its axes
+    are a little off (they may be, by up to a milliradian).
     """
     if not is_constrained(machine):
         return None
     here = constraints_at(machine, T_base_platform)
     worst = np.abs(here.values).max()
-    if worst <= _TOLERANCE:
+    least = _TOLERANCE * machine.size
+    if worst <= least:
         return None
     at_home = np.abs(constraints_at(machine, machine.home).values).max()
-    if worst <= _TOLERANCE + 10.0 * at_home:
+    if worst <= least + 10.0 * at_home:
         return None
     return describe_worst(machine, here, "would be")
 

@@ -8,7 +8,7 @@ of frames that coincide. Without a block ``legcal`` the tree is closed near wher
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,11 +57,11 @@ _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
-CLOSED = 1e-10  # [m] and [rad]
+CLOSED = 1e-10  # of the size of the machine, and [rad]
 _OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
 _RIGID = 1e-3  # determinants of rotations but for rounding
-_SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
-_MAX_STEP = 0.3  # step [rad, m]
+_SPREAD = 0.1, 0.2  # of the start of a trial, times its number: [rad], sizes of the machine
+_MAX_STEP = 0.3  # step: [rad], half sizes of the machine
 
 _NO_BLOCK = (
     ("legcal.home could not be used", "the pose that the file draws could not be used"),
@@ -421,25 +421,25 @@ def completed(source: Source) -> Source:
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
-    found = closed_near(chain, start, source.urdf.links)
-    configuration = start if found is None else found
     urdf = source.urdf
+    loops = _Loops.drawn(chain, start, urdf.links)
+    found = loops.closed_near(start, urdf.links)
+    configuration = start if found is None else found
     sliders = sliders_without_travel(urdf)
-    off = _off(chain, start)
+    off = loops.off(start)
     if sliders and found is not None and off > CLOSED:
-        configuration = found = _levelled(chain, found, source, closures)
+        configuration = found = _levelled(loops, found, source, closures)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
     if found is None:
         return source
-    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
-    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN * size)
+    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN)
 
 
 def _levelled(
-    chain: ClosedChain, configuration: Array, source: Source, closures: Sequence[Closure]
+    loops: "_Loops", configuration: Array, source: Source, closures: Sequence[Closure]
 ) -> Array:
     """Return a closed configuration with the platform level, the given one where it cannot be.
 
@@ -461,15 +461,15 @@ def _levelled(
             (block.platform, [leg.B_platform for leg in chains]),
         )
     )
-    level = RigidTransform.from_rotation(level_rotation(A, B))
+    level, chain = RigidTransform.from_rotation(level_rotation(A, B)), loops.chain
 
     def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
+        residual, jacobian = loops.linearize(points[0])
         turned, by_joints = chain.welded(block.base, block.platform, level)
         rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
         return rows[0][None], rows[1][None]
 
-    found = _solved(chain, equations, configuration)
+    found = loops.solved(equations, configuration)
     if found is None:
         return configuration
     sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
@@ -478,33 +478,94 @@ def _levelled(
     for _ in range(STEPS):
         free = null_space(equations(found[None])[1][0], rcond=1e-9)
         step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
-        step *= min(1.0, _MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
-        nearer = _solved(chain, equations, chain.integrate(found, step))
+        nearer = loops.solved(equations, chain.integrate(found, loops.shortened(step)))
         if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
             break
         found = nearer
     return found
 
 
-def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
-    """Return a closed configuration near a given one, or None where none was found.
+@dataclass(frozen=True, eq=False)
+class _Loops:
+    """A chain whose gaps and steps count in sizes of the machine beside [rad]."""
 
-    Among those that several starts lead to, the one with the smallest rotations of links.
-    """
-    if _off(chain, start) <= CLOSED:
-        return start
-    rng = np.random.default_rng(1965)
-    best: tuple[float, Array] | None = None
-    drawn = chain.turns(start, links[0], links)
-    for trial in range(TRIALS):
-        away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
-        found = _close(chain, away)
-        if found is None:
-            continue
-        turned = _turned(drawn, chain.turns(found, links[0], links))
-        if best is None or turned < best[0] - 1e-6:
-            best = turned, found
-    return None if best is None else best[1]
+    chain: ClosedChain
+    size: float  # of the machine [m]
+
+    @classmethod
+    def drawn(cls, chain: ClosedChain, configuration: Array, links: Sequence[str]) -> "_Loops":
+        """Return the loops of a machine that is as large as it is drawn."""
+        places = [chain.pose(configuration, links[0], link).translation for link in links]
+        return cls(chain, float(np.ptp(places, axis=0).max()) or 1.0)
+
+    def weights(self) -> Array:
+        """Return what divides the residuals of the closures, (n_rows,)."""
+        found, row = np.ones(self.chain.n_rows), 0
+        for closure in self.chain.closures:
+            found[row : row + 3] = 1.0 / self.size
+            row += closure.rows
+        return found
+
+    def linearize(self, configuration: Array) -> tuple[Array, Array]:
+        """Return the residual (n_rows,) and its Jacobian (n_rows, nv)."""
+        residual, jacobian = self.chain.linearize(configuration)
+        return self.weights() * residual, self.weights()[:, None] * jacobian
+
+    def off(self, configuration: Array) -> float:
+        """Return how far the loops are from closed."""
+        residual = self.weights() * self.chain.residual(configuration)
+        return float(np.abs(residual).max()) if len(residual) else 0.0
+
+    def unit(self, of_angles: float, of_lengths: float) -> Array:
+        """Return a number [rad] and one of sizes [m] for each tangent coordinate, (nv,)."""
+        found = np.full(self.chain.nv, of_lengths * self.size)
+        found[self.chain.rotation_columns()] = of_angles
+        return found
+
+    def shortened(self, step: Array) -> Array:
+        """Return a step that is not too long."""
+        length = float(np.abs(step / self.unit(1.0, 2.0)).max(initial=0.0))
+        return step * min(1.0, _MAX_STEP / max(length, 1e-300))
+
+    def closed_near(self, start: Array, links: Sequence[str]) -> Array | None:
+        """Return a closed configuration near a given one, or None where none was found.
+
+        Among those that several starts lead to, the one with the smallest rotations of links.
+        """
+        if self.off(start) <= CLOSED:
+            return start
+        rng, chain = np.random.default_rng(1965), self.chain
+        best: tuple[float, Array] | None = None
+        drawn = chain.turns(start, links[0], links)
+        for trial in range(TRIALS):
+            away = self.unit(*_SPREAD) * trial * rng.normal(size=chain.nv)
+            found = self.closed(chain.integrate(start, away))
+            if found is None:
+                continue
+            turned = _turned(drawn, chain.turns(found, links[0], links))
+            if best is None or turned < best[0] - 1e-6:
+                best = turned, found
+        return None if best is None else best[1]
+
+    def closed(self, configuration: Array) -> Array | None:
+        """Close the loops near a configuration, or return None."""
+
+        def equations(points: Array) -> tuple[Array, Array]:
+            residual, jacobian = self.linearize(points[0])
+            return residual[None], jacobian[None]
+
+        return self.solved(equations, configuration)
+
+    def solved(self, equations: Equations, configuration: Array) -> Array | None:
+        """Return the configuration near a given one where equations hold, or None."""
+
+        def retract(points: Array, step: Array) -> Array:
+            return self.chain.integrate(points[0], self.shortened(step[0]))[None]
+
+        found = solve(
+            equations, retract, configuration[None], tolerance=CLOSED, damped=True, steps=STEPS
+        )
+        return found.points[0] if found.worst[0] <= CLOSED else None
 
 
 def _turned(before: Array, after: Array) -> float:
@@ -513,35 +574,6 @@ def _turned(before: Array, after: Array) -> float:
     if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # rounded away, or not finite
         return math.inf
     return float(Rotation.from_matrix(apart).magnitude().sum())
-
-
-def _close(chain: ClosedChain, configuration: Array) -> Array | None:
-    """Close the loops near a configuration, or return None."""
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        return residual[None], jacobian[None]
-
-    return _solved(chain, equations, configuration)
-
-
-def _solved(chain: ClosedChain, equations: Equations, configuration: Array) -> Array | None:
-    """Return the configuration near a given one where equations hold, or None."""
-
-    def retract(points: Array, step: Array) -> Array:
-        step = step[0] * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))
-        return chain.integrate(points[0], step)[None]
-
-    found = solve(
-        equations, retract, configuration[None], tolerance=CLOSED, damped=True, steps=STEPS
-    )
-    return found.points[0] if found.worst[0] <= CLOSED else None
-
-
-def _off(chain: ClosedChain, configuration: Array) -> float:
-    """Return how far the loops are from closed."""
-    residual = chain.residual(configuration)
-    return float(np.abs(residual).max()) if len(residual) else 0.0
 
 
 def _with_travel(

@@ -38,6 +38,7 @@ MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
 _FAR, _DEPENDENT = 0.1, 1e-7  # of a leg length, and of the largest singular value
+_CLOSED = 2.5e-9  # of a leg length
 _REGULAR = 1e-4  # singularity measure, beyond which motors hold the platform
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
@@ -210,12 +211,12 @@ def _at_readings(
         )
 
     found = solved(exact, poses)
-    holds = found.worst < 1e-9
+    holds = found.worst < _CLOSED * reach
     if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
         poses, n_dependent = _on_constraints(machine, found.points)
         found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
         singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
-        holds = (found.worst < 1e-9) & (singular > _REGULAR)
+        holds = (found.worst < _CLOSED * reach) & (singular > _REGULAR)
         holds &= [_in_travel(machine, pose) for pose in found.points]
     return [
         motion_of(pose[:, :3], pose[:, 3]) if held else None

@@ -59,7 +59,6 @@ from legcal.machine.leg import (
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
-    leg_scale,
     mobility,
     motor_rank,
 )
@@ -168,7 +167,7 @@ def _load(source: Source) -> Machine:
         pose, configuration = closed_home(machine, given)
     except (ModelError, DidNotConverge):
         missed = np.abs(constraints_at(machine, machine.home).values).max(initial=0.0)
-        if missed <= MAX_POSE_ERROR * leg_scale(machine, machine.home):
+        if missed <= MAX_POSE_ERROR * machine.size:
             _check_dependence(machine, closes=False)
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)
@@ -388,8 +387,8 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
                 )
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
-        scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
-        if all(inside) and abs(both[0] - both[1]) > scale:
+        least = 1e-5 * float(np.ptp(leg.travel))
+        if all(inside) and abs(both[0] - both[1]) > least:
             raise ModelError(
                 f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
                 f"rod reaches the platform at {said} of '{leg.actuator.joint}', both inside its "

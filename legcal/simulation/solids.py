@@ -302,14 +302,12 @@ def _leg_along(
     """Return the leg that has a visual of a link, at home, among its cylinders."""
     half = np.array([0.0, 0.0, 0.5 * shape.length])
     ends = T_base_shape.apply(np.stack([-half, half]))
-    vectors = vectors_A_to_B(machine, machine.home)
+    vectors, least = vectors_A_to_B(machine, machine.home), COAXIAL * shape.length
     A = machine.home.apply(machine.B_platform) - vectors
     u = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     for j, leg in enumerate(machine.legs):
-        has_it = any(
-            c.link == link and abs(c.radius - shape.radius) < COAXIAL for c in leg.cylinders
-        )
-        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * COAXIAL:
+        has_it = any(c.link == link and abs(c.radius - shape.radius) < least for c in leg.cylinders)
+        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * least:
             return j
     return None
 
