@@ -1,6 +1,6 @@
 """The whole path from a dataset to the result folder: recovery, invariance, verdict, refusals.
 
-What every command writes for every shipped machine is compared in characterisation/.
+What commands write for small sessions of all classes is compared in test_recorded_sessions.py.
 """
 
 import json
@@ -219,7 +219,7 @@ def test_a_leg_of_a_view_that_was_left_out_speaks_against_a_model(
     "model",
     [
         PLANAR,
-        *(  # the others' numbers from outlines are in tests/characterisation
+        *(  # the others' numbers from outlines are in test_recorded_sessions.py
             pytest.param(name, marks=pytest.mark.slow)
             for name in (
                 *("tricept", "3-upu", "3-spr", "3-rps", "3-upu-tilted", "6-sps", "hexapod-rod"),
@@ -522,7 +522,7 @@ def test_views_without_corners_are_named() -> None:
 def test_photographs_bring_the_platform_within_0_15_mm_and_0_03_deg(example_run: Run) -> None:
     """As much as the README and its evidence say, which processors change a little."""
     readme = (ROOT / "README.md").read_text()
-    evidence = (ROOT / "docs/accuracy.md").read_text()
+    evidence = (ROOT / "docs/evidence.md").read_text()
     number = r"\*{0,2}([\d.]+) (?:mm|deg)\*{0,2}"
     for label, model, limits, within in (
         ("nominal model", HEXAPOD / "models/hexapod.yaml", (5.0, 1.0), 0.01),

@@ -43,7 +43,6 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
@@ -51,6 +50,7 @@ from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.calibration.outlier_images import outlier_images
 from legcal.data.axes import axes_from_outlines
 from legcal.data.outlines import no_outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber
@@ -255,7 +255,7 @@ def _outlier_image() -> None:
     found = refine(session.legs, session.measurements, session.outlines, disturbed_start(session))
     o = found.outlines
     wrong = o.row == 1
-    reason = tuple(DISAGREES if out else "" for out in wrong.tolist())
+    reason = tuple(Rejection(Reason.DISAGREES) if out else USED for out in wrong.tolist())
     rejected = replace(found, outlines=replace(o, used=o.used & ~wrong, reason=reason))
     assert outlier_images(session.measurements, load_mechanism("hexapod"), rejected)
 

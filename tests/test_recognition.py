@@ -14,6 +14,7 @@ from thinned import thinned
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED
 from legcal.geometry.types import Array, Image
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import inverse_kinematics
@@ -631,7 +632,7 @@ def _outlines(search: Search, T: RigidTransform, A: Array, B: Array, noise: Arra
     ends = ends + noise[row, leg, edge][..., None] * normal[:, None]
     return Outlines(
         row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), ends,
-        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), ("",) * n,
+        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), (USED,) * n,
         ("detected",) * n,
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """Simulated datasets: of the spread that they claim, reproducible, whole or not there at all.
 
-What options of the command give and how wrong ones are refused is in tests/characterisation.
+What options of the command give and how wrong ones are refused is in tests/refusal_table.py.
 """
 
 import io
@@ -175,14 +175,13 @@ def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: 
     (view,) = load_dataset(one.folder).measurements.views
     assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
     console = Console(width=400, record=True, file=io.StringIO())
-    console.print(simulation_table(summary_document(one), repeated=True))
+    console.print(simulation_table(summary_document(one)))
     printed = console.export_text()
     assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
-    assert f"measure noise with: legcal noise {one.folder}\n" in printed
     assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
     document = summary_document(one)
     document["views"]["c1"]["legs"]["leg2"] = 0
-    console.print(simulation_table(document, repeated=True))
+    console.print(simulation_table(document))
     assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()
 
 

@@ -23,6 +23,7 @@ from legcal.data.axes import LegAxes
 from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
 from legcal.data.measurements import Measurements
+from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
@@ -69,7 +70,7 @@ class BoardViews:
             ],
             dtype=np.bool_,
         )  # fmt: skip
-        return corners.reject(wrong & corners.used, "disagrees with the fit")
+        return corners.reject(wrong & corners.used, Reason.DISAGREES)
 
     def poses_by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
         """Return T_x_board of the base's by each camera that shows it, x any frame."""

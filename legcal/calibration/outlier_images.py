@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements, few
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import Factor, Frames, Problem, Residuals, Variables, all_free
@@ -68,7 +68,7 @@ def outlier_images(
 ) -> dict[int, str]:
     """Return what is said of every outlier image that was fitted, by row, without its name."""
     o = solution.outlines
-    rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
+    rejected = o.rejected_for(Reason.DISAGREES)
     notes = {}
     for row in np.unique(o.row[rejected]).tolist():
         judged = np.flatnonzero((o.row == row) & (rejected | o.used))

@@ -47,15 +47,15 @@ def simulate(
     from legcal.simulation.dataset import summary_document
     from legcal.simulation.settings import requested
 
-    nominal = load_mechanism(model).require_rigid_platform()
+    nominal = load_mechanism(model)
     settings = requested(Request(**options), nominal)
     workers = image_workers(cluster)
     made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
-    document, repeated = summary_document(made), options["images"] > 1
+    document = summary_document(made)
     show(
         as_json,
         lambda: document,
-        lambda: simulation_table(document, repeated=repeated, to_measure=made.to_measure),
+        lambda: simulation_table(document, to_measure=made.to_measure),
     )
 
 

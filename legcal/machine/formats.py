@@ -8,7 +8,7 @@ of frames that coincide. Without a block ``legcal`` the tree is closed near wher
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,6 @@ from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
-    DRAWING,
     Loop,
     LoopKind,
     Source,
@@ -51,29 +50,18 @@ from legcal.machine.urdf import (
     parse_xml,
     read_urdf,
 )
+from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
 XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
-CLOSED = 1e-10  # of the size of the machine, and [rad]
+CLOSED = 1e-10  # [m] and [rad]
 _OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
 _RIGID = 1e-3  # determinants of rotations but for rounding
-_SPREAD = 0.1, 0.2  # of the start of a trial, times its number: [rad], sizes of the machine
-_MAX_STEP = 0.3  # step: [rad], half sizes of the machine
-
-_NO_BLOCK = (
-    ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "the file draws no closed pose"),
-    ("write legcal.home", "add a block legcal with home"),
-    ("correct legcal.home", "add a block legcal with another home"),
-    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
-    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
-    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
-    ("write legcal.base, legcal.platform and legcal.legs",
-     "add a block legcal with base, platform and legs"),
-)  # fmt: skip
+_SPREAD = 0.1  # [rad], and of the size of the machine: of the start of a trial, times its number
+_MAX_STEP = 0.3  # [rad], and of the size of the machine
 
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
@@ -81,7 +69,6 @@ KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
     "universal": "universal",
 }
-_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
 
 
 def read_source(model: str | Path) -> Source:
@@ -133,7 +120,7 @@ def read_yaml_source(path: Path) -> Source:
     )
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
+        return Source(path, file, urdf if block else replace(urdf, wording=NO_BLOCK))
     return _converted(path, file, urdf)
 
 
@@ -157,8 +144,9 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
                 "for another joint (joint_name), needed another joint of that leg; name its "
                 "prismatic joint."
             )
-    words = _NO_BLOCK if file.legcal is None else ()
-    return Source(path, file.model_copy(update=changes), completed, words=words)
+    wording = NO_BLOCK if file.legcal is None else BLOCK
+    completed = replace(completed, wording=wording)
+    return Source(path, file.model_copy(update=changes), completed)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -268,8 +256,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         type=[kind for _, kind in pairs],
         name_mot=motors,
     )
-    urdf = parse_urdf(path, written, travel_needed=False)
-    return Source(path, file, urdf, tuple(notes), words=_WORDS)
+    urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
+    return Source(path, file, urdf, tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
@@ -421,25 +409,38 @@ def completed(source: Source) -> Source:
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
-    urdf = source.urdf
-    loops = _Loops.drawn(chain, start, urdf.links)
-    found = loops.closed_near(start, urdf.links)
+    drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
+    unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
+    unit[chain.rotation_columns()] = 1.0
+    found = closed_near(chain, start, source.urdf.links, unit)
     configuration = start if found is None else found
+    urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    off = loops.off(start)
+    off = _off(chain, start)
     if sliders and found is not None and off > CLOSED:
-        configuration = found = _levelled(loops, found, source, closures)
+        configuration = found = _levelled(chain, found, source, closures, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
     if found is None:
         return source
-    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN)
+    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
+    drawn = {
+        name: float(configuration[chain.q_index(name)])
+        for name in source.file.name_mot
+        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
+    }
+    is_open = not sliders and off > _OPEN * size
+    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
 
 
 def _levelled(
-    loops: "_Loops", configuration: Array, source: Source, closures: Sequence[Closure]
+    chain: ClosedChain,
+    configuration: Array,
+    source: Source,
+    closures: Sequence[Closure],
+    unit: Array,
 ) -> Array:
     """Return a closed configuration with the platform level, the given one where it cannot be.
 
@@ -461,15 +462,15 @@ def _levelled(
             (block.platform, [leg.B_platform for leg in chains]),
         )
     )
-    level, chain = RigidTransform.from_rotation(level_rotation(A, B)), loops.chain
+    level = RigidTransform.from_rotation(level_rotation(A, B))
 
     def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = loops.linearize(points[0])
+        residual, jacobian = chain.linearize(points[0])
         turned, by_joints = chain.welded(block.base, block.platform, level)
         rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
         return rows[0][None], rows[1][None]
 
-    found = loops.solved(equations, configuration)
+    found = _solved(chain, equations, configuration, unit)
     if found is None:
         return configuration
     sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
@@ -478,94 +479,35 @@ def _levelled(
     for _ in range(STEPS):
         free = null_space(equations(found[None])[1][0], rcond=1e-9)
         step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
-        nearer = loops.solved(equations, chain.integrate(found, loops.shortened(step)))
+        nearer = _solved(chain, equations, chain.integrate(found, _shortened(step, unit)), unit)
         if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
             break
         found = nearer
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Loops:
-    """A chain whose gaps and steps count in sizes of the machine beside [rad]."""
+def closed_near(
+    chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
+) -> Array | None:
+    """Return a closed configuration near a given one, or None where none was found.
 
-    chain: ClosedChain
-    size: float  # of the machine [m]
-
-    @classmethod
-    def drawn(cls, chain: ClosedChain, configuration: Array, links: Sequence[str]) -> "_Loops":
-        """Return the loops of a machine that is as large as it is drawn."""
-        places = [chain.pose(configuration, links[0], link).translation for link in links]
-        return cls(chain, float(np.ptp(places, axis=0).max()) or 1.0)
-
-    def weights(self) -> Array:
-        """Return what divides the residuals of the closures, (n_rows,)."""
-        found, row = np.ones(self.chain.n_rows), 0
-        for closure in self.chain.closures:
-            found[row : row + 3] = 1.0 / self.size
-            row += closure.rows
-        return found
-
-    def linearize(self, configuration: Array) -> tuple[Array, Array]:
-        """Return the residual (n_rows,) and its Jacobian (n_rows, nv)."""
-        residual, jacobian = self.chain.linearize(configuration)
-        return self.weights() * residual, self.weights()[:, None] * jacobian
-
-    def off(self, configuration: Array) -> float:
-        """Return how far the loops are from closed."""
-        residual = self.weights() * self.chain.residual(configuration)
-        return float(np.abs(residual).max()) if len(residual) else 0.0
-
-    def unit(self, of_angles: float, of_lengths: float) -> Array:
-        """Return a number [rad] and one of sizes [m] for each tangent coordinate, (nv,)."""
-        found = np.full(self.chain.nv, of_lengths * self.size)
-        found[self.chain.rotation_columns()] = of_angles
-        return found
-
-    def shortened(self, step: Array) -> Array:
-        """Return a step that is not too long."""
-        length = float(np.abs(step / self.unit(1.0, 2.0)).max(initial=0.0))
-        return step * min(1.0, _MAX_STEP / max(length, 1e-300))
-
-    def closed_near(self, start: Array, links: Sequence[str]) -> Array | None:
-        """Return a closed configuration near a given one, or None where none was found.
-
-        Among those that several starts lead to, the one with the smallest rotations of links.
-        """
-        if self.off(start) <= CLOSED:
-            return start
-        rng, chain = np.random.default_rng(1965), self.chain
-        best: tuple[float, Array] | None = None
-        drawn = chain.turns(start, links[0], links)
-        for trial in range(TRIALS):
-            away = self.unit(*_SPREAD) * trial * rng.normal(size=chain.nv)
-            found = self.closed(chain.integrate(start, away))
-            if found is None:
-                continue
-            turned = _turned(drawn, chain.turns(found, links[0], links))
-            if best is None or turned < best[0] - 1e-6:
-                best = turned, found
-        return None if best is None else best[1]
-
-    def closed(self, configuration: Array) -> Array | None:
-        """Close the loops near a configuration, or return None."""
-
-        def equations(points: Array) -> tuple[Array, Array]:
-            residual, jacobian = self.linearize(points[0])
-            return residual[None], jacobian[None]
-
-        return self.solved(equations, configuration)
-
-    def solved(self, equations: Equations, configuration: Array) -> Array | None:
-        """Return the configuration near a given one where equations hold, or None."""
-
-        def retract(points: Array, step: Array) -> Array:
-            return self.chain.integrate(points[0], self.shortened(step[0]))[None]
-
-        found = solve(
-            equations, retract, configuration[None], tolerance=CLOSED, damped=True, steps=STEPS
-        )
-        return found.points[0] if found.worst[0] <= CLOSED else None
+    Among those that several starts lead to, the one with the smallest rotations of links. *unit*
+    (nv,) is the size of the machine [m], 1 for angles.
+    """
+    if _off(chain, start) <= CLOSED:
+        return start
+    rng = np.random.default_rng(1965)
+    best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
+    for trial in range(TRIALS):
+        away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
+        found = _close(chain, away, unit)
+        if found is None:
+            continue
+        turned = _turned(drawn, chain.turns(found, links[0], links))
+        if best is None or turned < best[0] - 1e-6:
+            best = turned, found
+    return None if best is None else best[1]
 
 
 def _turned(before: Array, after: Array) -> float:
@@ -574,6 +516,44 @@ def _turned(before: Array, after: Array) -> float:
     if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # rounded away, or not finite
         return math.inf
     return float(Rotation.from_matrix(apart).magnitude().sum())
+
+
+def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
+    """Close the loops near a configuration, or return None."""
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
+    return _solved(chain, equations, configuration, unit)
+
+
+def _shortened(step: Array, unit: Array) -> Array:
+    """Return a step (nv,), no longer than ``_MAX_STEP``."""
+    longest = float(np.abs(step / unit).max(initial=0.0))
+    return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
+
+
+def _solved(
+    chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
+) -> Array | None:
+    """Return the configuration near a given one where equations hold, or None."""
+    found = solve(
+        equations,
+        lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
+        configuration[None],
+        tolerance=CLOSED,
+        unit=unit,
+        damped=True,
+        steps=STEPS,
+    )
+    return found.points[0] if found.worst[0] <= CLOSED else None
+
+
+def _off(chain: ClosedChain, configuration: Array) -> float:
+    """Return how far the loops are from closed."""
+    residual = chain.residual(configuration)
+    return float(np.abs(residual).max()) if len(residual) else 0.0
 
 
 def _with_travel(
@@ -587,6 +567,6 @@ def _with_travel(
     names: Sequence[str] = list(readings)
     return replace(
         source,
-        urdf=parse_urdf(source.urdf.path, content),
+        urdf=replace(parse_urdf(source.urdf.path, content), wording=source.urdf.wording),
         notes=(*source.notes, travel_note(names, travel)),
     )

@@ -246,7 +246,7 @@ def check_closes(machine: Machine) -> None:
             f"{machine.yaml_path}: the mechanism does not close at home: found a pose "
             f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
             f"readings, needed at most {1e3 * CLOSES * machine.size:.0e} mm and "
-            f"{np.degrees(CLOSES):.0e} deg; check legcal.home."
+            f"{np.degrees(CLOSES):.0e} deg; check {machine.urdf.wording.home}."
         )
 
 

@@ -64,7 +64,7 @@ def _sliding(
     away = -(towards - (towards @ d) * d)
     if np.linalg.norm(away) < 1e-3:  # rods in line with it stand beside each other
         away = cross(d, A[-1] - A[0])
-    if np.linalg.norm(away) < 1e-5 * r:
+    if np.linalg.norm(away) < 1e-6:
         away = normal_basis(d)[0]
     y = away / np.linalg.norm(away)
     frame = np.column_stack([d, y, cross(d, y)])

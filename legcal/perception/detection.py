@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 
 from legcal.data.outlines import Outlines, join_outlines, no_outlines
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array
 from legcal.perception.outline import (
-    OUTSIDE,
     ImageSearch,
     Method,
     PartLines,
@@ -19,8 +19,6 @@ from legcal.perception.outline import (
 from legcal.perception.placement import Placement, Search, predict_legs_and_arms
 from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run, in_turn
-
-NOT_PLACED = "the camera of its view could not be placed"  # a reason
 
 
 def measure_outlines(
@@ -88,7 +86,7 @@ def _of_image(
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
-    why = NOT_PLACED if T is None else OUTSIDE
+    why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
     others = [PartLines(j, _longest(search, j), (why, why)) for j in wanted if j not in seen]
     return join_outlines([found, outline_table(one, others)]) if others else found, blur
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines, is_edited, join_outlines
+from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
 from legcal.estimation.problem import (
     Factor,
@@ -38,15 +39,14 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
-from legcal.perception.detection import NOT_PLACED, measure_outlines
-from legcal.perception.outline import OUTSIDE, Method, measure
+from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
-DISAGREES = "disagrees with the other legs of its view"  # a reason
 WINDOW_PX, WINDOW_SIGMAS, MAX_WINDOW_PX = 2.0, 3.0, 40.0  # around a fit
 CLEAR = 0.7  # of the evidence that an ambiguous pose must have, where edge pairs are clear
 
@@ -508,7 +508,7 @@ def refine_views(
     )
     placed = np.array([T is not None for T in placement.T_base_camera])
     unplaced_rows = ~placed[search.measurements.view[outlines.row]]
-    return placement, outlines.reject(unplaced_rows & ~is_edited(outlines), NOT_PLACED), fits
+    return placement, outlines.reject(unplaced_rows & ~is_edited(outlines), Reason.NOT_PLACED), fits
 
 
 def _fits(
@@ -563,7 +563,7 @@ def _without_outliers(
     if not wrong:
         return outlines, fits
     out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
-    outlines = outlines.reject(out, DISAGREES)
+    outlines = outlines.reject(out, Reason.VIEW_DISAGREES)
     return outlines, _fits(search, groups, placement, outlines, fits, {row for row, _ in wrong})
 
 
@@ -618,7 +618,7 @@ def group_name(names: Sequence[str]) -> str:
 def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:
     """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
     missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
-    visible = [not why.startswith((OUTSIDE, NOT_PLACED)) for why in outlines.reason]
+    visible = ~outlines.rejected_for(Reason.OUTSIDE, Reason.NOT_PLACED)
     missing[outlines.row[visible], outlines.leg[visible]] = True
     missing[outlines.row[outlines.used], outlines.leg[outlines.used]] = False
     window = np.full(missing.shape, np.nan)

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.calibration.detection import DETECTION_PAGE, Detection
+from legcal.data.reasons import reason_in_words
 from legcal.report.render import heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
@@ -88,7 +89,7 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
         for name, view in views.items()
     ]
     numbers = ("images", "legs found", "outlines used", *(key for key, _, _ in shown))
-    reasons = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
+    reasons = ", ".join(f"{n} {reason_in_words(why)}" for why, n in rejected.most_common())
     return report(
         heading(
             document["mechanism"],
@@ -105,9 +106,7 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
     )
 
 
-def simulation_table(
-    document: dict[str, Any], *, repeated: bool, to_measure: str = ""
-) -> RenderableType:
+def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
     """Return the document of ``simulate``: how many images of each view show each leg.
 
     *to_measure* is the distance that would fix the scale, where nothing in the dataset does.
@@ -120,7 +119,6 @@ def simulation_table(
         for name, view in views.items()
     ]
     folder = shlex.quote(document["dataset"])
-    is_noise = repeated and document["level"] == "photographs"
     return report(
         heading(
             document["mechanism"],
@@ -137,7 +135,7 @@ def simulation_table(
             Text(
                 "Readings of motors that turn carry no length, and nothing else in this dataset "
                 f"does: simulate with --length {to_measure}=0.05mm, or calibrate with --length "
-                "or --prior.",
+                "or --set.",
                 style="yellow",
             )
             if to_measure
@@ -150,7 +148,6 @@ def simulation_table(
                 f"the true model: {document['truth']}",
                 f"calibrate with: legcal calibrate {folder} -o OUT",
                 f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
-                *([f"measure noise with: legcal noise {folder}"] * is_noise),
             )
         ],
     )

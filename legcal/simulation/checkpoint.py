@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.files.reading import open_regular
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
 
@@ -44,8 +43,6 @@ def open_checkpoint(
     """Open the checkpoint of a study, or begin it."""
     with ExitStack() as files:
         try:
-            if os.path.lexists(path):
-                open_regular(path).close()
             writer = files.enter_context(open(path, "ab", buffering=0))
             reader = files.enter_context(open(path, "rb"))
         except OSError as error:
@@ -129,7 +126,7 @@ class Checkpoint:
         self._reader.seek(0)
         expected = json.loads(self._reader.readline())
         try:
-            file = open_regular(other)
+            file = other.open("rb")
         except OSError as error:
             raise UsageError(
                 f"{other}: the runs could not be merged: found '{error.strerror}', needed the "
@@ -164,7 +161,7 @@ def is_begun(path: Path) -> bool:
     """Return whether a file holds the first line of a checkpoint, or of something else."""
     if not path.is_file():
         return False
-    with open_regular(path) as file:
+    with path.open("rb") as file:
         return file.readline(_MOST_OF_LINE).endswith(b"\n")
 
 

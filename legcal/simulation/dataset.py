@@ -142,7 +142,6 @@ def simulate(
         whole_number("workers", workers, 1)
     check_dataset_destination(destination, force=force)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
-    nominal.require_rigid_platform()
     _check_readings(nominal, settings)
     rngs = streams(settings.seed)
     with shown_progress(progress) as report, dataset_folder(destination, force=force) as folder:

@@ -14,13 +14,12 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.files.reading import MAX_MESH, open_regular
 from legcal.geometry.lines import cross, distance_to_line
 from legcal.geometry.motions import matrix_product, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
-from legcal.machine.cylinders import COAXIAL
+from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
@@ -128,8 +127,6 @@ def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
 
     name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
-        if (path := _found(urdf_path, name)) is not None:
-            open_regular(path, MAX_MESH).close()
         scene: Any = URDF.load(
             io.BytesIO(_alone(visual)),
             filename_handler=lambda fname: str(_found(urdf_path, fname)),
@@ -302,12 +299,15 @@ def _leg_along(
     """Return the leg that has a visual of a link, at home, among its cylinders."""
     half = np.array([0.0, 0.0, 0.5 * shape.length])
     ends = T_base_shape.apply(np.stack([-half, half]))
-    vectors, least = vectors_A_to_B(machine, machine.home), COAXIAL * shape.length
+    vectors = vectors_A_to_B(machine, machine.home)
     A = machine.home.apply(machine.B_platform) - vectors
     u = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    within = coaxial_tolerance(machine.legs)
     for j, leg in enumerate(machine.legs):
-        has_it = any(c.link == link and abs(c.radius - shape.radius) < least for c in leg.cylinders)
-        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * least:
+        has_it = any(
+            c.link == link and abs(c.radius - shape.radius) < within for c in leg.cylinders
+        )
+        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * within:
             return j
     return None
 

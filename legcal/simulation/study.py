@@ -90,7 +90,6 @@ class StudyHeading(SparseDocument):
     seed: int
     runs: int
     failures: dict[str, int]  # runs that failed as a whole, by kind of error
-    notes: list[str] | None = None  # left out where there are none
     part: list[int] | None = None  # which part of how many; left out where the runs are all
 
 
@@ -105,7 +104,6 @@ class StudyResult:
     n_runs: int
     failures: dict[str, int]  # how many runs failed as a whole, by kind of error
     summary: Summary  # what the others found
-    notes: tuple[str, ...] = ()  # on workers that differ from each other
     part: tuple[int, int] | None = None  # which part of how many the runs are
 
     def document(self) -> dict[str, Any]:
@@ -116,7 +114,6 @@ class StudyResult:
             seed=self.seed,
             runs=self.n_runs,
             failures=self.failures,
-            notes=list(self.notes) or None,
             part=list(self.part) if self.part else None,
         )
         return self.summary.document() | heading.document()
@@ -175,7 +172,7 @@ def run_study(
     """
     _check_numbers(n_runs, seed, workers)
     runs = _runs_of_part(n_runs, part)
-    stage, notes = f"Study {study.name}", tuple[str, ...]()
+    stage = f"Study {study.name}"
     with shown_progress(progress) as report, _folder(output) as folder:
         path = folder / CHECKPOINT_NAME
         first = header(study.name, study.settings, seed)
@@ -196,8 +193,7 @@ def run_study(
                         checkpoint.append(lines)
                         done += len(lines)
                         report(stage, done, len(runs))
-                    notes = run.notes
-            result = replace(_result(study, seed, runs, checkpoint), notes=notes, part=part)
+            result = replace(_result(study, seed, runs, checkpoint), part=part)
         if output is not None:
             _write(result, folder, beside)
     return result

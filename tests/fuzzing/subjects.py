@@ -8,13 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from characterisation.inputs import MAKERS, made_input
+from made_inputs import MAKERS, made_input
 from photograph_files import exif, jpeg, tiff
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A file of an input of the characterisation, and a command that reads it.
+    """A file of a made input, and a command that reads it.
 
     ``command`` holds the words after ``legcal``; ``{in}`` is the folder with the damaged file,
     ``{out}`` a place where nothing is.
@@ -92,7 +92,7 @@ def _pictures(folder: Path) -> None:
     for name, suffix in (("c1_1", "tiff"), ("c2_1", "jpg")):
         picture = cv2.imread(str(folder / f"images/{name}.png"), cv2.IMREAD_UNCHANGED)
         assert picture is not None
-        content = tiff(picture) if suffix == "tiff" else jpeg(picture, 80, said, b"crs:HasCrop='1'")
+        content = tiff(picture) if suffix == "tiff" else jpeg(picture, 80, said)
         (folder / f"images/{name}.{suffix}").write_bytes(content)
         text = text.replace(f"{name}.png", f"{name}.{suffix}")
     (folder / "measurements.csv").write_text(text)

@@ -1,0 +1,1119 @@
+"""What must be refused: the input, the command, and what the message must name.
+
+Sentences may be put better; exit codes, kinds of errors and numbers of problems are recorded,
+and the leg, view, image, file, joint, key or number that is wrong has to be named. Nothing may
+be left behind.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from command_outcomes import run, words_of
+from made_inputs import JOINTS, copy_of
+
+Edit = Callable[[Path], None]
+GONE = object()  # of a key: take it out
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A command that must fail.
+
+    Parameters
+    ----------
+    name : str
+        Unique, of the case.
+    command : str
+        The words after ``legcal``; ``{in}`` is a spoiled copy of the input, ``{out}`` a new place.
+    named : tuple of str
+        What the message has to contain.
+    input : str
+        The input; an empty folder without it.
+    edits : tuple of callables
+        What spoils it.
+    """
+
+    name: str
+    command: str
+    named: tuple[str, ...]
+    input: str = ""
+    edits: tuple[Edit, ...] = ()
+
+    def observe(self, folder: Path) -> dict[str, Any]:
+        """Return how the command ends, what is said, and the files that have changed."""
+        spoiled = folder / "in"
+        if self.input:
+            copy_of(self.input, spoiled)
+        else:
+            spoiled.mkdir()
+        for edit in self.edits:
+            edit(spoiled)
+        before = _files(folder)
+        places: dict[str, Path | str] = {"in": spoiled, "out": folder / "out", "here": folder}
+        outcome = run([*words_of(self.command, places), "--json"], inside=folder)
+        assert outcome.code != 0, f"{self.name} was not refused: {outcome.out[:200]}"
+        after = _files(folder)
+        error = outcome.document["error"]
+        return {
+            "exit": outcome.code,
+            "kind": error["kind"],
+            "message": error["message"],
+            "problems": len(error["message"].splitlines()),
+            "changed": sorted(k for k in before | after if before.get(k) != after.get(k)),
+        }
+
+
+def _files(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): (
+            sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+        )
+        for path in folder.rglob("*")
+    }
+
+
+# --- ways to spoil an input ---------------------------------------------------------------------
+
+
+def text(name: str, content: str | bytes) -> Edit:
+    """Write a file."""
+    data = content if isinstance(content, bytes) else content.encode()
+
+    def edit(folder: Path) -> None:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+
+    return edit
+
+
+def swap(name: str, old: str, new: str, count: int = 1) -> Edit:
+    """Replace text in a file."""
+
+    def edit(folder: Path) -> None:
+        content = (folder / name).read_text()
+        assert old in content, f"{name} has no {old!r}"
+        (folder / name).write_text(content.replace(old, new, count))
+
+    return edit
+
+
+def remove(name: str) -> Edit:
+    """Delete a file or folder."""
+
+    def edit(folder: Path) -> None:
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return edit
+
+
+def keyed(name: str, /, **values: Any) -> Edit:
+    """Set keys of a YAML or JSON file; ``a__b`` is b in a, numbers count entries of lists."""
+
+    def edit(folder: Path) -> None:
+        path = folder / name
+        is_json = path.suffix == ".json"
+        content = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
+        for key, value in values.items():
+            *parents, last = [int(k) if k.isdigit() else k for k in key.split("__")]
+            place: Any = content
+            for parent in parents:
+                place = place[parent]
+            if value is GONE:
+                del place[last]
+            else:
+                place[last] = value
+        path.write_text(
+            json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False)
+        )
+
+    return edit
+
+
+def cell(name: str, row: int | None, /, **cells: str) -> Edit:
+    """Change cells of a row of a table, counted from 1; of all rows without one."""
+
+    def edit(folder: Path) -> None:
+        header, rows = _table(folder / name)
+        for number, line in enumerate(rows, start=1):
+            if row in {None, number}:
+                for column, value in cells.items():
+                    line[header.index(column)] = value
+        _write_table(folder / name, [header, *rows])
+
+    return edit
+
+
+def header(name: str, old: str, new: str | None) -> Edit:
+    """Rename a column of a table, or take it out."""
+
+    def edit(folder: Path) -> None:
+        names, rows = _table(folder / name)
+        k = names.index(old)
+        lines = [names, *rows]
+        if new is None:
+            lines = [[*line[:k], *line[k + 1 :]] for line in lines]
+        else:
+            names[k] = new
+        _write_table(folder / name, lines)
+
+    return edit
+
+
+def doubled(name: str) -> Edit:
+    """Write the first row of a table once more."""
+
+    def edit(folder: Path) -> None:
+        names, rows = _table(folder / name)
+        _write_table(folder / name, [names, *rows, rows[0]])
+
+    return edit
+
+
+def kept(name: str, n: int) -> Edit:
+    """Keep the first rows of a table."""
+
+    def edit(folder: Path) -> None:
+        names, rows = _table(folder / name)
+        _write_table(folder / name, [names, *rows[:n]])
+
+    return edit
+
+
+def _table(path: Path) -> tuple[list[str], list[list[str]]]:
+    with path.open(newline="") as file:
+        names, *rows = csv.reader(file)
+    return names, rows
+
+
+def _write_table(path: Path, lines: list[list[str]]) -> None:
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(lines)
+
+
+def picture(name: str, width: int, height: int) -> Edit:
+    """Write a grey picture."""
+
+    def edit(folder: Path) -> None:
+        cv2.imwrite(str(folder / name), np.full((height, width), 90, dtype=np.uint8))
+
+    return edit
+
+
+def floating(name: str) -> Edit:
+    """Write a grey TIFF of floating-point pixels."""
+    image = np.full((48, 64), 90.0, dtype=np.float32)
+    return text(name, cv2.imencode(".tiff", image)[1].tobytes())
+
+
+def cut(name: str, by: int) -> Edit:
+    """Cut off the end of a file."""
+
+    def edit(folder: Path) -> None:
+        path = folder / name
+        path.write_bytes(path.read_bytes()[:-by])
+
+    return edit
+
+
+# --- the table ----------------------------------------------------------------------------------
+
+Rows = Iterable[tuple[str, tuple[Edit, ...] | Edit, tuple[str, ...]]]
+
+
+def _spoiled(group: str, command: str, given: str, rows: Rows) -> Iterable[Refusal]:
+    for name, edits, named in rows:
+        chosen = edits if isinstance(edits, tuple) else (edits,)
+        yield Refusal(f"{group}-{name}", command, named, given, chosen)
+
+
+def _worded(
+    group: str, command: str, rows: Iterable[tuple[str, str, tuple[str, ...]]], given: str = ""
+) -> Iterable[Refusal]:
+    for name, words, named in rows:
+        yield Refusal(f"{group}-{name}", f"{command} {words}", named, given)
+
+
+def _use() -> Iterable[Refusal]:
+    rows: list[tuple[str, str, tuple[str, ...]]] = [
+        ("no-command", "", ()),
+        ("no-study", "study", ()),
+        ("unknown-command", "frobnicate", ("frobnicate",)),
+        ("unknown-study", "study papers", ("papers",)),
+        ("no-model", "inspect", ("MODEL",)),
+        ("unknown-option", "inspect hexapod --colour", ("--colour",)),
+        ("no-dataset", "calibrate nowhere -o {out}", ("nowhere",)),
+        ("no-output", "calibrate nowhere", ("--output",)),
+        ("no-reference", "evaluate hexapod nowhere.urdf", ("nowhere.urdf",)),
+        ("unknown-model", "inspect octopod", ("octopod", "hexapod", "tricept")),
+        ("no-file", "inspect nowhere.yaml", ("nowhere.yaml",)),
+        ("long-name", "inspect " + 300 * "a", ("aaa",)),
+        ("folder", "inspect {in}", ("{in}", "robot.yaml")),
+        ("empty-output", "simulate hexapod -o ''", ("-o",)),
+        ("empty-value", "simulate hexapod -o {out} --poses=", ("--poses",)),
+        ("empty-model", "simulate '' -o {out}", ("simulate",)),
+        ("empty-study", "study paper -o ''", ("-o",)),
+        ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
+        ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
+        ("workers", "detect x -o {out} --workers 0", ("--workers", "found 0")),
+        ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
+        ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
+        ("identify-nothing", "identify", ("MODEL|DATASET",)),
+    ]
+    yield from _worded("use", "", rows)
+    existing = [text("thesis.tex", "years of work")]
+    for name, command in {
+        "calibrate": "calibrate {in} -o {in}",
+        "simulate": "simulate 3-rpr -o {in} --level axes --poses 1",
+        "simulate-force": "simulate 3-rpr -o {in} --level axes --poses 1 --force",
+        "study": "study convergence --machine 3-rpr --runs 1 -o {in}",
+        "detect": "detect {in} -o {in}",
+    }.items():
+        given = "plain" if name in {"calibrate", "detect"} else ""
+        named = ("{in}",) if name != "calibrate" else ()
+        yield Refusal(f"taken-{name}", command, named, given, tuple(existing))
+
+
+def _options() -> Iterable[Refusal]:
+    identify: list[tuple[str, str, tuple[str, ...]]] = [
+        ("leg", "--view leg1,lge2", ("1", "'lge2'", "'leg2'")),
+        ("no-leg", "--view ,", ("1",)),
+        ("empty", "--view leg1,,leg2", ("1", "''")),
+        ("twice", "--view leg1,leg1", ("'leg1'", "2")),
+        ("images", "--images 0", ("0",)),
+        ("many-images", "--images 2001", ("2001", "2000")),
+        ("many-views", "--view leg1 " * 51, ("51", "50")),
+        ("text", "--images many", ("--images",)),
+        ("hand-held", "--view leg1,leg2,leg3 --hand-held", ("--board",)),
+        ("hand-held-alone", "--board --hand-held", ("--view",)),
+    ]
+    yield from _worded("identify", "identify hexapod", identify)
+    yield Refusal("identify-dataset-view", "identify {in} --view leg1", ("--view",), "plain")
+    yield Refusal("identify-dataset-images", "identify {in} --images 3", ("--images",), "plain")
+
+    checks: list[tuple[str, str, tuple[str, ...]]] = [
+        ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
+        ("criteria", "--check {in}/result --criteria literal", ("--criteria", "--check")),
+        ("transformation", "--check {in}/result --transformation points", ("--transformation",)),
+        ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
+        ("no-output", "", ("--output", "-o")),
+        ("fraction", "-o {out} --holdout 1.5", ("1.5", "0", "1")),
+        ("fraction-none", "-o {out} --holdout 0", ("0", "1")),
+        ("no-result", "--check {in}/none", ("none",)),
+    ]
+    yield from _worded("check", "calibrate {in}/set", checks, "result")
+
+    simulate: list[tuple[str, str, tuple[str, ...]]] = [
+        ("images", "--images 0", ("0",)),
+        ("poses", "--poses 0", ("0",)),
+        ("negative-poses", "--poses -3", ("-3",)),
+        ("half-poses", "--poses 1.5", ("1.5",)),
+        ("poses-e", "--poses 1e3", ("1e3",)),
+        ("poses-file", "--poses none.csv", ("none.csv",)),
+        ("views", "--views 0", ("0",)),
+        ("seed", "--seed -1", ("-1",)),
+        ("pixel-noise", "--level outlines --pixel-noise -0.1px", ("--pixel-noise", "-0.1")),
+        ("pixel-unit", "--level outlines --pixel-noise 0.1", ("--pixel-noise", "0.1", "px")),
+        ("pixel-size", "--level outlines --pixel-noise 1e308px", ("1e+308", "100 px")),
+        ("encoder-negative", "--encoder-noise -2um", ("--encoder-noise", "-2")),
+        ("encoder-kind", "--encoder-noise 2um:gauss", ("--encoder-noise", "'gauss'")),
+        ("encoder-size", "--encoder-noise 1m", ("29.6 mm",)),
+        ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
+        ("error-unit", "--error joints=0.1deg", ("joints", "mm", "um")),
+        ("error-angle", "--error axes=2mm", ("axes", "deg")),
+        ("error-kind", "--error joint=2mm", ("joint", "'joints'")),
+        ("error-no-kind", "--error 2mm", ("2mm", "KIND=SIZE")),
+        ("error-no-size", "--error joints", ("'joints'", "KIND=SIZE")),
+        ("error-size", "--error joints=2m", ("2m", "1m")),
+        ("error-none-there", "--error twists=1deg", ("twists",)),
+        ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
+        ("views-and-cameras", "--views 2 --cameras c.yaml", ("--views", "--cameras")),
+        ("own-poses", "--poses p.csv --own-poses", ("--own-poses",)),
+        ("sampling", "--poses p.csv --sampling extreme", ("--sampling",)),
+        ("camera", "--camera none.yaml", ("none.yaml",)),
+        ("cameras", "--cameras none.yaml", ("none.yaml",)),
+        ("appearance", "--appearance none.yaml", ("none.yaml",)),
+        ("photographs-noise", "--pixel-noise 0.2px", ("--pixel-noise", "outlines")),
+        ("axes-blur", "--level axes --blur 1", ("--blur", "axes", "photographs")),
+        ("outlines-table", "--level outlines --table-noise radians", ("--table-noise", "axes")),
+        ("outlines-gamma", "--level outlines --no-gamma", ("--no-gamma could", "photographs")),
+        ("outlines-gamma-given", "--level outlines --gamma", ("--gamma could", "photographs")),
+        ("axes-grey", "--level axes --grey", ("--grey could", "photographs")),
+        ("bits", "--bits 12", ("12", "8", "16")),
+        ("blur", "--blur -1", ("blur", "-1")),
+        ("clutter", "--clutter -2", ("clutter", "-2")),
+        ("board", "--board chess", ("chess",)),
+        ("board-pose", "--board-pose", ("--board",)),
+        ("hand-held", "--hand-held", ("--board",)),
+        ("too-many", "--level axes --images 100001", ("100000",)),
+        ("level", "--level pictures", ("--level", "pictures", "axes")),
+    ]
+    yield from _worded("simulate", "simulate hexapod -o {out}", simulate)
+
+    study: list[tuple[str, str, tuple[str, ...]]] = [
+        ("runs", "convergence --runs 0", ("0",)),
+        ("seed", "bound --seed -1", ("-1",)),
+        ("workers", "paper --workers 0", ("--workers", "found 0")),
+        ("machine", "bound --machine 4-rpr", ("4-rpr", "3-rpr")),
+        ("class", "classes --machine 6-spu-coplanar", ("6-spu-coplanar", "hexapod")),
+    ]
+    yield from _worded("study", "study", study)
+
+    locate: list[tuple[str, str, tuple[str, ...]]] = [
+        ("tool-position", "-o {out} --tool-position 1,2", ("--tool-position",)),
+        ("tool-unit", "-o {out} --tool-position 1,2,3deg", ("--tool-position",)),
+        ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
+        ("sigma", "-o {out} --position-sigma 0.02", ("--position-sigma", "0.02")),
+        ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
+        ("link", "-o {out} --world-link room", ("--urdf",)),
+        ("folder", "-o none/a.yaml", ("none",)),
+        ("no-output", "", ("--output",)),
+        ("links", "-o {out} --urdf {here}/u --world-link a --tool-link a", ("a",)),
+    ]
+    yield from _worded("locate", "locate hexapod {in}/hexapod.csv", locate, "tool-poses")
+
+    camera: list[tuple[str, str, tuple[str, ...]]] = [
+        ("kind", "chessbord:9x6", ("chessbord", "chessboard:9x6:25mm")),
+        ("counts", "chessboard:9", ("chessboard:9x6:25mm",)),
+        ("few", "chessboard:3x6", ("3 x 6",)),
+        ("unit", "chessboard:9x6:25", ("25",)),
+        ("metres", "chessboard:9x6:25m", ("25000 mm",)),
+        ("dictionary", "charuco:7x5:40mm:29mm", ("charuco:7x5:40mm:29mm:DICT_4X4_50",)),
+        ("unknown", "charuco:7x5:40mm:29mm:DICT_4X4_51", ("DICT_4X4_51",)),
+        ("exchanged", "charuco:7x5:29mm:40mm:DICT_4X4_50", ("marker", "square")),
+        ("legacy", "charuco:7x5:40mm:29mm:DICT_4X4_50:old", ("old", "legacy")),
+        ("gap", "aprilgrid:6x6:88mm:wide", ("wide",)),
+        ("gap-size", "aprilgrid:6x6:88mm:9", ("9", "0.05", "2")),
+    ]
+    for name, spec, named in camera:
+        command = f"camera {{in}}/images -o {{out}} --board {spec}"
+        yield Refusal(f"camera-{name}", command, named, "plain")
+    spec = "--board chessboard:9x6:25mm"
+    yield Refusal("camera-none", f"camera {{in}}/images {spec} -o {{out}}", ("4",), "plain")
+    yield Refusal("camera-missing", f"camera no*.png {spec} -o {{out}}", ("no*.png",))
+    yield Refusal("camera-no-board", "camera {in}/images -o {out}", ("--board",), "plain")
+    yield Refusal("camera-place", f"camera {{in}}/images {spec} -o no/c.yaml", ("no",), "plain")
+    yield Refusal(
+        "camera-other", f"camera {{in}}/images {spec} -o {{in}}/camera_info.yaml",
+        ("camera_info.yaml",), "plain",
+    )  # fmt: skip
+    yield Refusal(
+        "camera-sizes", f"camera {{in}}/images {spec} -o {{out}}",
+        ("64 x 48", "48 x 64", "c1_1.png", "turned.png"), "plain",
+        (picture("images/turned.png", 48, 64),),
+    )  # fmt: skip
+    yield Refusal(
+        "camera-cut", f"camera {{in}}/images {spec} -o {{out}}", ("c1_2.png",), "plain",
+        (cut("images/c1_2.png", 30),),
+    )  # fmt: skip
+
+
+def _datasets() -> Iterable[Refusal]:
+    def entry(**values: Any) -> Edit:
+        return keyed("dataset.yaml", **values)
+
+    quaternion = [0.0, 0.0, 0.0, 1.0]
+    rows: Rows = [
+        ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
+        ("no-version", entry(legcal_dataset=GONE), ("legcal_dataset",)),
+        ("sigma-0", entry(encoder_sigma=0.0), ("encoder_sigma", "0.0")),
+        ("sigma-negative", entry(encoder_sigma=-1e-6), ("encoder_sigma", "-1e-06")),
+        ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
+        ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90")),
+        ("sigma-text", entry(encoder_sigma="small"), ("encoder_sigma", "'small'")),
+        ("no-views", entry(views={}), ("views",)),
+        ("view-list", entry(views=["c1"]), ("views",)),
+        ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
+        ("no-mechanism", entry(mechanism=None), ("mechanism",)),
+        ("mechanism", entry(mechanism="models/none.yaml"), ("none.yaml",)),
+        ("key", entry(measurement="x"), ("measurement", "'measurements'")),
+        ("absolute", entry(measurements="/etc/passwd"), ("measurements", "/etc/passwd")),
+        ("outside", entry(measurements="../m.csv"), ("measurements", "../m.csv")),
+        ("no-table", entry(measurements="none.csv"), ("none.csv",)),
+        ("no-camera", entry(views__c1__camera=GONE), ("views.c1.camera",)),
+        ("camera", entry(views__c1__camera="none.yaml"), ("none.yaml",)),
+        ("gamma", entry(views__c1__gamma=0), ("views.c1.gamma", "0.2")),
+        ("gamma-large", entry(views__c1__gamma=100), ("views.c1.gamma", "100", "5")),
+        ("pose-key", entry(views__c1__T_base_camer={}), ("T_base_camer", "'T_base_camera'")),
+        ("pose-list", entry(views__c1__T_base_camera=[1, 2, 3]), ("views.c1.T_base_camera",)),
+        (
+            "pose-xyz",
+            entry(views__c1__T_base_camera={"xyz": [1, 2], "quat_xyzw": quaternion}),
+            ("views.c1.T_base_camera.xyz", "2"),
+        ),
+        ("norm-0", entry(views__c1__T_base_camera__quat_xyzw=[0, 0, 0, 0]), ("norm 0", "0.001")),
+        ("norm", entry(views__c1__T_base_camera__quat_xyzw=[0, 0, 0, 1.002]), ("1.002",)),
+        (
+            "pose-nan",
+            entry(views__c1__T_base_camera__xyz=[1, 2, float("nan")]),
+            ("T_base_camera.xyz.2", "nan"),
+        ),
+        ("no-legs", entry(views__c1__legs=[]), ("views.c1.legs",)),
+        ("legs-twice", entry(views__c1__legs=["leg1", "leg1"]), ("c1", "leg1")),
+        ("leg", entry(views__c1__legs=["leg1", "leg7"]), ("c1", "'leg7'")),
+        ("legs-text", entry(views__c1__legs="leg1"), ("views.c1.legs", "'leg1'")),
+        ("hand-held", entry(views__c1__hand_held=True), ("c1", "board")),
+        (
+            "all-at-once",
+            entry(encoder_sigma=-1, views__c1__legs=3, views__c2={}, measurements=GONE),
+            ("encoder_sigma", "views.c1.legs", "views.c2.camera", "measurements"),
+        ),
+        ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
+        ("repeated", swap("dataset.yaml", "  c2:", "  c1:"), ("'c1'",)),
+        ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
+        ("axes-and-outlines", (text("axes.csv", "x\n"), text("observations.csv", "x\n")),
+         ("axes.csv", "observations.csv")),
+    ]  # fmt: skip
+    yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
+
+    prior = "parameters"
+    choices: Rows = [
+        ("unknown", entry(**{prior: {"fixed": ["leg9.offset"]}}), ("leg9.offset",)),
+        ("key", entry(**{prior: {"prior": {}}}), ("prior", "'priors'")),
+        ("sigma", entry(**{prior: {"priors": {"leg1.offset": "0.345±0"}}}), ("leg1.offset", "0")),
+        ("pair", entry(**{prior: {"priors": {"leg1.offset": {"value": 1}}}}), ("leg1.offset",)),
+        (
+            "both",
+            entry(**{prior: {"fixed": ["leg1.offset"], "free": ["leg1.offset"]}}),
+            ("leg1.offset",),
+        ),
+    ]
+    yield from _spoiled("parameters", "calibrate {in} -o {out}", "plain", choices)
+
+    chess = {"kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03}
+    char = {
+        "kind": "charuco", "squares_x": 7, "squares_y": 5, "square": 0.04, "marker": 0.03,
+        "dictionary": "DICT_4X4_50",
+    }  # fmt: skip
+    april = {"kind": "aprilgrid", "tags_x": 6, "tags_y": 6, "tag_size": 0.088, "tag_spacing": 0.3}
+    boards: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+        ("square", {**chess, "square": 30}, ("board.square", "30 m", "0.03")),
+        ("square-0", {**chess, "square": 0.0}, ("board.square", "0 m")),
+        ("square-nan", {**chess, "square": float("nan")}, ("board.square",)),
+        ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
+        ("no-kind", {"squares_x": 9}, ("board.kind",)),
+        ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
+        ("few", {**chess, "squares_x": 3}, ("3 x 6", "4")),
+        ("fraction", {**chess, "squares_x": 9.5}, ("board.squares_x",)),
+        ("negative", {**chess, "squares_x": -1}, ("board.squares_x", "-1")),
+        ("key", {**chess, "columns": 9}, ("board.columns",)),
+        ("pose", {**chess, "T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
+        ("marker", {**char, "marker": 0.05}, ("0.05 m", "0.04 m")),
+        ("marker-metres", {**char, "marker": 30}, ("board.marker", "30 m")),
+        ("no-marker", {k: v for k, v in char.items() if k != "marker"}, ("board.marker",)),
+        ("dictionary", {**char, "dictionary": "4X4"}, ("board.dictionary", "'4X4'")),
+        ("markers", {**char, "squares_x": 20, "squares_y": 20}, ("200", "50")),
+        ("few-squares", {**char, "squares_x": 2, "squares_y": 3}, ("2 x 3",)),
+        ("tag", {**april, "tag_size": 88}, ("board.tag_size", "88 m")),
+        ("spacing", {**april, "tag_spacing": 0.026}, ("0.026", "0.05")),
+        ("tags", {**april, "tags_x": 60, "tags_y": 60}, ("60 x 60", "587")),
+        ("family", {**april, "family": "25h9"}, ("board.family", "'25h9'")),
+    ]
+    for name, board, named in boards:
+        yield from _spoiled(
+            "board", "calibrate {in} -o {out}", "plain", [(name, entry(board=board), named)]
+        )
+
+
+def _measurements() -> Iterable[Refusal]:
+    table = "measurements.csv"
+    joint = "leg1_prismatic"
+
+    def readings(row: int | None, value: str, column: str = joint) -> Edit:
+        return cell(table, row, **{column: value})
+
+    def image(value: str) -> Edit:
+        return cell(table, 3, image=value)
+
+    rows: Rows = [
+        ("column", header(table, joint, "leg7_prismatic"), ("'leg7_prismatic'", f"'{joint}'")),
+        ("no-column", header(table, "leg6_prismatic", None), ("'leg6_prismatic'",)),
+        ("no-view", header(table, "view", None), ("'view'",)),
+        ("column-twice", header(table, "leg2_prismatic", joint), (f"'{joint}'", "2 times")),
+        ("semicolons", swap(table, ",", ";", -1), ("commas",)),
+        ("tabs", swap(table, ",", "\t", -1), ("commas",)),
+        ("empty", kept(table, 0), ("no row",)),
+        ("nothing", text(table, ""), ("no row",)),
+        ("short", swap(table, "c1,images/c1_2.png", "images/c1_2.png"), ("row 2", "7", "8")),
+        ("long", swap(table, "c1,images/c1_2.png", "c1,,images/c1_2.png"), ("row 2", "9", "8")),
+        ("nan", readings(3, "nan"), ("row 3 (line 4)", joint, "'nan'")),
+        ("inf", readings(3, "inf"), ("row 3 (line 4)", joint, "'inf'")),
+        ("blank", readings(3, ""), ("row 3 (line 4)", joint)),
+        ("word", readings(3, "ten"), ("row 3 (line 4)", joint, "'ten'")),
+        ("underscore", readings(3, "1_0"), ("row 3 (line 4)", joint, "'1_0'")),
+        ("overflow", readings(3, "1e999"), ("row 3 (line 4)", joint, "'1e999'")),
+        ("travel", readings(2, "0.15288"), (joint, "0.15288 m", "row 2", "-0.004", "0.144")),
+        ("millimetres", readings(None, "70"), (joint, "millimetres")),
+        ("view", cell(table, 3, view="c3"), ("row 3", "view", "'c3'")),
+        ("same-image", image("images/c1_1.png"), ("row 3", "images/c1_1.png", "row 1")),
+        ("same-path", image("images/../images/c1_1.png"), ("row 3", "row 1")),
+        ("outside", image("../other.png"), ("row 3", "../other.png")),
+        ("absolute", image("/tmp/other.png"), ("row 3", "/tmp/other.png")),
+        ("windows", image("C:\\other.png"), ("row 3", "C:\\other.png")),
+        ("no-image", image("images/none.png"), ("row 3", "none.png")),
+        ("folder", image("images"), ("row 3", "images")),
+        ("no-name", image(""), ("row 3", "observations.csv")),
+        ("bytes", text(table, b"view,image\n\xff\xfe"), ("0xff",)),
+        ("quote", text(table, b'view,image\n"c1,x'), (table,)),
+        (
+            "all-at-once",
+            (cell(table, 1, view="c7"), readings(2, "nan"), image("/a.png"), readings(4, "9")),
+            ("row 1", "row 2", "row 3", "row 4", "c7", "nan", "/a.png"),
+        ),
+        (
+            "pose",
+            (header(table, "leg6_prismatic", "leg6_prismatic"),
+             swap(table, "view,image", "pose,view,image"), swap(table, "\nc", "\np,c", -1)),
+            ("row 1 (line 2)", "pose p", joint),
+        ),
+        ("gif", text("images/c1_1.png", b"GIF89a"), ("row 1", "c1_1.png", "PNG")),
+        ("empty-image", text("images/c1_1.png", b""), ("row 1", "c1_1.png")),
+        ("cut-image", cut("images/c1_2.png", 30), ("row 2", "c1_2.png")),
+        (
+            "float-image",
+            (floating("images/c1_2.png"), remove("images/c1_1.png")),
+            ("row 1", "row 2", "c1_2.png", "8 or 16"),
+        ),
+        ("image-size", picture("images/c2_1.png", 63, 48), ("row 3", "63 x 48", "64 x 48")),
+        (
+            "images-at-once",
+            (remove("images/c1_1.png"), cut("images/c1_2.png", 30),
+             picture("images/c2_1.png", 63, 48), text("images/c2_2.png", "text")),
+            ("row 1", "row 2", "row 3", "row 4"),
+        ),
+    ]  # fmt: skip
+    yield from _spoiled("measurements", "calibrate {in} -o {out}", "plain", rows)
+
+
+def _cameras() -> Iterable[Refusal]:
+    file = "camera_info.yaml"
+
+    def content(**values: Any) -> Edit:
+        return keyed(file, **values)
+
+    K = [80.0, 0.0, 31.5, 0.0, 80.0, 23.5, 0.0, 0.0, 1.0]
+    five = {"rows": 1, "cols": 5, "data": [0.0] * 5}
+
+    def kalibr(**values: Any) -> Edit:
+        camera = {
+            "camera_model": "pinhole", "distortion_coeffs": [0.0] * 4,
+            "distortion_model": "radtan", "intrinsics": [80.0, 80.0, 31.5, 23.5],
+            "resolution": [64, 48],
+        }  # fmt: skip
+        return text(file, yaml.safe_dump({"cam0": camera | values}))
+
+    def matrix(*changes: tuple[int, float]) -> Edit:
+        data = list(K)
+        for place, value in changes:
+            data[place] = value
+        return content(camera_matrix__data=data)
+
+    rows: Rows = [
+        ("model", content(distortion_model="thin_prism"), ("distortion_model", "'thin_prism'")),
+        ("equidistant", content(distortion_model="equidistant"), ("5", "4", "equidistant")),
+        ("rational", content(distortion_model="rational_polynomial"), ("5", "8")),
+        ("height", content(image_height=-768), ("image_height", "-768")),
+        ("no-width", content(image_width=GONE), ("image_width",)),
+        ("few-numbers", content(camera_matrix__data=K[:6]), ("camera_matrix", "6", "9")),
+        ("text", content(distortion_coefficients__data__0="a"), ("data.0", "'a'")),
+        ("nan", content(distortion_coefficients__data__0=float("nan")), ("data.0", "nan")),
+        ("singular", matrix((0, 0.0)), ("fx = 0",)),
+        ("negative", matrix((4, -3.0)), ("fy = -3",)),
+        ("centre", matrix((5, 900.0)), ("cy = 900", "64 x 48")),
+        ("last-row", matrix((8, 2.0)), ("[0, 0, 1]",)),
+        ("mapping", content(camera_matrix=7), ("camera_matrix", "7")),
+        ("shape", content(camera_matrix={"rows": 1, "cols": 2, "data": [1, 2]}), ("1 x 2",)),
+        (
+            "all-at-once",
+            content(camera_matrix__data=[0.0, *K[1:4], -3.0, 900.0, *K[6:]],
+                    distortion_coefficients=five | {"cols": 3, "data": [0, 0, 0]}),
+            ("fx = 0", "fy = -3", "cy = 900", "3"),
+        ),
+        ("kalibr-model", kalibr(camera_model="omni"), ("cam0.camera_model", "'omni'")),
+        ("kalibr-lens", kalibr(distortion_model="fov"), ("cam0.distortion_model", "'fov'")),
+        ("kalibr-few", kalibr(distortion_coeffs=[0.1]), ("1", "4", "radtan")),
+        ("kalibr-intrinsics", kalibr(intrinsics=[1, 2, 3]), ("cam0.intrinsics", "3")),
+        ("keys", text(file, "fx: 1\nfy: 2\n"), ("fx", "fy")),
+        ("list", text(file, "[1, 2]"), (file,)),
+        ("nothing", text(file, ""), (file,)),
+        ("broken", text(file, "a: [1, 2"), ("line 1",)),
+        ("repeated", text(file, "a: 1\nb: 2\na: 3"), ("line 3", "'a'")),
+        ("python", text(file, "a: !!python/object/apply:os.system [ls]"), (file,)),
+        ("storage", text(file, "%YAML:1.0\n---\nimage_width: [[["), ("OpenCV",)),
+        ("bytes", text(file, b"a: \xff\xfe\xfd"), ("UTF-8",)),
+    ]  # fmt: skip
+    yield from _spoiled("lens", "calibrate {in} -o {out}", "plain", rows)
+
+
+def _tables() -> Iterable[Refusal]:
+    o = "observations.csv"
+    outlines: Rows = [
+        ("view", cell(o, 1, view="up"), ("row 1", "view", "'up'")),
+        ("image", cell(o, 1, image="i.png"), ("row 1", "image", "'i.png'")),
+        ("leg", cell(o, 1, leg="leg9"), ("row 1", "leg", "'leg9'")),
+        ("part", cell(o, 1, part="leg2_rod"), ("row 1", "part", "'leg2_rod'", "leg1")),
+        ("edge", cell(o, 1, edge="3"), ("row 1", "edge", "'3'", "1", "2")),
+        ("verdict", cell(o, 1, verdict="yes"), ("verdict", "'yes'", "used", "rejected")),
+        ("source", cell(o, 1, source="me"), ("source", "'me'", "detected", "edited")),
+        ("number", cell(o, 1, a="0.1x"), ("column a", "'0.1x'")),
+        ("blank", cell(o, 1, u0=""), ("column u0",)),
+        ("nan", cell(o, 1, v1="nan"), ("column v1", "'nan'")),
+        ("inf", cell(o, 1, s00="inf"), ("column s00", "'inf'")),
+        ("norm", cell(o, 1, a="5"), ("columns a, b, c", "norm")),
+        ("zero", cell(o, 1, a="0", b="0", c="0"), ("norm 0",)),
+        ("point", cell(o, 1, u0="5", u1="5", v0="7", v1="7"), ("u0", "v1")),
+        ("negative", cell(o, 1, s00="-1"), ("columns s00, s01, s11",)),
+        ("indefinite", cell(o, 1, s00="1", s01="2", s11="1"), ("(1, 2, 1)",)),
+        ("far", cell(o, 1, u0="-400", v0="-300"), ("px", "(a, b, c)")),
+        ("twice", doubled(o), ("row 1",)),
+        ("one-gamma", cell(o, 2, gamma="2.2"), ("row 2", "gamma", "by_gamma")),
+        ("gamma-0", cell(o, 2, gamma="0", by_gamma="0.1"), ("row 2", "gamma", "'0'")),
+        ("header", header(o, "edge", "side"), (o, "edge")),
+        ("no-table", text(o, ""), (o,)),
+        ("short", swap(o, "\n", "\nc1,x\n"), ("2", "24")),
+        (
+            "all-at-once",
+            (cell(o, 1, view="up", leg="none", edge="0"), cell(o, 4, a="x", b="y")),
+            ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
+        ),
+        ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
+        ("few", kept("measurements.csv", 2), ("6",)),
+    ]
+    yield from _spoiled("outlines", "calibrate {in} -o {out}", "3-rpr-outlines", outlines)
+
+    a = "axes.csv"
+    axes: Rows = [
+        ("view", cell(a, 5, view="up"), ("row 5 (line 6)", "view", "'up'")),
+        ("image", cell(a, 5, image="i.png"), ("row 5 (line 6)", "image", "'i.png'")),
+        ("leg", cell(a, 5, leg="legZ"), ("row 5 (line 6)", "leg", "'legZ'")),
+        ("blank", cell(a, 5, psi=""), ("row 5 (line 6)", "psi")),
+        ("nan", cell(a, 5, z="nan"), ("column z", "'nan'")),
+        ("underscore", cell(a, 5, x="1_0"), ("column x", "'1_0'")),
+        ("degrees", cell(a, 5, theta="-12"), ("-12", "3.1416", "rad")),
+        ("tilt", cell(a, 5, psi="1.7"), ("1.7", "1.5708", "rad")),
+        ("far", cell(a, 5, x="1e9"), ("column x", "1e9", "1000 m")),
+        ("sigma-0", cell(a, 5, sigma_psi="0"), ("sigma_psi", "0")),
+        ("sigma-negative", cell(a, 5, sigma_x="-1e-3"), ("sigma_x", "-1e-3", "1e-09")),
+        ("sigma-large", cell(a, 5, sigma_z="50"), ("sigma_z", "1", "m")),
+        ("no-point", cell(a, 5, theta="1.5707963"), ("psi, theta",)),
+        ("twice", doubled(a), ("row 1",)),
+        ("header", header(a, "sigma_z", "sigma_y"), ("sigma_z",)),
+        ("short", swap(a, "\n", "\nc1,x\n"), ("2", "11")),
+        ("empty", kept(a, 0), ("no row",)),
+        ("all-at-once", (cell(a, 2, psi="x", sigma_x="0"), cell(a, 4, leg="leg9")),
+         ("'x'", "sigma_x", "'leg9'")),
+        ("all-degrees", cell(a, None, theta="-91"), ("-91", "rad")),
+        ("few", (kept("measurements.csv", 1), kept(a, 3)), ()),
+        ("missing", kept(a, 60), ("row",)),
+    ]  # fmt: skip
+    yield from _spoiled("axes", "calibrate {in} -o {out}", "3-rpr-axes", axes)
+    for name, words, named in (
+        ("radius", "--set leg1.radius.leg1_rod=free", ("leg1.radius.leg1_rod", "axes")),
+        ("intrinsic", "--set c1.fx=free", ("c1.fx", "axes")),
+        ("holdout", "--holdout 0.2", ("axes",)),
+    ):
+        command = f"calibrate {{in}} -o {{out}} {words}"
+        yield Refusal(f"axes-{name}", command, named, "3-rpr-axes")
+    yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
+
+    c = "corners.csv"
+    line = "view,image,corner,u,v,sigma,verdict,reason,source\n"
+    good = "c1,images/c1_1.png,0,5.0,5.0,0.1,used,,detected\n"
+    board = keyed("dataset.yaml", board={
+        "kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03,
+    })  # fmt: skip
+    corners: list[tuple[str, str, tuple[str, ...]]] = [
+        ("number", "c1,images/c1_2.png,1.0,1,2,0.1,used,,detected", ("corner", "'1.0'")),
+        ("many", "c1,images/c1_2.png,99,1,2,0.1,used,,detected", ("corner", "99")),
+        ("u", "c1,images/c1_2.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
+        ("v", "c1,images/c1_2.png,3,1,,0.1,used,,detected", ("column v",)),
+        ("outside", "c1,images/c1_2.png,3,470,2,0.1,used,,detected", ("column u", "470 px")),
+        ("sigma", "c1,images/c1_2.png,3,1,2,0,used,,detected", ("column sigma", "0")),
+        ("verdict", "c1,images/c1_2.png,3,1,2,0.1,good,,detected", ("verdict", "used")),
+        ("source", "c1,images/c1_2.png,3,1,2,0.1,used,,me", ("source", "edited")),
+        ("short", "c1,images/c1_2.png,3,1,2,0.1,used", ("7", "9")),
+        ("view", "c8,images/c1_2.png,3,1,2,0.1,used,,detected", ("view", "'c8'")),
+        ("twice", good.strip(), ("row 2", "row 1")),
+    ]
+    for name, row, said in corners:
+        edits = (board, text(c, f"{line}{good}{row}\n"))
+        yield Refusal(
+            f"corners-{name}", "calibrate {in} -o {out}", (*said, "row 2"), "plain", edits
+        )
+    yield Refusal(
+        "corners-none", "calibrate {in} -o {out}", ("no row",), "plain", (board, text(c, line))
+    )
+
+
+def _overrides() -> Iterable[Refusal]:
+    """Choices of parameters by options."""
+    priors: list[tuple[str, str, tuple[str, ...]]] = [
+        ("empty", "leg1.offset=", ("leg1.offset",)),
+        ("sigma-0", "leg1.offset=0.35±0", ("sigma 0",)),
+        ("sigma-negative", "leg1.offset=0.35±-0.001", ("-0.001",)),
+        ("infinite", "leg1.offset=0.35±1e999", ("'1e999'",)),
+        ("sigma-small", "leg1.offset=0.35±1e-12", ("1e-12", "1e-09")),
+        ("sigma-large", "leg1.offset=0.35±1e300", ("1e+300", "1e+06")),
+        ("one-unit", "leg1.offset=350mm±0.1", ("unit",)),
+        ("two-kinds", "leg1.offset=350mm±1deg", ("unit",)),
+        ("unit", "leg1.offset=350±1furlong", ("'furlong'", "mm")),
+        ("pixels", "leg1.offset=350±1px", ("px", "leg1.offset", "m")),
+        ("k1", "c1.k1=0±1mm", ("c1.k1",)),
+        ("metres", "leg1.offset=350±1", ("350 m", "leg1.offset")),
+        ("radius", "leg1.radius.leg1_tube=0±0.001", ("0 m", "leg1.radius.leg1_tube")),
+        ("radius-negative", "leg1.radius.leg1_tube=-0.01±0.001", ("-0.01 m",)),
+        ("focal", "c1.fx=10±1", ("10 px", "c1.fx")),
+        ("centre", "c1.cx=1024±1", ("1024 px", "c1.cx")),
+        ("name", "leg1.ofset=0.35±0.1", ("'leg1.offset'",)),
+        ("pattern", "*.ofset=0.35±0.1", ("*.ofset",)),
+        ("frame", "leg1.base.x=0±0.1", ("leg1.base.x", "R_b")),
+        ("platform-frame", "leg5.platform.z=0±0.1", ("leg5.platform.z", "R_e")),
+        ("length", "leg1.length=0.3±0.1", ("leg1.length", "leg1.offset")),
+        ("twist", "leg1.twist=0±0.1", ("leg1.twist", "SPU")),
+        ("two", "leg1.offset=0.35±0.1' --set 'leg1.offset=0.36±0.1", ("leg1.offset",)),
+        ("two-patterns", "leg1.offset=0.35±0.1' --set '*.offset=0.35±0.2", ("leg1.offset",)),
+        ("fixed", "leg1.offset=0.35±0.1' --set '*.offset", ("leg1.offset",)),
+        ("camera", "c1.fx=79±3' --set 'c2.fx=78±3", ("c1.fx", "c2.fx")),
+    ]
+    command = "calibrate {in} -o {out}"
+    for name, words, named in priors:
+        yield Refusal(f"prior-{name}", f"{command} --set '{words}'", named, "plain")
+    others: list[tuple[str, str, tuple[str, ...]]] = [
+        ("freed", "--set leg1.offset --set leg1.offset=free", ("leg1.offset",)),
+        ("values", "--set leg1.offset=0.35 --set leg1.offset=0.36", ("leg1.offset",)),
+        ("nan", "--set leg1.offset=nan", ("leg1.offset",)),
+        ("unit", "--set leg1.offset=350foot", ("leg1.offset", "foot")),
+        ("text", "--set leg1.offset=x", ("leg1.offset",)),
+        ("all-at-once", "--set leg9.offset --set leg1.base.x --set c9.fx=free",
+         ("leg9.offset", "leg1.base.x", "c9.fx")),
+        ("everything", "--set '*.base.?' --set '*.platform.?' --set '*.offset'", ()),
+    ]  # fmt: skip
+    for name, words, named in others:
+        yield Refusal(f"fix-{name}", f"{command} {words}", named, "plain")
+    planar: list[tuple[str, str, tuple[str, ...]]] = [
+        ("height", "--set leg1.base.z", ("leg1.base.z",)),
+        ("axis", "--set leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
+        ("contradicted", "--set leg1.offset=0.24", ("leg1.offset", "0.24")),
+        ("contradicted-prior", "--set leg1.offset=240+-0.1mm", ("leg1.offset", "0.24")),
+    ]
+    for name, words, named in planar:
+        yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-axes")
+
+
+def _models() -> Iterable[Refusal]:
+    y, u = "models/hexapod.yaml", "urdf/hexapod.urdf"
+    limit = '<limit lower="-0.004" upper="0.144" effort="1000" velocity="1"/>'
+    rows: Rows = [
+        ("frame", swap(y, "- - leg1_end", "- - leg1_ned"), ("closed_loop.0.0", "'leg1_end'")),
+        ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
+        ("three", swap(y, "  - leg1_seat\n", "  - leg1_seat\n  - base\n"), ("closed_loop.0",)),
+        ("motor", swap(y, "- leg1_prismatic\n", "- leg9_prismatic\n"), ("name_mot.0",)),
+        ("motor-twice", swap(y, "- leg1_prismatic\n", "- leg2_prismatic\n"),
+         ("'leg2_prismatic'",)),
+        ("types", swap(y, "- 3d\n", ""), ("6", "5", "closed_loop", "type")),
+        ("type", swap(y, "- 3d\n", "- 2d\n"), ("type.0", "'2d'", "'3d'")),
+        ("base", swap(y, "base: base\n", "base: bass\n"), ("legcal.base", "'bass'")),
+        ("platform", swap(y, "platform: platform\n", "platform: plate\n"), ("legcal.platform",)),
+        ("both", swap(y, "platform: platform\n", "platform: base\n"), ("base", "platform")),
+        ("joint", swap(y, "platform_free", "platform_fee"), ("legcal.platform_joint",)),
+        ("leg", swap(y, "leg1: leg1_prismatic", "leg1: lost"), ("legcal.legs.leg1",)),
+        ("leg-name", swap(y, "leg2: leg2", '"leg 2": leg2'), ("legs", "leg 2")),
+        ("frame-leg", swap(y, "  - leg1\n", "  - leg8\n"), ("legcal.base_frame", "'leg8'")),
+        ("frame-legs", swap(y, "  - leg1\n", ""), ("2", "3")),
+        ("frame-leg-twice", swap(y, "  - leg1\n", "  - leg3\n"), ("'leg3'",)),
+        ("home-nan", swap(y, "0.38274", ".nan"), ("legcal.home.xyz.2",)),
+        ("home-text", swap(y, "0.38274", "high"), ("legcal.home.xyz.2",)),
+        ("home-norm", swap(y, "0.951057", "0.7"), ("0.765",)),
+        ("home-far", swap(y, "0.38274", "0.9"), ("legcal.home",)),
+        ("version", swap(y, "  version: 1", "  version: 2"), ("legcal.version", "2")),
+        ("key", swap(y, "  base: base\n", "  bse: base\n"), ("'base'",)),
+        ("key-name", swap(y, "name_mot:", "name_motor:"), ("name_mot",)),
+        ("urdf", swap(y, "../urdf/hexapod.urdf", "../urdf/none.urdf"), ("none.urdf",)),
+        ("stand-in", swap(y, "joint_name: []", "joint_name: [leg1_b1]"), ("1", "0")),
+        ("all-at-once", (swap(y, "- - leg1_end", "- - nowhere"),
+                         swap(y, "base: base\n", "base: bass\n"),
+                         swap(y, "leg5: leg5_prismatic", "leg5: lost")),
+         ("'nowhere'", "'bass'", "'lost'")),
+        ("list", text(y, "- 1\n"), (y,)),
+        ("broken", text(y, "a: [1\n"), (y,)),
+        ("nothing", text(y, ""), (y,)),
+        ("python", swap(y, "type:", "x: !!python/object/apply:os.system [ls]\ntype:"),
+         ("python/object/apply",)),
+        ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
+        ("xyz-nan", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 nan 0.0"'), ("line", "nan")),
+        ("xyz-two", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 0.195"'), ("line", "3")),
+        ("xyz-huge", swap(u, "0.195", "1e300"), ("1e300",)),
+        ("axis-0", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'), ("line", "axis")),
+        ("axis-2", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 2"'), ("length 2",)),
+        ("radius", swap(u, 'radius="0.01"', 'radius="-0.01"'), ("-0.01",)),
+        ("no-radius", swap(u, 'radius="0.01" ', ""), ("radius",)),
+        ("length", swap(u, 'length="0.3105"', 'length="long"'), ("'leg1_b2_link'", "long")),
+        ("limits", swap(u, 'lower="-0.004"', 'lower="0.2"'), ("0.2", "0.144")),
+        ("no-limit", swap(u, limit, ""), ("lower", "upper")),
+        ("floating", swap(u, 'type="floating"', 'type="spherical"'), ("'spherical'",)),
+        ("mimic", swap(u, limit, f'{limit}<mimic joint="leg2_prismatic"/>'), ("<mimic>",)),
+        ("no-parent", swap(u, '<parent link="leg1_b2_link"/>', ""), ("<parent link",)),
+        ("parent", swap(u, '<parent link="leg1_b2_link"/>', '<parent link="lost"/>'), ("'lost'",)),
+        ("second-parent", swap(u, '<child link="leg1_seat"/>', '<child link="leg1_end"/>'),
+         ("'leg1_end'",)),
+        ("same-link", swap(u, '<link name="leg1_seat"/>', '<link name="leg1_end"/>'),
+         ("leg1_end", "2")),
+        ("same-joint", swap(u, 'joint name="leg2_b1"', 'joint name="leg1_b1"'), ("leg1_b1", "2")),
+        ("loose", swap(u, '<link name="base"/>', '<link name="base"/><link name="loose"/>'),
+         ("loose",)),
+        ("doctype", swap(u, "<robot", '<!DOCTYPE robot [<!ENTITY a "0.1">]><robot'),
+         ("DOCTYPE",)),
+        ("cut", cut(u, 3000), ("line",)),
+        ("no-robot", text(u, "<a/>"), (u,)),
+        ("no-name", swap(u, ' name="hexapod"', ""), ("<robot>",)),
+        ("moved-axis", swap(u, 'xyz="0.0 0.0 0.345"', 'xyz="0.0 0.002 0.345"'), ("leg1", "2 mm")),
+    ]  # fmt: skip
+    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", rows)
+    yield Refusal("model-urdf-alone", "inspect {in}/arm.urdf", ("arm.urdf",), "model",
+                  (_alone,))  # fmt: skip
+    yield Refusal("model-table", "inspect {in}/3-rps.yaml", ("3-rps.yaml", "legcal new"), "tables")
+    yield Refusal("model-csv", "inspect {in}/tripod.csv", ("tripod.csv", "legcal new"), "tables")
+    yield Refusal("model-dataset", "inspect {in}", ("dataset", "legcal calibrate"), "plain")
+    yield Refusal(
+        "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
+    )
+    for name, content in {
+        "empty": b"", "binary": b"\x00\x01", "other": b"<a/>",
+        "bodies": b"<mujoco><worldbody/></mujoco>", "unclosed": b"<mujoco>",
+        "entity": b'<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>',
+    }.items():  # fmt: skip
+        edits = (text("machine.xml", content),)
+        yield Refusal(f"mjcf-{name}", "inspect {in}/machine.xml", ("machine.xml",), "", edits)
+
+
+def _new() -> Iterable[Refusal]:
+    file = "3-rps.yaml"
+
+    def entry(**values: Any) -> Edit:
+        return keyed(file, **values)
+
+    rows: Rows = [
+        ("no-unit", entry(unit=GONE), ("unit",)),
+        ("unit", entry(unit="cm"), ("unit", "'cm'", "mm")),
+        ("version", entry(legcal_table=2), ("legcal_table", "2", "1")),
+        ("key", entry(ofsets=380), ("ofsets", "'offsets'")),
+        ("name", entry(name="a/b"), ("name", "'a/b'")),
+        ("no-type", entry(type=GONE), ("type", "types")),
+        ("types", entry(types=["RPS"] * 3), ("type", "types")),
+        ("count", entry(type="6-RPS"), ("6-RPS", "3", "6")),
+        ("class", entry(type="3-PPS"), ("'PPS'",)),
+        ("type-text", entry(type="x-RPS"), ("'x-RPS'",)),
+        ("joints-size", entry(base_joints=[[1e300, 2, 3]] * 3), ("base_joints", "row 1")),
+        ("many", entry(base_joints=[[1, 2, 3]] * 33), ("base_joints", "33", "32")),
+        ("lengths", entry(lengths=455), ("lengths", "leg1")),
+        ("joints-row", entry(base_joints=[[1, 2, "x"]] * 3), ("base_joints", "row 1")),
+        ("platform", entry(platform_joints=[[1, 2, 3]]), ("platform_joints", "1", "3")),
+        ("offsets", entry(offsets="long"), ("offsets", "'long'")),
+        ("offsets-two", entry(offsets=[380, 380]), ("offsets", "2", "3")),
+        ("no-offsets", entry(offsets=GONE), ("leg1", "offset")),
+        ("no-travel", entry(travel=GONE), ("leg1", "travel")),
+        ("travel", entry(travel=[150, 0]), ("travel", "150")),
+        ("radius", entry(radius=-4), ("radius", "-4")),
+        ("pipe", entry(radius={"pipe": 4}), ("radius", "pipe")),
+        ("kinds", entry(kinds="loose"), ("kinds", "'loose'")),
+        ("constant", entry(kinds="constant"), ("leg1", "constant")),
+        ("axes", entry(base_axes=[[0, 0, 0]] * 3), ("base_axes", "row 1")),
+        ("axes-s", entry(platform_axes=[[1, 0, 0]] * 3), ("S",)),
+        ("home", entry(home={"xyz": [0, 0, 440]}), ("home",)),
+        ("home-norm", entry(home={"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 2]}),
+         ("home.quat_xyzw",)),
+        ("legs", entry(legs=["a", "a", "b"]), ("legs", "'a'")),
+        ("frame", entry(base_frame=["leg1", "leg9"]), ("base_frame", "'leg9'")),
+        ("one-point", entry(base_joints=[[1, 2, 3]] * 3), ()),
+        ("metres", entry(unit="m"), ("leg1", "unit")),
+        ("millimetres", entry(offsets=0.38, travel=[0, 0.15]), ("leg1", "unit")),
+        ("thin", entry(radius=0.014), ("leg1", "radius")),
+        ("across", entry(base_axes=[[0, 1, 0.1], None, None]), ("leg1", "90 deg")),
+        ("all-at-once", entry(unit="inch", offsets="long", radius=0),
+         ("unit", "offsets", "radius")),
+    ]  # fmt: skip
+    yield from _spoiled("table", f"new {{in}}/{file} -o {{out}}", "tables", rows)
+    head, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
+    lines: list[tuple[str, str, str, tuple[str, ...]]] = [
+        ("header", "type,base_x\n", "--unit mm", ("a header and no row",)),
+        ("column", f"{head},bse_z\n{row},0\n", "--unit mm", ("'bse_z'", "'base_z'")),
+        ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
+        ("twice", f"{head},type\n{row},RPS\n", "--unit mm", ("'type'",)),
+        ("long", f"{head}\n{row},1\n", "--unit mm", ("line 2", "6", "5")),
+        ("word", f"{head}\nRPS,1,x,3,4\n", "--unit mm", ("line 2", "base_y", "'x'")),
+        ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
+        ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
+        ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
+        ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
+        (
+            "semicolons",
+            "type;base_x;base_y;platform_x\nRPS;1;2;3\n",
+            "--unit mm",
+            ("'platform_y'",),
+        ),
+    ]
+    for name, content, words, named in lines:
+        yield Refusal(
+            f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
+            (text("m.csv", content),),
+        )  # fmt: skip
+    for name, words, named in (
+        ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
+        ("missing", "{in}/none.yaml", ("none.yaml",)),
+        ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
+    ):
+        yield Refusal(f"new-{name}", f"new {words} -o {{out}}", named, "tables")
+
+
+def _poses() -> Iterable[Refusal]:
+    p = "hexapod.csv"
+    sigma = swap(p, "\n", ",0.5\n", -1)
+    joint = "leg1_prismatic"
+    rows: Rows = [
+        ("no-y", header(p, "y", None), ("'y'",)),
+        ("no-joint", header(p, "leg3_prismatic", None), ("'leg3_prismatic'",)),
+        ("no-qw", header(p, "qw", None), ("'qw'",)),
+        ("angle", header(p, "qx", "rx"), ("'rx'",)),
+        ("column", swap(p, "leg1_prismatic,", "quality,leg1_prismatic,"), ("'quality'",)),
+        ("nan", cell(p, 2, x="nan"), ("row 2 (line 3)", "x", "'nan'")),
+        ("blank", cell(p, 2, z=""), ("row 2 (line 3)", "z")),
+        ("far", cell(p, 2, z="2e9"), ("2e9", "1e+06 m")),
+        ("reading", cell(p, 2, **{joint: "none"}), ("row 2", joint, "'none'")),
+        ("travel", cell(p, 2, **{joint: "0.4"}), (joint, "0.4")),
+        ("half", cell(p, 2, qx=""), ("row 2", "qx")),
+        ("norm", cell(p, 2, qx="2.0"), ("row 2", "0.001")),
+        ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
+        ("angle-sigma", (sigma, swap(p, "0.5", "angle_sigma")), ("angle_sigma", "0.5")),
+        ("twice", doubled(p), ("row 25", "row 1")),
+        ("empty", text(p, ""), ("no row",)),
+        ("no-rows", kept(p, 0), ("no row",)),
+        ("semicolons", text(p, "x;y;z\n1;2;3\n"), ("commas",)),
+        ("short", swap(p, "\n", "\n1,2\n"), ("row 1", "2", "13")),
+        ("two-poses", kept(p, 2), ("2", "3")),
+        ("gone", remove(p), (p,)),
+    ]
+    command = "locate {in}/hexapod/models/hexapod.yaml {in}/hexapod.csv -o {out}"
+    yield from _spoiled("poses", command, "tool-poses", rows)
+
+
+def _results() -> Iterable[Refusal]:
+    r = "result/result.json"
+
+    def document(**values: Any) -> Edit:
+        return keyed(r, **values)
+
+    rows: Rows = [
+        ("gone", remove(r), ("result.json",)),
+        ("broken", text(r, "{"), ("result.json",)),
+        ("other", document(legcal_result=GONE), ("legcal_result",)),
+        ("version", document(legcal_result=2), ("legcal_result", "2")),
+        ("covariance", document(covariance__0=[1.0]), ("covariance",)),
+        ("asymmetric", document(covariance__0__1=1.0), ("covariance",)),
+        ("kinematic", document(kinematic__covariance__0__1=1.0), ("kinematic",)),
+        ("names", document(kinematic__names__0="leg9.base.x"), ()),
+        ("sigma", document(parameters__0__sigma=-1e-5), ("sigma",)),
+        ("value", document(parameters__0__value=0.7), ("leg2.base.x",)),
+        ("shared", document(residuals__shared_px={"bias of nothing": 0.1}), ("bias of nothing",)),
+        ("model", remove("result/calibrated.yaml"), ("calibrated.yaml",)),
+    ]
+    yield from _spoiled("result", "calibrate {in}/set --check {in}/result", "result", rows)
+    yield Refusal(
+        "result-other-machine", "calibrate {in} --check {in}/none", ("none",), "3-rps-axes"
+    )
+
+
+def _scenes() -> Iterable[Refusal]:
+    away = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
+    inside = "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 1]}"
+    far = "{xyz: [90.0, 0.0, 0.2], quat_xyzw: [-0.5, -0.5, 0.5, 0.5]}"
+    endless = "{xyz: [0.0, 0.0, .inf], quat_xyzw: [0, 0, 0, 1]}"
+    norm = "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 2]}"
+    command = "simulate hexapod -o {out} --level outlines --poses 1"
+    for name, pose, said in (
+        ("away", away, ("c1", "leg")),
+        ("inside", inside, ("c1",)),
+        ("far", far, ("c1", "px")),
+        ("endless", endless, ("views.c1",)),
+        ("norm", norm, ("c1", "2")),
+    ):
+        content = f"views: {{c1: {{T_base_camera: {pose}}}}}\n"
+        yield Refusal(
+            f"scene-{name}", f"{command} --cameras {{in}}/c.yaml", said, "",
+            (text("c.yaml", content),),
+        )  # fmt: skip
+    looks: dict[str, tuple[str, tuple[str, ...]]] = {
+        "key": ("blurr: 1\n", ("blurr", "'blur'")),
+        "text": ("blur: many\n", ("blur", "'many'")),
+        "negative": ("blur: -1\n", ("blur", "-1")),
+        "electrons": ("electrons: 1e-300\n", ("electrons", "1e-300")),
+        "light": ("lights: [{strength: 1}]\n", ("lights.0.direction",)),
+        "list": ("[1]\n", ("look.yaml",)),
+    }
+    for name, (content, named) in looks.items():
+        yield Refusal(
+            f"look-{name}", "simulate hexapod -o {out} --appearance {in}/look.yaml", named, "",
+            (text("look.yaml", content),),
+        )  # fmt: skip
+    head = ",".join(JOINTS)
+    drawn: dict[str, tuple[str, tuple[str, ...]]] = {
+        "column": ("leg9_prismatic\n0.1\n", ("leg9_prismatic",)),
+        "travel": (f"{head}\n{','.join(['0.5'] * 6)}\n", ("0.5",)),
+        "word": (f"{head}\nx{',0.07' * 5}\n", ("'x'",)),
+        "empty": (f"{head}\n", ()),
+    }
+    for name, (content, named) in drawn.items():
+        yield Refusal(
+            f"readings-{name}",
+            "simulate hexapod -o {out} --level outlines --poses {in}/p.csv", named, "",
+            (text("p.csv", content),),
+        )  # fmt: skip
+    wide = keyed("camera_info.yaml", image_width=20000, image_height=20000)
+    yield Refusal("scene-huge", f"{command} --camera {{in}}/camera_info.yaml",
+                  ("20000 x 20000", "100000000"), "plain", (wide,))  # fmt: skip
+    yield Refusal(
+        "scene-board", f"{command} --board {{in}}/b.yaml", ("board",), "", (text("b.yaml", "a: 1"),)
+    )
+    yield Refusal("scene-again", "simulate 3-rpr -o {in} --level axes --poses 1", ("--force",),
+                  "3-rpr-axes")  # fmt: skip
+    invisible = Refusal(
+        "scene-invisible", "simulate {in}/models/hexapod.yaml -o {out} --level axes --poses 1",
+        ("cylinder",), "model", (_without_visuals,),
+    )  # fmt: skip
+    yield invisible
+
+
+def _alone(folder: Path) -> None:
+    (folder / "urdf/hexapod.urdf").rename(folder / "arm.urdf")
+
+
+def _without_visuals(folder: Path) -> None:
+    path = folder / "urdf/hexapod.urdf"
+    path.write_text(re.sub(r"<visual>.*?</visual>", "", path.read_text(), flags=re.DOTALL))
+
+
+REFUSALS: tuple[Refusal, ...] = (
+    *_use(),
+    *_options(),
+    *_datasets(),
+    *_measurements(),
+    *_cameras(),
+    *_tables(),
+    *_overrides(),
+    *_models(),
+    *_new(),
+    *_poses(),
+    *_results(),
+    *_scenes(),
+)
