@@ -358,7 +358,9 @@ def draw_session(
     nominal = moved_legs(true.nominal, design.parametrization.place, step)
     arms = design.arms
     if len(arms):
-        nominal = moved_legs(nominal, arms.place, arm_sigmas(arms) * rng.normal(size=len(arms)))
+        nominal = moved_legs(
+            nominal, arms.place, arm_sigmas(arms, nominal) * rng.normal(size=len(arms))
+        )
     radii = {
         part: radius * float(1.0 + noise.radius_sigma * rng.normal())
         for part, radius in true.radii.items()
@@ -376,9 +378,11 @@ def draw_session(
     return OutlineSession(legs, measurements, outlines, home)
 
 
-def arm_sigmas(arms: Parametrization) -> Array:
+def arm_sigmas(arms: Parametrization, legs: Sequence[Leg]) -> Array:
     """Return how well lines of arms are known before [rad, m]: as the joint fit takes them."""
-    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": DEFAULT_SETTINGS.arm_point_sigma}
+    length = float(np.mean([leg.q0 for leg in legs]))
+    point = DEFAULT_SETTINGS.arm_point_sigma * length
+    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": point}
     return np.array([known[unit] for unit in arms.units])
 
 
