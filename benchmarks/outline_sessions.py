@@ -358,9 +358,7 @@ def draw_session(
     nominal = moved_legs(true.nominal, design.parametrization.place, step)
     arms = design.arms
     if len(arms):
-        nominal = moved_legs(
-            nominal, arms.place, arm_sigmas(arms, nominal) * rng.normal(size=len(arms))
-        )
+        nominal = moved_legs(nominal, arms.place, arm_sigmas(arms) * rng.normal(size=len(arms)))
     radii = {
         part: radius * float(1.0 + noise.radius_sigma * rng.normal())
         for part, radius in true.radii.items()
@@ -378,11 +376,9 @@ def draw_session(
     return OutlineSession(legs, measurements, outlines, home)
 
 
-def arm_sigmas(arms: Parametrization, legs: Sequence[Leg]) -> Array:
+def arm_sigmas(arms: Parametrization) -> Array:
     """Return how well lines of arms are known before [rad, m]: as the joint fit takes them."""
-    length = float(np.mean([leg.q0 for leg in legs]))
-    point = DEFAULT_SETTINGS.arm_point_sigma * length
-    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": point}
+    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": DEFAULT_SETTINGS.arm_point_sigma}
     return np.array([known[unit] for unit in arms.units])
 
 

@@ -110,18 +110,13 @@ def plan(
         typer.Option("--hand-held", help="Every image from a place of its own; with --board."),
     ] = False,
     model_error: Annotated[
-        str | None,
-        typer.Option(
-            help="How far joints and offsets of the machine are off at most; by default 0.5 % of "
-            "the mean leg length.",
-            show_default=False,
-        ),
-    ] = None,
+        str, typer.Option(help="How far joints and offsets of the machine are off at most.")
+    ] = "2mm",
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of a reading; by default that of --given, or 5e-6 of the mean leg "
-            "length, of motors that turn 0.1mrad, of hobby servos 0.5deg.",
+            help="Sigma of a reading; by default that of --given, or 2um, of motors that turn "
+            "0.1mrad, of hobby servos 0.5deg.",
             show_default=False,
         ),
     ] = None,
@@ -134,10 +129,9 @@ def plan(
 ) -> None:
     """Plan a session: poses and camera places that determine a machine best."""
     from legcal.files.quantity import LENGTH, parse_quantity
-    from legcal.machine.loader import load_mechanism
     from legcal.planning import request
     from legcal.planning.information import DEFAULT_NOISE
-    from legcal.planning.places import parse_bounds, usual_setting
+    from legcal.planning.places import USUAL, parse_bounds
     from legcal.planning.session import check_session, write_session
     from legcal.report.plan import plan_files, plan_table
     from legcal.signals import held_back_signals, is_waiting
@@ -146,12 +140,10 @@ def plan(
         return None if text is None else parse_quantity(text, LENGTH, option)
 
     check_session(output, force=force)
-    error = length(model_error, "--model-error")
-    machine = load_mechanism(model)
-    setting = usual_setting(machine.size)
+    error = length(model_error, "--model-error") or 0.0
     with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
         found = request.plan(
-            machine,
+            model,
             images=images,
             images_per_view=images_per_view,
             cameras=cameras,
@@ -166,7 +158,7 @@ def plan(
             given=given,
             board=board,
             hand_held=hand_held,
-            setting=setting if error is None else replace(setting, length=error),
+            setting=replace(USUAL, length=error),
             seed=seed,
             workers=image_workers(cluster, workers),
             progress=not quiet,

@@ -1,7 +1,7 @@
 """Platform poses from the equations of the legs alone: nearest ones, and those at readings."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -21,13 +21,12 @@ from legcal.machine.equations import (
     pose_equations,
     posture_constraints,
 )
-from legcal.machine.leg import Leg, mean_length
+from legcal.machine.leg import Leg
 from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
-from legcal.machine.rods import actuators_of
 from legcal.machine.solver import poses_after, solve
 
-TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # of a leg length
+TOLERANCE = 1e-13  # of a leg length
 MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
 DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
 
@@ -38,8 +37,7 @@ class SolvedPoses(NamedTuple):
     R: Array  # (k, 3, 3)
     t: Array  # (k, 3) [m]
     missed: Array  # (k,) the largest of what legs still miss [m]
-    # (k,) the last step [rad], mean leg lengths: not small where a pose has not come to rest
-    size: Array
+    size: Array  # (k,) the last step [m, rad]: not small where a pose has not come to rest
 
 
 def solve_poses(
@@ -72,10 +70,7 @@ def solve_poses(
         return found.values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
-    length = mean_length(legs, poses[0]) if len(poses) else 1.0
-    unit = np.repeat([1.0, length], 3)
-    how: dict[str, Any] = {"tolerance": ROUNDING * length, "unit": unit, "rank": DEPENDENT}
-    found = solve(equations, poses_after, poses, steps=steps, **how)
+    found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
     poses, missed, size = found.points, found.worst, found.size
     if lengthening is None or len(poses) == 0:
         return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
@@ -90,8 +85,9 @@ def solve_poses(
             lambda poses: least_squares_equations(with_known(poses)),
             poses_after,
             poses,
+            tolerance=1e-15,
+            rank=DEPENDENT,
             steps=steps,
-            **how,
         )
         poses, size = found.points, found.size
         missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
@@ -121,12 +117,7 @@ def solve_postures(
 
     points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
     points = np.concatenate([points, q], axis=1)
-    length = mean_length(legs, points[0, :12].reshape(3, 4)) if len(points) else 1.0
-    turns = np.array([actuator.turns for actuator in actuators_of(legs)], dtype=np.bool_)
-    unit = np.concatenate([np.repeat([1.0, length], 3), np.where(turns, 1.0, length)])
-    found = solve(
-        equations, retract, points, tolerance=ROUNDING * length, unit=unit, rank=DEPENDENT
-    )
+    found = solve(equations, retract, points, tolerance=1e-15, rank=DEPENDENT)
     poses = found.points[:, :12].reshape(-1, 3, 4)
     solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
     return solved, found.points[:, 12:]

@@ -35,13 +35,14 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.square_root import information_rows, marginal_rows
 from legcal.geometry.lines import cross, normal_basis
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms, pose_equations
-from legcal.machine.leg import LegColumns
+from legcal.machine.leg import EquationKind, LegColumns
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, parametrize
 
+SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
 _WHOLE = slice(None)  # all numbers of a variable are touched
@@ -70,6 +71,9 @@ class WhitenedEquations:
     # displacements; and by readings of actuators, in metres
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
+    leg: IntArray  # (m,): the leg of each row
+    demand: tuple[EquationKind, ...]  # (m,): what it is about
+    reading: BoolArray  # (m,): rows of the readings of actuators, of the first leg on each
 
     def at(self, poses: IntArray) -> WhitenedEquations:
         """Return the equations at some of the poses, in that order."""
@@ -83,10 +87,11 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
     equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
     # The readings that move rods are rows of their own
     read = equations.measured & (predicted.carried_by < 0)[equations.leg]
-    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], predicted.sigma_exact)[:, None]
+    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], SIGMA_EXACT)[:, None]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
+    leg, kinds = equations.leg, equations.kinds
     if actuators:  # what moves joints is unknown at each pose, of actuators it is measured
         unit, n = predicted.unit_of_q, len(actuators)
         first = by_pose.shape[2]
@@ -96,7 +101,10 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
         by_pose = np.concatenate([by_pose, rows], axis=1)
         none = np.zeros((n_poses, n, by_parameters.shape[2]))
         by_parameters = np.concatenate([by_parameters, none], axis=1)
-    return WhitenedEquations(by_pose, by_parameters)
+        leg = np.append(leg, [int(np.argmax(predicted.carried_by == a)) for a in range(n)])
+        kinds = (*kinds, *[EquationKind.LENGTH] * n)
+    reading = np.arange(len(leg)) >= len(equations.leg)
+    return WhitenedEquations(by_pose, by_parameters, leg, kinds, reading)
 
 
 def image_rows(predicted: PredictedObservations) -> Array:
@@ -156,7 +164,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
         if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
         elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):
-            sigma[i] = predicted.sigma_exact * predicted.unit[i]
+            sigma[i] = SIGMA_EXACT * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)
 
@@ -166,13 +174,13 @@ def prior_of_arms(
 ) -> GaussianPrior:
     """Return what is known of the lines of arms, four numbers each; *stated*: by somebody."""
     named = parametrize(predicted.leg_names, predicted.legs, predicted.frame_legs, twists=True)
-    sigmas, unit = arm_sigmas(named, predicted.legs, predicted.arms), _line_unit(predicted)
+    sigmas, unit = arm_sigmas(named, predicted.arms), _line_unit(predicted)
     known = {}
     for i, (name, sigma) in enumerate(sigmas.items()):
         if name in choices.priors:
             known[i] = choices.priors[name].sigma / unit[i % 4]
         elif name in choices.fixed:
-            known[i] = predicted.sigma_exact
+            known[i] = SIGMA_EXACT
         elif name not in choices.free and not stated:
             known[i] = sigma / unit[i % 4]
     of = np.array(list(known), dtype=np.intp)
@@ -265,7 +273,7 @@ def _images(
 
 def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
     """Return the factor of what legs demand of poses, readings among it."""
-    m = equations.by_pose.shape[1]
+    m = len(equations.leg)
     demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     touches = (("parameters", np.zeros(n_poses, dtype=np.intp), _WHOLE),)
     return Factor("legs", lambda _: demanded, touches, n_poses, m, np.arange(n_poses))
@@ -273,7 +281,7 @@ def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
 
 def _ties(predicted: PredictedObservations, lengths: Array | None) -> Factor[_Nominal]:
     """Return the factor of what ties parameters to each other, and of measured lengths."""
-    ties = predicted.ties[None] / predicted.sigma_exact
+    ties = predicted.ties[None] / SIGMA_EXACT
     if lengths is not None:
         ties = np.concatenate([ties, lengths[None]], axis=1)
     tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
@@ -431,7 +439,7 @@ def intrinsics_changes(
     lateral = across.gradient[:, :, 0] @ R
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
     focal = predicted.focal[predicted.view][:, None, None]
-    depth = np.maximum(at[..., 2:], 1e-6 * predicted.mean_length)
+    depth = np.maximum(at[..., 2:], 1e-6)
     xy = at[..., :2] / depth
     u = predicted.body_u[predicted.pose] @ R
     along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m

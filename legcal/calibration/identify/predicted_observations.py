@@ -26,7 +26,7 @@ from legcal.machine.actuator import Actuator, ActuatorColumns, Arm, JointMotion
 from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.directions import leg_labels, list_in_words
 from legcal.machine.equations import freedoms
-from legcal.machine.leg import SIGMA_READING, Leg, LegColumns, LegKind, main_cylinders
+from legcal.machine.leg import Leg, LegColumns, LegKind, main_cylinders
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -54,8 +54,8 @@ _ALONG = 1e-6  # a leg that points at the camera shows no lateral direction: lea
 FOCAL_PX = 1290.0  # 1024 x 768 pixels, 43 degrees wide
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
+SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
-_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what the mechanism itself demands
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -183,6 +183,12 @@ class PredictedObservations:
         """Number of frames: of cameras that nothing ties to others, and of the board."""
         return int(self.frame.max(initial=-1)) + 1
 
+    @cached_property
+    def frames(self) -> tuple[tuple[int, ...], ...]:
+        """The legs that are seen in each frame."""
+        seen = [self.seen[self.frame == f].any(axis=0) for f in range(self.n_frames)]
+        return tuple(tuple(np.flatnonzero(row).tolist()) for row in seen)
+
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
@@ -304,11 +310,6 @@ class PredictedObservations:
         """Mean leg length, by which angles become lengths [m]."""
         return float(self.length.mean())
 
-    @property
-    def sigma_exact(self) -> float:
-        """Standard deviation of what the mechanism itself demands [m]."""
-        return _EXACT * self.mean_length
-
     @cached_property
     def unit(self) -> Array:
         """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
@@ -340,9 +341,11 @@ class PredictedObservations:
             return replace(self, platform_board=np.full(len(self.view), board, dtype=np.bool_))
         return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
-    def columns(self, kind: int) -> IntArray:
-        """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
-        found = self.parametrization.place[:, kind]
+    def columns(self, *kinds: int | slice, legs: BoolArray | None = None) -> IntArray:
+        """Return the parameters that stand for numbers (:class:`LegColumns`) of some legs."""
+        place = self.parametrization.place
+        place = place if legs is None else place[legs]
+        found = np.concatenate([place[:, kind].ravel() for kind in kinds])
         return np.unique(found[found >= 0])
 
 
@@ -424,7 +427,7 @@ def planned_observations(
         seen=seen,
         camera=default_cameras(A, B, views, machine.spatial, rng),
         focal=np.full(len(views), FOCAL_PX),
-        sigma_q=SIGMA_READING * machine.size,
+        sigma_q=SIGMA_Q,
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
     )

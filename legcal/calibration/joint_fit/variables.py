@@ -22,7 +22,7 @@ from legcal.geometry.axes import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.equations import PoseEquations, freedoms, posture_constraints
-from legcal.machine.leg import Leg, LegColumns, mean_length
+from legcal.machine.leg import Leg, LegColumns
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -41,9 +41,9 @@ from legcal.machine.ties import Ties, independent, ties_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
-_TIED, _TIE_STEPS = 2.5e-13, 20  # mean leg lengths, and steps towards it
-_MET = 2.5e-12  # mean leg lengths by which constraints are missed that are met
-_STEP_TOLERANCE = 1e-6  # mean leg lengths, [rad]: last step where they cannot all be met
+_TIED, _TIE_STEPS = 1e-13, 20  # [m], and steps towards it
+_MET = 1e-12  # [m, rad]
+_STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class RefinementSettings:
 
     radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
     arm_axis_sigma: float = 0.02  # of that on the line of an arm where the model draws it [rad],
-    arm_point_sigma: float = 0.01  # and across it, of the mean length of the rods
+    arm_point_sigma: float = 4e-3  # and across it [m]
     board_scale_sigma: float = 0.001  # of the dimensions of a board: what printers and paper do
     loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
     rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
@@ -225,11 +225,6 @@ class FittedLegs:
         return is_spatial(self.frame_legs)
 
     @cached_property
-    def length_at_home(self) -> float:
-        """Mean length of the legs where ties are taken [m]; 0 without a home."""
-        return 0.0 if self.home is None else mean_length(self.nominal, self.home.as_matrix()[:3])
-
-    @cached_property
     def sign(self) -> IntArray:
         """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
         return np.array([leg.sign for leg in self.nominal], dtype=np.intp)
@@ -380,7 +375,7 @@ class LegParameters:
         """Return legs moved, as little as possible, to where all ties hold."""
         for _ in range(_TIE_STEPS if self.n_tied else 0):
             left, rows = self.tie_rows(geometry)
-            if np.abs(left).max() < _TIED * self.legs.length_at_home:
+            if np.abs(left).max() < _TIED:
                 break
             step = np.append(-rows.T @ left, 0.0)
             geometry = self.retract(geometry, step[self.unknown])
@@ -483,8 +478,8 @@ class LegConstraints:
             return there
         raise DidNotConverge(
             "The joint fit could not keep the platform on what its joints allow: found a pose that "
-            f"still moves by {size:.2g} leg lengths or rad, needed rest; start nearer to the truth "
-            "(joints to 1 % of a leg length, axes to 3 deg)."
+            f"still moves by {size:.2g} m or rad, needed rest; start nearer to the truth (joints "
+            "to 5 mm, axes to 3 deg)."
         )
 
     def with_poses(self, state: State, poses: Postures) -> State:
@@ -505,7 +500,7 @@ class LegConstraints:
         else:
             found = solve_poses(state.legs, frame_legs, R, t)
         # The last step to where they hold may be long.
-        step = np.where(found.missed < _MET * state.mean_length, 0.0, found.size)
+        step = np.where(found.missed < _MET, 0.0, found.size)
         return replace(state, platform_pose=Postures(found.R, found.t, q)), step
 
     @cached_property
