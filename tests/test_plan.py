@@ -40,7 +40,7 @@ from legcal.planning import planner
 from legcal.planning.exchange import Session, choose
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
 from legcal.planning.noise import read_noise
-from legcal.planning.places import Place, Setting, parse_bounds
+from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.request import difference
@@ -51,7 +51,7 @@ from legcal.simulation.request import Level
 from legcal.simulation.settings import ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
-FEW = Setting(draws=3)
+FEW = replace(usual_setting(load_mechanism("3-rpr").size), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 
@@ -149,7 +149,7 @@ def test_the_command_writes_what_python_plans(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr("legcal.planning.places.USUAL_DRAWS", 3)
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
@@ -185,7 +185,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr(planner, "choose", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr("legcal.planning.places.USUAL_DRAWS", 3)
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
@@ -374,11 +374,13 @@ def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -
     """From where a machine is shown as well, wherever that is."""
     predictor = Predictor(load_mechanism("hexapod"), sample_camera(), WHITE, 1e-6)
     poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
-    around = [p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1), poses)]
+    around = [
+        p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1, FEW), poses)
+    ]
     middle = np.mean(around[:2], axis=0)  # one nearer than the other
     box = middle[:, None] + [-0.01, 0.01]
     assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
-    places = planner._places(Task(predictor, 6, 1, bounds=box), poses)
+    places = planner._places(Task(predictor, 6, 1, FEW, bounds=box), poses)
     assert places
     assert all(place.is_inside(box) for place in places)
 
@@ -386,7 +388,7 @@ def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -
 def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
     """A tripod stands on the ground, whichever way the platform is."""
     places = planner._places(
-        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1),
+        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1, FEW),
         random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
     )
     below = [place.T_base_camera.translation[2] < -0.5 for place in places]
@@ -413,7 +415,7 @@ def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
 
 
 def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
-    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1)
+    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
     view = planned.views[0]
     candidates = Candidates(Place(view.T_base_camera), view.poses)
     found = Scene.nominal(task).of(candidates)
@@ -450,10 +452,10 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
-    ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
-    ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
-    ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
-    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
+    ({"setting": Setting(0.05, 2e-3, draws=0)}, UsageError, "0 draws"),
+    ({"setting": Setting(50.0, 2e-3)}, UsageError, "off by 50 m"),
+    ({"setting": Setting(0.05, 3.0)}, UsageError, "a model error of 3 m"),
+    ({"setting": Setting(0.05, 0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
     ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
     ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]

@@ -110,13 +110,18 @@ def plan(
         typer.Option("--hand-held", help="Every image from a place of its own; with --board."),
     ] = False,
     model_error: Annotated[
-        str, typer.Option(help="How far joints and offsets of the machine are off at most.")
-    ] = "2mm",
+        str | None,
+        typer.Option(
+            help="How far joints and offsets of the machine are off at most; by default 0.5 % of "
+            "the mean leg length.",
+            show_default=False,
+        ),
+    ] = None,
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of a reading; by default that of --given, or 2um, of motors that turn "
-            "0.1mrad, of hobby servos 0.5deg.",
+            help="Sigma of a reading; by default that of --given, or 5e-6 of the mean leg "
+            "length, of motors that turn 0.1mrad, of hobby servos 0.5deg.",
             show_default=False,
         ),
     ] = None,
@@ -129,9 +134,10 @@ def plan(
 ) -> None:
     """Plan a session: poses and camera places that determine a machine best."""
     from legcal.files.quantity import LENGTH, parse_quantity
+    from legcal.machine.loader import load_mechanism
     from legcal.planning import request
     from legcal.planning.information import DEFAULT_NOISE
-    from legcal.planning.places import USUAL, parse_bounds
+    from legcal.planning.places import parse_bounds, usual_setting
     from legcal.planning.session import check_session, write_session
     from legcal.report.plan import plan_files, plan_table
     from legcal.signals import held_back_signals, is_waiting
@@ -140,10 +146,12 @@ def plan(
         return None if text is None else parse_quantity(text, LENGTH, option)
 
     check_session(output, force=force)
-    error = length(model_error, "--model-error") or 0.0
+    error = length(model_error, "--model-error")
+    machine = load_mechanism(model)
+    setting = usual_setting(machine.size)
     with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
         found = request.plan(
-            model,
+            machine,
             images=images,
             images_per_view=images_per_view,
             cameras=cameras,
@@ -158,7 +166,7 @@ def plan(
             given=given,
             board=board,
             hand_held=hand_held,
-            setting=replace(USUAL, length=error),
+            setting=setting if error is None else replace(setting, length=error),
             seed=seed,
             workers=image_workers(cluster, workers),
             progress=not quiet,

@@ -23,7 +23,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import actuator_index
@@ -217,7 +216,7 @@ class _Surplus:
             else:
                 by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
         parametrization = parametrization_of(machine)
-        length = leg_scale(machine, machine.home)
+        length = machine.size
         size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
         by_model = found.by_parameters(parametrization) * (_MODEL * size)
         values, own, of_model = (

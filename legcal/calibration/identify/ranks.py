@@ -40,7 +40,7 @@ from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, s
 from legcal.machine.equations import pose_sensitivity
 from legcal.vision.board import Link
 
-_ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
+_ERROR = 0.0025  # mean leg lengths: the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move
 
 
@@ -271,10 +271,11 @@ def weak_directions(
 def _direction(
     predicted: PredictedObservations, motion: PlatformMotion, row: Array, harmless: bool
 ) -> WeakDirection:
-    """Return a direction with its largest component at 1 mm."""
-    row = row * (_ERROR / row[np.argmax(np.abs(row))])
-    shown = np.flatnonzero(np.abs(row) > SHOWN * _ERROR)
-    shown = shown[np.argsort(-np.abs(row[shown] / _ERROR).round(3), kind="stable")]
+    """Return a direction with its largest component at a small part of the leg length."""
+    row = row / row[np.argmax(np.abs(row))]
+    shown = np.flatnonzero(np.abs(row) > SHOWN)
+    shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
+    row = row * (_ERROR * predicted.mean_length)
     names = tuple(predicted.parametrization.names[i] for i in shown)
     effect = motion.effect(row)
     return WeakDirection(

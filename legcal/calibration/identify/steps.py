@@ -11,7 +11,7 @@ from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
-from legcal.calibration.identify.information import SIGMA_EXACT, WhitenedEquations, pose_unit
+from legcal.calibration.identify.information import WhitenedEquations, pose_unit
 from legcal.calibration.identify.predicted_observations import (
     Across,
     PredictedObservations,
@@ -251,7 +251,7 @@ def identify_platform(
     rows = np.concatenate(
         [rows * wanted[..., None], grouped(seen, groups.of_image, len(groups.pose))], axis=1
     )
-    ties = predicted.ties[:, columns] / SIGMA_EXACT
+    ties = predicted.ties[:, columns] / predicted.sigma_exact
     found = np.concatenate([eliminate(rows[:, :, keep], n_f), ties])
     return StepInformation("platform_joints", columns, found)
 
@@ -346,7 +346,7 @@ def _joint_and_axis(
     rows[:, 2:4, 2:] = B.gradient[here, j] @ by_A
     rows[:, 4, :2] = np.einsum("kia,ka->ki", E, axis) / length[:, None]
     rows[:, 4, 2:] = np.einsum("ka,kac->kc", u, by_v)
-    rows[:, 4] *= predicted.mean_length / SIGMA_EXACT
+    rows[:, 4] *= predicted.mean_length / predicted.sigma_exact
     return eliminate(rows, 2)
 
 
