@@ -45,7 +45,7 @@ _POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it i
 # they suffice
 _REACH = 0.15  # of these from home [rad], and of the mean leg length
 _RANK, _NEARLY = 1e-7, 1e-3  # of the largest singular value
-_AT_REST, _STEPS = 1e-13, 30  # [m, rad], the last of so many Gauss-Newton steps
+_AT_REST, _STEPS = 2.5e-13, 30  # mean leg lengths, [rad]: the last of so many Gauss-Newton steps
 _TRIAL = 1e-3  # of the mean leg length, and [rad]: errors that a machine must be able to have
 _WHOLLY = 1e-9
 _CLOSED = 1e-10  # of the mean leg length
@@ -186,8 +186,8 @@ def on_ties(
     for _ in range(_STEPS):
         found = ties.at(legs)
         left, along = independent(found, by_step(found, place) * scale, n)
-        step = -scale * (along.T @ left)
-        legs = moved_legs(legs, place, step)
+        step = -(along.T @ left)
+        legs = moved_legs(legs, place, scale * step)
         if np.abs(step).max(initial=0.0) < _AT_REST:
             break
     return tuple(legs)
@@ -322,10 +322,10 @@ def _closed(
         left, singular, right = np.linalg.svd(slopes)
         rank = left.shape[1] - n_dependent
         along = np.einsum("kmr,km->kr", left[:, :, :rank], found.values) / singular[:, :rank]
-        step = -np.einsum("kr,krc->kc", along, right[:, :rank]) / unit
-        if np.abs(step).max(initial=0.0) < _AT_REST:
+        step = -np.einsum("kr,krc->kc", along, right[:, :rank])
+        if np.abs(step).max(initial=0.0) < _AT_REST * mean_length(legs, home):
             break
-        at = _moved(at, step)
+        at = _moved(at, step / unit)
     return at, found, left[:, :, rank:]
 
 
