@@ -23,7 +23,6 @@ from legcal.machine.leg import KinematicParameters, point_like_legs
 from legcal.machine.parameters import parametrize, to_vector
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import NominalMachine, point_like_machine
-from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     RAISED,
@@ -41,11 +40,10 @@ from legcal.simulation.hexapod import (
     simulated_leg_vectors,
 )
 from legcal.simulation.observe import TableNoise
-from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
+from legcal.simulation.paper_report import BOUND, INITIAL, PaperSummary
 from legcal.simulation.study import Record, failure_of
 
 MACHINES = {"coplanar": paper_hexapod, "noncoplanar": noncoplanar_hexapod}
-_N_PARAMETERS = 30  # of a 6-SPU
 
 
 @dataclass(frozen=True)
@@ -83,14 +81,6 @@ class PaperStudy:
             name: self._calibrations(truth(), np.random.default_rng(child))
             for (name, truth), child in zip(MACHINES.items(), seeds, strict=True)
         }
-
-    def is_record(self, found: Any) -> bool:
-        """Return whether a document has the errors of every estimator on either machine."""
-        wanted = {INITIAL, *self.estimators, BOUND}
-        return has_keys(found, set(MACHINES)) and all(
-            has_keys(of_machine, wanted) and all(map(is_errors, of_machine.values()))
-            for of_machine in found.values()
-        )
 
     def summary(self, records: Iterable[Record]) -> PaperSummary:
         """Return the means over all runs."""
@@ -278,16 +268,3 @@ def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: A
         "of_bound_squared": of_bound_squared,
         "parameters": parameters.tolist(),
     }
-
-
-def is_errors(found: Any) -> bool:
-    """Return whether a document has the errors of one estimator, or how it failed."""
-    if has_keys(found, {"failure"}):
-        return is_failure(found["failure"])
-    return (
-        has_keys(found, {*SCALARS, "parameters"})
-        and all(is_number(found[name]) for name in SCALARS)
-        and isinstance(found["parameters"], list)
-        and len(found["parameters"]) == _N_PARAMETERS
-        and all(map(is_number, found["parameters"]))
-    )

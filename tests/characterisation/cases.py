@@ -409,26 +409,6 @@ def _simulate() -> Iterable[Case]:
     )
 
 
-def _studies() -> Iterable[Case]:
-    machine = "--machine 3-rpr"
-    for name, words, folder in (
-        ("paper", "--radians", "{out}"),
-        ("bound", machine, "{out}"),
-        ("convergence", machine, "{out}"),
-        ("classes", machine, "{out}"),
-    ):
-        runs = "1" if name == "paper" else "2"
-        command = f"study {name} --runs {runs} --seed 5 --workers 1 {words} --output {{out}} --json"
-        system = name == "classes"
-        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=not system, system=system)
-    resumed = f"study convergence --runs {{}} --seed 5 --workers 2 {machine} -o {{{{out}}}} --json"
-    yield Case(
-        "study-resumed",
-        (Step(resumed.format(1)), Step(resumed.format(3)), Step(resumed.format(2))),
-        slow=True,
-    )
-
-
 def _others() -> Iterable[Case]:
     yield Case("version", (Step("--version"),))
 
@@ -442,6 +422,5 @@ CASES: tuple[Case, ...] = (
     *_images(),
     *_locate(),
     *_simulate(),
-    *_studies(),
     *_others(),
 )

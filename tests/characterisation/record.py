@@ -33,7 +33,7 @@ EXPECTED = Path(__file__).parent / "expected"
 
 COMMANDS = (
     "", "inspect", "camera", "identify", "detect", "calibrate", "evaluate", "locate", "new",
-    "noise", "simulate", "study paper", "study bound", "study convergence", "study classes",
+    "noise", "simulate", "study paper",
 )  # fmt: skip
 
 

@@ -280,7 +280,6 @@ def _use() -> Iterable[Refusal]:
         "calibrate": "calibrate {in} -o {in}",
         "simulate": "simulate 3-rpr -o {in} --level axes --poses 1",
         "simulate-force": "simulate 3-rpr -o {in} --level axes --poses 1 --force",
-        "study": "study convergence --machine 3-rpr --runs 1 -o {in}",
         "detect": "detect {in} -o {in}",
     }.items():
         given = "plain" if name in {"calibrate", "detect"} else ""
@@ -368,11 +367,7 @@ def _options() -> Iterable[Refusal]:
     yield from _worded("simulate", "simulate hexapod -o {out}", simulate)
 
     study: list[tuple[str, str, tuple[str, ...]]] = [
-        ("runs", "convergence --runs 0", ("0",)),
-        ("seed", "bound --seed -1", ("-1",)),
         ("workers", "paper --workers 0", ("--workers", "found 0")),
-        ("machine", "bound --machine 4-rpr", ("4-rpr", "3-rpr")),
-        ("class", "classes --machine 6-spu-coplanar", ("6-spu-coplanar", "hexapod")),
     ]
     yield from _worded("study", "study", study)
 
