@@ -32,7 +32,6 @@ from outline_sessions import (
     closed_poses,
     design_of,
     draw_session,
-    nominal_start,
     one_fit,
 )
 from outline_study import (
@@ -41,6 +40,7 @@ from outline_study import (
 )
 from parameter_steps import written_with
 from rich.console import Console
+from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.calibration.joint_fit.solution import Solution
@@ -54,6 +54,7 @@ from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import parametrization_of, vector_of
+from legcal.simulation.paper import nominal_start
 from legcal.simulation.study import Record, child_seed, run_study
 
 NOISE = Noise()
@@ -366,7 +367,7 @@ def test_what_a_fit_starts_from_is_as_wrong_as_is_said(errors: StartErrors, leas
 def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
     design, session = _design(machine), _session(machine)
     nominal = session.legs.nominal
-    start = nominal_start(session)
+    start = nominal_start(session.legs, session.measurements, RigidTransform.identity())
     assert start.legs == nominal
     q = session.measurements.q_of_poses
     lengths = session.legs.sign * q + np.array([leg.q0 for leg in nominal])

@@ -22,12 +22,15 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import View
 from legcal.data.outlines import format_observations, read_observations
 from legcal.errors import DatasetError, NotVisible, OutOfResources, UsageError
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.geometry.motions import look_at
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.report.images import simulation_table
+from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import SimulatedDataset, simulate, summary_document
 from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
-from legcal.simulation.observe import TableNoise
+from legcal.simulation.observe import OutlineNoise, TableNoise
 from legcal.simulation.request import Level, Request, Sampling
 from legcal.simulation.settings import (
     Distribution,
@@ -36,6 +39,7 @@ from legcal.simulation.settings import (
     Spread,
     requested,
 )
+from legcal.simulation.visibility import Viewpoint
 
 FEW = settings(poses=1, views=1)
 
@@ -186,26 +190,33 @@ def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: 
     assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()
 
 
+def _from_the_side(name: str, camera: Path | None, x: float, *legs: str) -> Viewpoint:
+    """Return a camera that sees the hexapod from a side."""
+    T = motion_from_xyz_quat((x, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
+    return Viewpoint(name, mild_lens() if camera is None else read_lens(camera), T, legs or None)
+
+
 def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
-    place = "T_base_camera: {{xyz: [{}, 0.26, 0.19], quat_xyzw: [0.411, 0.574, -0.552, -0.443]}}"
-    (tmp_path / "cameras.yaml").write_text(
-        f"views:\n  left: {{camera: small.yaml, {place.format(0.93)}}}\n"
-        f"  right: {{{place.format(0.94)}}}\n"
+    views = (
+        _from_the_side("left", small_camera(tmp_path), 0.93),
+        _from_the_side("right", None, 0.94, "leg2", "leg5"),
     )
-    small_camera(tmp_path)
     rows = ["0.06,0.06,0.06,0.06,0.06,0.06", "0.07,0.06,0.05,0.06,0.08,0.06"]
     header = ",".join(f"leg{j}_prismatic" for j in range(1, 7))
     (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
     given = settings(
-        views=tmp_path / "cameras.yaml", poses=str(tmp_path / "poses.csv"), readings=Spread(),
-        level=Level.AXES,
+        views=views, poses=tmp_path / "poses.csv", readings=Spread(), level=Level.AXES,
+        occlusion=False,
     )  # fmt: skip
-    m = load_dataset(simulate("hexapod", tmp_path / "set", given).folder).measurements
+    made = simulate("hexapod", tmp_path / "set", given)
+    m = load_dataset(made.folder).measurements
 
     def lens(view: View) -> tuple[str, int]:
         return view.name, view.camera.width
 
     assert [lens(view) for view in m.views] == [("left", 200), ("right", 1024)]
+    assert m.views[1].legs == ("leg2", "leg5")
+    assert made.seen.tolist() == [[True] * 6] * 2 + [[False, True, False, False, True, False]] * 2
     assert m.pose.tolist() == [0, 1, 0, 1]
     readings = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
@@ -227,6 +238,22 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
+def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:
+    T = look_at(np.array([1.0, 0.2, 0.3]), np.zeros(3)).inv()
+    assert np.allclose(T.apply(np.zeros(3))[:2], 0.0, atol=1e-12)
+    assert T.apply(np.zeros(3))[2] > 0.0
+    assert T.apply([0.0, 0.0, 0.1])[1] < 0.0
+
+
+def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
+    noise = OutlineNoise(sigma_px=0.2, n_points=50)
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 1.0, 50)
+    fits = np.polyfit(t, rng.normal(scale=0.2, size=(50, 20000)), 1)
+    ends = np.stack([fits[1], fits[0] + fits[1]])
+    assert np.allclose(np.cov(ends), noise.covariance(0.0), rtol=0.1, atol=2e-4)
+
+
 # --- settings
 
 
@@ -238,13 +265,13 @@ def test_options_become_settings(tmp_path: Path) -> None:
     request = Request(
         level=Level.OUTLINES, seed=4, error=["none", "radii=0.1mm", "joints=1mm:normal"],
         poses="7", sampling=Sampling.WORKSPACE, shared_poses=True, images=2,
-        cameras=tmp_path / "c.yaml", hints=False, pixel_noise="0px",
+        views=2, hints=False, pixel_noise="0px",
     )  # fmt: skip
     joints = Spread(1e-3, Distribution.NORMAL)
     errors = ParameterErrors(base_joints=joints, platform_joints=joints, radii=Spread(1e-4))
     assert requested(request, load_mechanism("hexapod")) == SimulationSettings(
         level=Level.OUTLINES, seed=4, errors=errors, poses=7, sampling=Sampling.WORKSPACE,
-        shared_poses=True, images=2, views=tmp_path / "c.yaml", hints=False, sigma_px=0.0,
+        shared_poses=True, images=2, views=2, hints=False, sigma_px=0.0,
     )  # fmt: skip
 
 
@@ -327,7 +354,7 @@ def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
         ({"seed": -1}, "seed, needed a whole number of 0 or more"),
         ({"poses": 1000, "views": 100, "images": 2}, "200000 images"),
         ({"board": "charuco", "hand_held": True, "images": 2}, "2 images of each pose"),
-        ({"board": "charuco", "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
+        ({"board": "charuco", "hand_held": True, "views": "c.yaml"}, "and places of cameras"),
         ({"board": 3}, "3 as board, needed a Board"),
     ],
 )
@@ -362,11 +389,8 @@ def test_cameras_of_too_many_pixels_or_images_are_refused(tmp_path: Path) -> Non
     large = settings(poses=1, views=1, camera=small_camera(tmp_path, 4_000_000_000, 3000))
     with pytest.raises(DatasetError, match="found 4000000000 x 3000 px, needed at most"):
         simulate("hexapod", tmp_path / "set", large)
-    place = "{T_base_camera: {xyz: [1, 0, 0.2], quat_xyzw: [0, 0, 0, 1]}}"
-    path = tmp_path / "cameras.yaml"
-    path.write_text(f"views: {{a: {place}, b: {place}}}\n")
     with pytest.raises(UsageError, match=r"found 120000 images \(2 views of 1 poses, 60000 of"):
-        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path, images=60_000))
+        settings(poses=1, views=2, images=60_000)
 
 
 # --- the folder: what --force replaces, and what it never touches
@@ -419,11 +443,11 @@ def test_force_replaces_a_simulated_dataset_and_keeps_what_is_not_its_own(tmp_pa
 
 
 def test_a_failure_leaves_an_earlier_dataset_as_it_was(out: Path, tmp_path: Path) -> None:
-    away = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
-    (tmp_path / "cameras.yaml").write_text(f"views: {{c1: {{T_base_camera: {away}}}}}\n")
+    away = motion_from_xyz_quat((1.5, 0.0, 0.2), (0.5, 0.5, 0.5, 0.5))
+    nothing = (Viewpoint("c1", mild_lens(), away),)
     before = files_of(tmp_path)
     with pytest.raises(NotVisible):
-        simulate("hexapod", out, settings(poses=1, views=tmp_path / "cameras.yaml"), force=True)
+        simulate("hexapod", out, settings(poses=1, views=nothing), force=True)
     assert files_of(tmp_path) == before
 
     def full() -> None:

@@ -114,17 +114,18 @@ def read_lens(path: Path) -> Camera:
     return camera
 
 
-def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
-    """Return the camera and T_base_camera of every view of a file."""
+def read_cameras(path: Path, camera: Camera) -> tuple[Viewpoint, ...]:
+    """Return the cameras of a file and where they stand."""
     found = read_yaml(path, "cameras file")
     entry = validate(CamerasEntry, found, path)
-    return {
-        name: (
+    return tuple(
+        Viewpoint(
+            name,
             camera if view.camera is None else read_lens(path.parent / view.camera),
             view.T_base_camera.motion(),
         )
         for name, view in entry.views.items()
-    }
+    )
 
 
 def cameras_around(

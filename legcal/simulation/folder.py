@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ def write_truth(
         "legcal_truth": 1,
         "legcal": __version__,
         "model": f"models/{truth.yaml_path.name}",
-        "settings": _plain(asdict(settings)),
+        "settings": _plain(asdict(replace(settings, views=settings.n_views))),
         "radii": {leg.name: leg.radius_of_part for leg in truth.legs},
         "views": {
             view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)}

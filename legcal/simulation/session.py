@@ -29,7 +29,6 @@ from legcal.simulation.cameras import (
     camera_in_hand,
     cameras_around,
     mild_lens,
-    read_cameras,
     read_lens,
     rough_pose,
 )
@@ -62,9 +61,10 @@ _MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
 _MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
 
 
-def streams(seed: int) -> dict[str, np.random.Generator]:
+def streams(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
     """Return a random generator for each purpose: draws for one do not change the others."""
-    children = np.random.SeedSequence(seed).spawn(len(_PURPOSES))
+    root = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
+    children = root.spawn(len(_PURPOSES))
     return {
         name: np.random.default_rng(child) for name, child in zip(_PURPOSES, children, strict=True)
     }
@@ -127,24 +127,22 @@ class _Simulator:
         """The plan that is shot, if one is."""
         return None if self.settings.plan is None else read_plan(self.settings.plan, self.nominal)
 
-    @cached_property
-    def given_views(self) -> tuple[dict[str, Camera], tuple[Viewpoint, ...]]:
-        """The camera of each view, and where all of them stand if settings give that."""
-        settings = self.settings
-        camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
-        if isinstance(settings.views, int):
-            return {f"c{v + 1}": camera for v in range(settings.views)}, ()
-        given = read_cameras(settings.views, camera)
-        cameras = {name: lens for name, (lens, _) in given.items()}
-        return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
+    @property
+    def given_views(self) -> tuple[Viewpoint, ...]:
+        """Where cameras stand, if settings give that."""
+        views = self.settings.views
+        return () if isinstance(views, int) else tuple(views)
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
         """The camera of each view."""
-        plan, (cameras, _) = self.plan, self.given_views
-        if plan is not None:
-            return {view.name: view.camera for view in plan.measurements.views}
-        return cameras
+        settings = self.settings
+        if self.plan is not None:
+            return {view.name: view.camera for view in self.plan.measurements.views}
+        if not isinstance(settings.views, int):
+            return {view.name: view.camera for view in settings.views}
+        camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
+        return {f"c{v + 1}": camera for v in range(settings.views)}
 
     @property
     def n_sets(self) -> int:
@@ -176,8 +174,9 @@ class _Simulator:
         """Return boards and cameras around the machine: where plan and settings have them."""
         # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
-        posed = pose_machine(self.truth, dressed(replace(self.truth, urdf=urdf)), poses)
-        on_base, (_, views), groups = None, self.given_views, tuple[str, ...]()
+        solids = dressed(replace(self.truth, urdf=urdf)) if self.settings.occlusion else ()
+        posed = pose_machine(self.truth, solids, poses)
+        on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:
             on_base = self._board_of_plan(self.plan)
             posed = _beside(on_base, posed)

@@ -31,10 +31,12 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import kind_of_parameter, parametrization_of
 from legcal.option_fields import flags_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
+from legcal.simulation.cameras import mild_lens, read_cameras, read_lens
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.pipeline import CAMERAS
 from legcal.simulation.request import Angles, Level, Request, Sampling
+from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board
 
 MAX_SIZE = 1.0  # [m] or [rad]
@@ -177,8 +179,10 @@ class SimulationSettings:
         Every view sees the same poses (several cameras at once) instead of its own.
     images : int
         Images of each pose in each view.
-    views : int or Path
-        Number of cameras around the machine, or a file that says where they stand.
+    views : int or sequence of Viewpoint
+        Number of cameras around the machine, or where they stand.
+    occlusion : bool
+        Parts of the machine hide its legs from a camera; in photographs they always do.
     camera : Path or None
         Camera file of all views that name none; None for a camera of 1024 x 768 pixels with
         slight distortion.
@@ -225,7 +229,8 @@ class SimulationSettings:
     sampling: Sampling = Sampling.EXTREME
     shared_poses: bool = False
     images: int = 1
-    views: int | Path = 3
+    views: int | Sequence[Viewpoint] = 3
+    occlusion: bool = True
     camera: Path | None = None
     hints: bool = True
     tell_gamma: bool = True
@@ -245,20 +250,20 @@ class SimulationSettings:
     def __post_init__(self) -> None:
         for name, choices in (("level", Level), ("sampling", Sampling)):
             object.__setattr__(self, name, _choice(choices, name, getattr(self, name)))
-        for name in ("poses", "views", "camera", "plan"):
+        for name in ("poses", "camera", "plan"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, Path(getattr(self, name)))
         self._check_kinds()
         for name in ("poses", "views", "images", "seed"):
-            if not isinstance(getattr(self, name), Path):
+            if not isinstance(getattr(self, name), Path | Sequence):
                 least, most = (0, None) if name == "seed" else (1, MAX_IMAGES)
                 what = "as the seed" if name == "seed" else name
                 whole = whole_number(what, getattr(self, name), least, most)
                 object.__setattr__(self, name, whole)
         self._check_sizes()
         self._check_board()
-        n_views, n_poses = (1 if isinstance(x, Path) else x for x in (self.views, self.poses))
-        self.check_images(n_views, n_poses)
+        n_poses = self.poses if isinstance(self.poses, int) else 1
+        self.check_images(self.n_views, n_poses)
 
     def _check_kinds(self) -> None:
         """Refuse settings that are no settings at all."""
@@ -324,7 +329,7 @@ class SimulationSettings:
             ]
         if self.hand_held and not isinstance(self.views, int):
             problems.append(
-                f"{start} a camera in the hand and a file of cameras, needed a number of views; "
+                f"{start} a camera in the hand and places of cameras, needed a number of views; "
                 "leave out one of the two."
             )
         if self.hand_held and self.images > 1:
@@ -344,6 +349,11 @@ class SimulationSettings:
                 f"{n_poses} poses, {self.images} of each), needed at most {MAX_IMAGES}; give "
                 "fewer views, poses or images."
             )
+
+    @property
+    def n_views(self) -> int:
+        """Number of cameras."""
+        return self.views if isinstance(self.views, int) else len(self.views)
 
     @property
     def encoder_sigma(self) -> float:
@@ -450,7 +460,7 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         sampling=request.sampling or Sampling.EXTREME,
         shared_poses=bool(request.shared_poses) or isinstance(given, Path),
         images=request.images,
-        views=request.cameras or (3 if request.views is None else request.views),
+        views=_views(request),
         camera=_camera(request)[0],
         board=_board(request.board, "--board"),
         platform_board=_board(request.platform_board, "--platform-board"),
@@ -466,6 +476,14 @@ def requested(request: Request, nominal: Machine) -> SimulationSettings:
         plan=request.plan,
         lengths=_lengths(request.length or (), nominal),
     )
+
+
+def _views(request: Request) -> int | tuple[Viewpoint, ...]:
+    """Return how many cameras there are, or where they stand."""
+    if request.cameras is None:
+        return 3 if request.views is None else request.views
+    file = _camera(request)[0]
+    return read_cameras(request.cameras, mild_lens() if file is None else read_lens(file))
 
 
 def _encoder_noise(text: str, nominal: Machine) -> dict[str, Spread]:
