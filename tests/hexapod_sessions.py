@@ -27,10 +27,10 @@ from legcal.simulation.observe import (
     outlines_of,
 )
 from legcal.simulation.paper import PAPER_VIEWS, paper_cameras
-from legcal.simulation.request import Level
 from legcal.simulation.session import simulate_session, streams
 from legcal.simulation.settings import (
     Distribution,
+    Level,
     ParameterErrors,
     SimulationSettings,
     Spread,

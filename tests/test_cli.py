@@ -10,6 +10,7 @@ import pytest
 from command_line import run
 from hexapod_example import Run, copy_of_the_example
 
+from legcal.cli.gone import GONE
 from legcal.errors import ModelError, NotVisible
 
 
@@ -144,7 +145,7 @@ def test_without_a_command_the_help_is_shown(
     ("words", "found"),
     [
         (("doctor", "x", "--nonsense"), "--nonsense"),
-        (("simulate", "x", "--level", "nonsense"), "'nonsense' is not one of 'axes'"),
+        (("simulate", "x", "--level", "nonsense"), "'nonsense' is not one of 'photographs'"),
         (("doctor",), "DATASET"),
         (("study", "nonsense"), "'nonsense'"),
     ],
@@ -159,6 +160,18 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     (line,) = capsys.readouterr().err.splitlines()
     assert found in line
     assert f"; legcal {words[0]} --help lists" in line
+
+
+def test_options_of_earlier_versions_are_refused_with_what_takes_their_place(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command, options in GONE.items():
+        for option, instead in options.items():
+            for words in ([option], option.split("=")):
+                assert run(monkeypatch, *command.split(), "x", "-o", "y", *words) == 2
+                (line,) = capsys.readouterr().err.splitlines()
+                assert line.startswith(f"legcal: {option.replace('=', ' ')} could not be used")
+                assert line.endswith(f"needed {instead}.")
 
 
 @pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
@@ -186,7 +199,7 @@ def test_help_names_the_unit_of_the_tool_position(
 def test_progress_is_shown_unless_somebody_wants_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["simulate", "3-rpr", "--level", "axes", "--poses", "4", "--views", "1"]
+    words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "2"]
     assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
     shown = capsys.readouterr()
     assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0

@@ -18,7 +18,7 @@ from legcal.calibration.pipeline import calibrate
 from legcal.calibration.result_folder import load_result
 from legcal.cluster import Stamp
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from legcal.cli.commands import (
 )
 from legcal.cli.example import example
 from legcal.cli.export import export
+from legcal.cli.gone import refuse_gone
 from legcal.cli.import_ import import_
 from legcal.cli.init import init
 from legcal.cli.new import new
@@ -135,6 +136,7 @@ def run(*, as_json: bool) -> int:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
+        refuse_gone(sys.argv[1:])
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error

@@ -105,9 +105,7 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
     )
 
 
-def simulation_table(
-    document: dict[str, Any], *, repeated: bool, to_measure: str = ""
-) -> RenderableType:
+def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
     """Return the document of ``simulate``: how many images of each view show each leg.
 
     *to_measure* is the distance that would fix the scale, where nothing in the dataset does.
@@ -120,7 +118,6 @@ def simulation_table(
         for name, view in views.items()
     ]
     folder = shlex.quote(document["dataset"])
-    is_noise = repeated and document["level"] == "photographs"
     return report(
         heading(
             document["mechanism"],
@@ -136,8 +133,8 @@ def simulation_table(
             "travel.",
             Text(
                 "Readings of motors that turn carry no length, and nothing else in this dataset "
-                f"does: simulate with --length {to_measure}=0.05mm, or calibrate with --length "
-                "or --prior.",
+                f"does: simulate with --board charuco, or state the distance {to_measure} to "
+                "calibrate.",
                 style="yellow",
             )
             if to_measure
@@ -150,7 +147,6 @@ def simulation_table(
                 f"the true model: {document['truth']}",
                 f"calibrate with: legcal calibrate {folder} -o OUT",
                 f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
-                *([f"measure noise with: legcal noise {folder}"] * is_noise),
             )
         ],
     )

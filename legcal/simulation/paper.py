@@ -47,9 +47,14 @@ from legcal.paper.nominal import NominalMachine
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.paper_report import BOUND, INITIAL, PaperSummary
 from legcal.simulation.poses import draw_poses
-from legcal.simulation.request import Level, Sampling
 from legcal.simulation.session import SimulatedSession, simulate_session, streams
-from legcal.simulation.settings import ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.settings import (
+    Level,
+    ParameterErrors,
+    Sampling,
+    SimulationSettings,
+    Spread,
+)
 from legcal.simulation.study import Record, failure_of
 from legcal.simulation.truth import draw_errors, write_model_with
 from legcal.simulation.visibility import Viewpoint

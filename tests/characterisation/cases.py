@@ -81,10 +81,10 @@ class Chain(Case):
     def observe(self, folder: Path) -> dict[str, Any]:
         """Run it, and tell of the simulated dataset too: what is wrong there shows there."""
         machine, _, level = self.name.rpartition("-")
-        made, outcome = simulated(machine, level)
+        made, document = simulated(machine, level)
         tables = sorted(made.glob("*.csv"))
         before = {
-            "document": facts(outcome.document),
+            "document": facts(document),
             "tables": {path.name: table_facts(path) for path in tables},
             "files": sorted(
                 p.relative_to(made).as_posix()
@@ -255,16 +255,6 @@ def _calibrate() -> Iterable[Case]:
         input="3-rpr-axes",
     )
     yield Case(
-        "check",
-        (
-            Step("calibrate {in}/set --check {in}/result --json"),
-            Step("calibrate {in}/set --check {in}/result/result.json --significance 0.001 --json"),
-            Step("simulate 3-rpr -o {out} --level outlines --poses 4 --views 1 --seed 8"),
-            Step("calibrate {out} --check {in}/result --json"),
-        ),
-        input="result",
-    )
-    yield Case(
         "photographs-again",
         (
             Step("calibrate {in} -o {out} --json"),
@@ -274,23 +264,6 @@ def _calibrate() -> Iterable[Case]:
         input="3-rpr-photographs",
         slow=True,
     )
-
-
-def _boards() -> Iterable[Case]:
-    for name, words in {  # test_calibrate.py shows a board in the hand
-        "unknown": "--board charuco --views 2",
-        "known": "--board chessboard --board-pose --views 2",
-        "hand-held": "--board aprilgrid --hand-held --views 1",
-    }.items():
-        yield Case(
-            f"board-{name}",
-            (
-                Step(f"simulate 3-rpr -o {{here}}/set --level outlines --poses 7 --seed 4 {words}"),
-                Step("calibrate {here}/set -o {out} --json", folder="{out}"),
-                Step("identify {here}/set --json"),
-            ),
-            slow=True,
-        )
 
 
 def _images() -> Iterable[Case]:
@@ -360,54 +333,6 @@ def _simulate() -> Iterable[Case]:
     for machine in MACHINES:
         yield Places(f"places-{machine}", (), slow=machine != "3-rpr")
 
-    def case(name: str, words: str, machine: str = "3-rpr", **more: Any) -> Case:
-        step = Step(f"simulate {machine} -o {{out}} {words}", folder="{out}")
-        return Case(f"simulate-{name}", (step,), **more)
-
-    poses = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n0.06,0.07,0.08\n0.08,0.07,0.06\n"
-    errors = "--error joints=1mm:normal --error radii=0.1mm --error offsets=0.5mm:uniform"
-    noise = "--pixel-noise 0.2px --encoder-noise 3um:uniform"
-    yield case("errors", f"{QUICK} {errors} {noise}")
-    yield case("no-errors", f"{QUICK} --error none --no-hints")
-    yield case("coplanar", f"{QUICK} --coplanar --hints", "hexapod")
-    yield case("poses", "--level outlines --json --poses {here}/p.csv --views 2",
-               files=(("p.csv", poses),))  # fmt: skip
-    words = "--level axes --poses 2 --seed 1 --json"
-    yield case("shared", f"{words} --views 2 --shared-poses --sampling workspace --images 2")
-    cameras = f"views: {{one: {PLACE}}}\n"
-    yield case("cameras", f"{words} --cameras {{here}}/c.yaml --table-noise radians --own-poses",
-               files=(("c.yaml", cameras),))  # fmt: skip
-    yield case("table-noise", f"{words} --views 1 --table-noise degrees --sampling extreme")
-    yield case("board", f"{QUICK} --board chessboard --board-pose")
-    yield case("hand-held", f"{QUICK} --board aprilgrid --hand-held")
-    tiny = "--level photographs --poses 1 --views 1 --camera {here}/tiny.yaml"
-    look = "blur: 0.8\nclutter: 3\nelectrons: .inf\nlights: [{direction: [0, 0, 1]}]\n"
-    yield case("look", f"{tiny} --appearance {{here}}/look.yaml --clutter 7 --bits 16 --json",
-               files=(("tiny.yaml", SMALL), ("look.yaml", look)))  # fmt: skip
-    yield case("colour", f"{tiny} --colour --blur 1.5 --no-gamma", files=(("tiny.yaml", SMALL),))
-    kalibr = (
-        "cam0: {camera_model: pinhole, intrinsics: [300, 300, 100, 75], resolution: [200, 150],\n"
-        "  distortion_model: equidistant, distortion_coeffs: [0.01, 0, 0, 0]}\n"
-    )
-    opencv = (
-        "%YAML:1.0\n---\nimage_width: 200\nimage_height: 150\n"
-        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-        "   data: [300., 0., 100., 0., 300., 75., 0., 0., 1.]\n"
-        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
-        "   data: [-0.1, 0.01, 0., 0., 0.]\n"
-    )
-    for name, content in {"kalibr": kalibr, "opencv": opencv}.items():
-        yield case(f"camera-{name}", f"{QUICK} --camera {{here}}/c.yaml",
-                   files=(("c.yaml", content),))  # fmt: skip
-    yield case("grey", f"{tiny} --grey --gamma", files=(("tiny.yaml", SMALL),), slow=True)
-    yield Case(
-        "simulate-force",
-        (
-            Step(f"simulate 3-rpr -o {{out}} {QUICK}"),
-            Step(f"simulate 3-rps -o {{out}} {QUICK} --force", folder="{out}"),
-        ),
-    )
-
 
 def _others() -> Iterable[Case]:
     yield Case("version", (Step("--version"),))
@@ -418,7 +343,6 @@ CASES: tuple[Case, ...] = (
     *_models(),
     *_identify(),
     *_calibrate(),
-    *_boards(),
     *_images(),
     *_locate(),
     *_simulate(),

@@ -16,7 +16,12 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from characterisation.running import Outcome, run
+from characterisation.running import run
+from legcal.files.motions import MotionEntry
+from legcal.simulation.cameras import mild_lens, read_lens
+from legcal.simulation.dataset import simulate, summary_document
+from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.visibility import Viewpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINES = sorted(  # those that were shipped when this was recorded
@@ -60,21 +65,18 @@ def camera_file(path: Path, width: int, height: int) -> Path:
 
 
 @cache
-def simulated(machine: str, level: str) -> tuple[Path, Outcome]:
+def simulated(machine: str, level: str) -> tuple[Path, dict[str, Any]]:
     """Simulate a small dataset of a machine, whose cameras stand at recorded places."""
     folder = _top() / f"{machine}-{level}"
-    words = ["simulate", machine, "-o", str(folder), "--level", level, "--seed", SEED]
-    words += ["--poses", POSES[level], "--json"]
+    camera = mild_lens()
     if level == "photographs":
-        words += ["--camera", str(camera_file(_top() / "camera.yaml", 512, 384))]
-    places = _top() / f"{machine}-places.yaml"
-    if not places.exists():
-        views = json.loads(PLACES.read_text())[machine]
-        places.write_text(yaml.safe_dump({"views": views}))
-    words += ["--cameras", str(places)]
-    outcome = run(words)
-    assert outcome.code == 0, outcome
-    return folder, outcome
+        camera = read_lens(camera_file(_top() / "camera.yaml", 512, 384))
+    views = [
+        Viewpoint(name, camera, MotionEntry(**place["T_base_camera"]).motion())
+        for name, place in json.loads(PLACES.read_text())[machine].items()
+    ]
+    settings = SimulationSettings(level=level, seed=int(SEED), poses=int(POSES[level]), views=views)
+    return folder, summary_document(simulate(machine, folder, settings))
 
 
 @cache
@@ -146,9 +148,10 @@ def _repeats(folder: Path) -> None:
     rows = [[low + part * (high - low) for low, high in travel] for part in (0.4, 0.6)]
     (folder / "poses.csv").write_text(header + "".join(_row(row) for row in rows))
     camera = camera_file(folder / "camera.yaml", 512, 384)
-    words = ["simulate", "3-rpr", "-o", str(folder / "set"), "--seed", SEED, "--images", "3"]
-    words += ["--poses", str(folder / "poses.csv"), "--views", "1", "--camera", str(camera)]
-    assert run(words).code == 0
+    settings = SimulationSettings(
+        seed=int(SEED), images=3, poses=folder / "poses.csv", views=1, camera=camera
+    )
+    simulate("3-rpr", folder / "set", settings)
 
 
 def _travel(machine: str) -> list[tuple[float, float]]:
@@ -165,9 +168,10 @@ def _row(values: list[float]) -> str:
 def _boards(folder: Path) -> None:
     """Photograph a board beside a 3-RPR from five places."""
     camera = camera_file(folder / "camera.yaml", 512, 384)
-    words = ["simulate", "3-rpr", "-o", str(folder / "set"), "--seed", SEED, "--poses", "5"]
-    words += ["--views", "1", "--board", "charuco", "--hand-held", "--camera", str(camera)]
-    assert run(words).code == 0
+    settings = SimulationSettings(
+        seed=int(SEED), poses=5, views=1, board="charuco", hand_held=True, camera=camera
+    )
+    simulate("3-rpr", folder / "set", settings)
 
 
 def _tool_poses(folder: Path) -> None:

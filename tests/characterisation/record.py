@@ -9,7 +9,6 @@ import argparse
 import dataclasses
 import inspect
 import json
-import os
 import re
 import sys
 import tempfile
@@ -20,21 +19,13 @@ from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import legcal
 from characterisation.cases import CASES
 from characterisation.inputs import remove_inputs
 from characterisation.refusals import REFUSALS
-from characterisation.running import run
 
 EXPECTED = Path(__file__).parent / "expected"
-
-
-COMMANDS = (
-    "", "inspect", "camera", "identify", "detect", "calibrate", "evaluate", "locate", "new",
-    "noise", "simulate", "study paper",
-)  # fmt: skip
 
 
 def expected_path(name: str) -> Path:
@@ -46,19 +37,6 @@ def expected_path(name: str) -> Path:
 def recorded(name: str) -> Any:
     """Return the facts of a case."""
     return json.loads(expected_path(name).read_text(encoding="utf-8"))
-
-
-def told_options(command: str) -> list[str]:
-    """Return the options that the help of a command tells, but for the help itself."""
-    with patch.dict(os.environ, COLUMNS="200"):
-        lines = run([*command.split(), "--help"]).out.splitlines()
-    found: set[str] = set()
-    for line in lines:
-        for word in line.strip(" │").lstrip("* ").split():
-            if not re.fullmatch(r"--?[a-z][a-z-]*", word):
-                break
-            found.add(word)
-    return sorted(found - {"--help"})
 
 
 def public_api() -> dict[str, Any]:
@@ -92,7 +70,6 @@ def recorded_refusals() -> dict[str, Any]:
 
 
 OTHERS: dict[str, Callable[[], dict[str, Any]]] = {
-    "help": lambda: {command: told_options(command) for command in COMMANDS},
     "api": public_api,
     "refusals": recorded_refusals,
 }

@@ -7,7 +7,6 @@ import dataclasses
 import inspect
 import json
 import re
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,9 @@ from characterisation.comparison import (
 from characterisation.facts import facts
 from characterisation.inputs import copy_of, made_input, remove_inputs
 from characterisation.record import (
-    COMMANDS,
     expected_path,
     public_api,
     recorded,
-    told_options,
 )
 from characterisation.refusals import REFUSALS, Refusal
 from characterisation.running import run
@@ -82,29 +79,10 @@ def test_refusals_name_what_is_wrong_and_leave_nothing(refusal: Refusal, tmp_pat
 
 
 def test_every_recorded_case_is_there() -> None:
-    names = {case.name for case in CASES} | {"help", "api", "refusals", "places"}
+    names = {case.name for case in CASES} | {"api", "refusals", "places"}
     assert {path.stem for path in expected_path("x").parent.glob("*.json")} == names
     assert len({case.name for case in CASES}) == len(CASES)
     assert {refusal.name for refusal in REFUSALS} == recorded("refusals").keys()
-
-
-def test_no_option_of_a_command_is_lost() -> None:
-    lost = {
-        command: set(recorded("help")[command]) - set(told_options(command)) for command in COMMANDS
-    }
-    assert {command: options for command, options in lost.items() if options} == {}
-
-
-def test_every_option_is_in_a_case() -> None:
-    used: dict[str, set[str]] = {command: set() for command in COMMANDS}
-    for step in (step for case in CASES for step in case.steps):
-        words = shlex.split(step.command)
-        command = " ".join(words[: 2 if words[0] == "study" else 1])
-        options = {word.split("=")[0] for word in words if word.startswith("-")}
-        options |= {"-o", "--output"} if options & {"-o", "--output"} else set()
-        used["" if command.startswith("-") else command] |= options
-    lost = {name: sorted(set(recorded("help")[name]) - used[name]) for name in COMMANDS}
-    assert {name: options for name, options in lost.items() if options} == {}
 
 
 def test_the_public_api_has_the_names_and_parameters_that_it_had() -> None:
