@@ -45,12 +45,13 @@ from legcal import LegcalError, calibrate, evaluate, load_mechanism
 from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.diagnostics import arm_misfits, wrong_arms
 from legcal.data.outlines import Outlines, are_of_arms
+from legcal.data.reasons import Reason
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import arms_at
-from legcal.perception.outline import WIDTH_TOLERANCE, WRONG_WIDTH
+from legcal.perception.outline import WIDTH_TOLERANCE
 from legcal.planning.request import LENGTH_SIGMA
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines, noisy_outlines
@@ -128,7 +129,7 @@ def _refused(outlines: Outlines, design: Design) -> Outlines:
     )
     wrong = np.zeros(len(outlines), dtype=np.bool_)
     wrong[own[np.abs(wide - expected) > least[0] + least[1] * expected]] = True
-    return outlines.reject(wrong, f"{WRONG_WIDTH}, as detection says")
+    return outlines.reject(wrong, Reason.WIDTH)
 
 
 class Judged:

@@ -4,7 +4,7 @@
                                                  [--workers N] [-o OUT] [--json]
 
 Machines: 6-spu-noncoplanar, 6-spu-coplanar, 3-upu-tilted, 3-rpr; all of them without --machine.
-OUT gets the runs, which the same command goes on from, the document and the page of docs/bound.md.
+OUT gets the runs, which the same command goes on from, the document and the page `bound.md`.
 """
 
 from __future__ import annotations
@@ -196,8 +196,7 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
         "",
         "The Cramer-Rao bound is the least standard deviation that any unbiased estimator of the "
         "same data can\nhave. This page says, parameter by parameter, how near the joint fit comes "
-        "to it and whether the\nstandard deviations that it states are right. "
-        "[Accuracy](accuracy.md#the-cramer-rao-bound) sums it up.",
+        "to it and whether the\nstandard deviations that it states are right.",
         "",
         f"Written by `python benchmarks/bound.py` on {date.today()}.",
         "",

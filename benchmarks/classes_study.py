@@ -6,7 +6,7 @@
 The errors of the fit are judged by what it states of them and by the Cramer-Rao bound, on all that
 is determined. What errors do to the platform tells of the rest, and compares the fit with the
 nominal model and with the four steps, as printed and with legcal's criteria. OUT gets the runs, the
-document and the page of docs/classes.md.
+document and the page `classes.md`.
 """
 
 from __future__ import annotations
@@ -356,9 +356,7 @@ def page(machines: Sequence[Found], readings: Sequence[str]) -> str:
         "# Machines of every class, calibrated",
         "",
         "What is the joint fit worth on each class of machine, and what do the paper's four steps "
-        "give by\nthemselves? This page has both, for simulated machines whose truth is known. "
-        "[Accuracy](accuracy.md)\nsays what follows; [studies](studies.md#every-class-classes_"
-        "studypy) has the program.",
+        "give by\nthemselves? This page has both, for simulated machines whose truth is known.",
         "",
         f"Written by `python benchmarks/classes_study.py` on {date.today()}."
         + (f" Not in these runs: {', '.join(left)}." if left else ""),

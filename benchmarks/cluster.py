@@ -1,15 +1,13 @@
 """Time of the same work in local processes and on a Dask cluster of this machine, and bytes moved.
 
     OMP_NUM_THREADS=1 python benchmarks/cluster.py [--runs 10000] [--images 1000] [--workers 1 2 4]
-        [--repeat 3] [--send]
+        [--repeat 3]
 
 Images are those of the example, searched for edge pairs again and again; runs are those of ``legcal
 study paper``. Scheduler and workers are processes of their own over TCP on this machine, so that
 the scheduler takes its time from the same cores. Both ways take turns, each in a process of its
 own; the shortest times are compared, without imports. Workers keep images that they decoded in an
-earlier turn, local processes decode each once. ``--send`` has the images sent, as where
-workers do not share the file system. Bytes are those of results and tasks as pickled, without what
-TCP and Dask add.
+earlier turn. Bytes are those of results and tasks as pickled, without what TCP and Dask add.
 """
 
 import argparse
@@ -109,7 +107,6 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=1000)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--send", action="store_true")
     parser.add_argument("--only", nargs=4, help="print the time of some work, without the rest")
     asked = parser.parse_args()
     if asked.only:
@@ -118,13 +115,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         data = copytree(EXAMPLE, folder / "own" / "data")
-        if asked.send:  # another folder in every process
-            os.chdir(data.parent)
-            data = Path("/proc/self/cwd/data")
         task, rows = _search(data)
         result = np.mean([len(pickle.dumps(task(row))) for row in rows[:5]])
         size = np.mean([path.stat().st_size for path in (data / "images").iterdir()])
-        print(f"image: task {len(pickle.dumps(task)) / 1e3:.0f} kB once for each worker, "
+        print(f"image: task {len(pickle.dumps(task)) / 1e3:.0f} kB, "
               f"result {result / 1e3:.1f} kB, file {size / 1e3:.0f} kB")  # fmt: skip
         print(
             f"{'work':14s} workers  local/s  cluster/s  ratio  scheduler/s  scheduler/MB  worker/MB"

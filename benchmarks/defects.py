@@ -1,21 +1,17 @@
-"""Which of the seeded defects of defects.yaml a test suite catches.
+"""Which of the seeded defects of defects.yaml the tests catch.
 
     python benchmarks/defects.py --check
-    OMP_NUM_THREADS=1 python benchmarks/defects.py --suite old [--only ID ...] [--concern NAME ...]
-    OMP_NUM_THREADS=1 python benchmarks/defects.py --suite tests/characterisation [-k WORDS]
-    python benchmarks/defects.py --compare old tests/characterisation
+    OMP_NUM_THREADS=1 python benchmarks/defects.py --run [--only ID ...] [--concern NAME ...]
 
 A defect replaces a snippet of the package by another one that is as plausible: a sign, a factor, a
 weight, a frame, a refusal. The snippet is looked up in the whole package, whatever file it is in,
 and however its lines are broken and indented; it must be there once (``--check``). One defect at a
-time is put into a copy of the tree, and pytest runs there until the first failure. ``--suite old``
-runs the files that are named at each defect (``tests``), ``--suite new`` these and then the cases
-of tests/characterisation that it names (``cases``); any other suite is a path of tests, of which
-the named ones go first (or those of -k), and with --subset no others run.
+time is put into a copy of the tree, and pytest runs there until the first failure: the files that
+are named at the defect (``tests``), then the recorded sessions.
 
-One line for each defect is appended to defects_SUITE.jsonl beside this file, so that a run
-continues where it stopped; ``--again`` repeats what is there. ``--confirm`` runs the tests that
-caught something without any defect: they must pass.
+One line for each defect is appended to defects.jsonl beside this file, so that a run continues
+where it stopped; ``--again`` repeats what is there. ``--confirm`` runs the tests that caught
+something without any defect: they must pass.
 """
 
 import argparse
@@ -44,7 +40,8 @@ import yaml
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 DEFECTS = HERE / "defects.yaml"
-OLD, NEW = "old", "new"
+OUTCOMES = HERE / "defects.jsonl"
+RECORDED = "tests/test_recorded_sessions.py"
 CAUGHT, SURVIVED, TIMEOUT = "caught", "survived", "timeout"
 LIBRARIES = (
     "casadi",
@@ -78,7 +75,6 @@ class Defect:
     old: str
     new: str
     tests: tuple[str, ...]  # files that are about it
-    cases: str  # words for pytest -k, of any other suite
 
 
 @dataclass(frozen=True)
@@ -102,11 +98,7 @@ class Outcome:
 def read_defects(path: Path = DEFECTS) -> list[Defect]:
     """Return the defects of the data file."""
     document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    cases: dict[str, str] = document["cases"]
-    return [
-        Defect(**{"cases": cases[entry["concern"]], **entry, "tests": tuple(entry["tests"])})
-        for entry in document["defects"]
-    ]
+    return [Defect(**{**entry, "tests": tuple(entry["tests"])}) for entry in document["defects"]]
 
 
 def pattern_of(snippet: str) -> re.Pattern[str]:
@@ -270,29 +262,18 @@ def load_libraries() -> None:
         import_module(name)
 
 
-def checkpoint_of(suite: str) -> Path:
-    """Return the file of the outcomes of a suite."""
-    name = suite if suite in (OLD, NEW) else Path(suite).name
-    return HERE / f"defects_{name}.jsonl"
-
-
-def read_outcomes(path: Path) -> dict[str, dict[str, object]]:
+def read_outcomes() -> dict[str, dict[str, object]]:
     """Return the last outcome of every defect, in the order of the file."""
-    if not path.is_file():
+    if not OUTCOMES.is_file():
         return {}
-    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [json.loads(line) for line in OUTCOMES.read_text(encoding="utf-8").splitlines()]
     return {str(line["id"]): line for line in lines}
 
 
-def commands(defect: Defect, arguments: argparse.Namespace) -> list[list[str]]:
+def commands(defect: Defect) -> list[list[str]]:
     """Return what pytest runs for a defect, one after the other until it is caught."""
-    cases = ["-k", arguments.k or defect.cases, "-m", ""]  # slow ones too
-    if arguments.suite in (OLD, NEW):
-        there = [name for name in defect.tests if (ROOT / "tests" / name).is_file()]
-        named = [[f"tests/{name}" for name in there]] if there else []
-        return named if arguments.suite == OLD else [*named, ["tests/characterisation", *cases]]
-    first = [arguments.suite, *cases]
-    return [first] if arguments.subset else [first, [arguments.suite]]
+    named = [f"tests/{name}" for name in defect.tests if (ROOT / "tests" / name).is_file()]
+    return [paths for paths in (named, [RECORDED]) if paths]
 
 
 def confirm(tree: Tree, outcomes: dict[str, dict[str, object]], limit: float) -> None:
@@ -313,16 +294,15 @@ def confirm(tree: Tree, outcomes: dict[str, dict[str, object]], limit: float) ->
 
 
 def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
-    """Run a suite on the defects that have no outcome yet."""
-    path = checkpoint_of(arguments.suite)
-    done = {} if arguments.again else read_outcomes(path)
-    todo = [defect for defect in defects if defect.id not in done and commands(defect, arguments)]
+    """Run the tests on the defects that have no outcome yet."""
+    done = {} if arguments.again else read_outcomes()
+    todo = [defect for defect in defects if defect.id not in done]
     end = time.perf_counter() + 60.0 * arguments.minutes
     load_libraries()
     with TemporaryDirectory(prefix="legcal-defects-") as folder:
         tree = Tree(ROOT, Path(folder))
         if arguments.confirm:
-            confirm(tree, read_outcomes(path), 3600.0)
+            confirm(tree, read_outcomes(), 3600.0)
             return
         for defect in todo:
             if time.perf_counter() > end:
@@ -330,7 +310,7 @@ def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
                 break
             outcome, seconds = Outcome(SURVIVED, "", 0.0), 0.0
             with tree.with_defect(defect):
-                for command in commands(defect, arguments):
+                for command in commands(defect):
                     outcome = tree.run(command, arguments.limit)
                     seconds += outcome.seconds
                     if outcome.found != SURVIVED:
@@ -341,10 +321,10 @@ def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
                 "by": outcome.by,
                 "seconds": round(seconds, 1),
             }
-            with path.open("a", encoding="utf-8") as file:
+            with OUTCOMES.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             print(f"{outcome.found:9}{seconds:7.1f} s  {defect.id:34}{outcome.by}", flush=True)
-    table(defects, read_outcomes(path))
+    table(defects, read_outcomes())
 
 
 def table(defects: Sequence[Defect], outcomes: dict[str, dict[str, object]]) -> None:
@@ -360,30 +340,12 @@ def table(defects: Sequence[Defect], outcomes: dict[str, dict[str, object]]) -> 
         print(f"{name:20}{count.total():9}" + "".join(f"{count[found]:10}" for found in columns))
 
 
-def compare(defects: Sequence[Defect], one: str, other: str) -> bool:
-    """Print what one suite catches and another one does not; say whether there is nothing."""
-    first, second = (read_outcomes(checkpoint_of(suite)) for suite in (one, other))
-    lost = []
-    for defect in defects:
-        found = [
-            outcomes.get(defect.id, {}).get("found", "not run") for outcomes in (first, second)
-        ]
-        if found[0] == CAUGHT != found[1]:
-            lost.append(defect)
-            print(f"{defect.id:34}{found[1]:10}{defect.what}")
-    print(f"{len(lost)} of {len(defects)} are caught by {one} and not by {other}")
-    return not lost
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="are all snippets there once?")
-    parser.add_argument("--suite", help="old, new, or a path of tests")
-    parser.add_argument("--compare", nargs=2, metavar="SUITE")
+    parser.add_argument("--run", action="store_true", help="run those without an outcome")
     parser.add_argument("--only", nargs="+", default=[], metavar="ID")
     parser.add_argument("--concern", nargs="+", default=[])
-    parser.add_argument("-k", metavar="WORDS", help="tests of the suite that are run first")
-    parser.add_argument("--subset", action="store_true", help="run no other tests than those")
     parser.add_argument("--again", action="store_true", help="repeat what has an outcome")
     parser.add_argument("--confirm", action="store_true", help="do those that catch pass without?")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds of a run of pytest")
@@ -396,10 +358,8 @@ def main() -> None:
         if (not arguments.only or defect.id in arguments.only)
         and (not arguments.concern or defect.concern in arguments.concern)
     ]
-    if arguments.compare:
-        raise SystemExit(0 if compare(chosen, *arguments.compare) else 1)
     defects = usable(chosen, read_package(ROOT))
-    if arguments.suite:
+    if arguments.run or arguments.confirm:
         run(arguments, defects)
     print(f"{len(defects)} of {len(chosen)} defects can be put into the package")
     raise SystemExit(0 if len(defects) == len(chosen) else 1)

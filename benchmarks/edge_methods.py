@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from rendered_cylinders import Photographed, interpolated
 
-from legcal.calibration.measurement_noise.canny import edge_points
 from legcal.geometry.types import Array
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import measure_edges
@@ -14,6 +13,9 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
 
 REACH = 2.5  # from the start, of a point that belongs to an outline [px]
+SMOOTHING = 1.0  # of an image before Canny's filter [px]
+NO_EDGE, NOISE, LOWER = 0.9, 4.0, 0.4  # upper threshold of Canny's filter: of the gradients, this
+# quantile and this many medians; lower threshold, as a part of it
 
 Ends = list[tuple[Array, Array] | None]
 """Of both edges: offsets at both ends of the band (2,) [px], and their standard deviations."""
@@ -65,6 +67,21 @@ def by_canny(scene: Photographed, grey: Grey, start: Array) -> Ends:
     along = (t > 0.0) & (t < 1.0)
     t, v = t[along], v[along]
     return [_line(t, v, ends, true) for ends, true in zip(start, scene.v, strict=True)]
+
+
+def edge_points(grey: Grey) -> Array:
+    """Return the pixels (n, 2) that Canny's filter marks as edges."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), SMOOTHING)
+    scale = 32.0  # grey levels are stretched so that rounding the gradient does not matter
+    dx, dy = (
+        np.rint(np.clip(scale * cv2.Sobel(smooth, cv2.CV_32F, *d), -32767, 32767)).astype(np.int16)
+        for d in ((1, 0), (0, 1))
+    )
+    steepness = np.hypot(dx.astype(np.float32), dy.astype(np.float32))
+    typical, steep = np.quantile(steepness, [0.5, NO_EDGE]).tolist()
+    upper = max(steep, NOISE * typical, 1.0)
+    row, column = np.nonzero(cv2.Canny(dx, dy, LOWER * upper, upper, L2gradient=True))
+    return np.column_stack([column, row]).astype(np.float64)
 
 
 def by_segments(scene: Photographed, grey: Grey, start: Array) -> Ends:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.fit import refine
@@ -32,8 +31,7 @@ from legcal.errors import DidNotConverge
 from legcal.files.schema import read_yaml
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import ActuatorColumns
-from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of
+from legcal.machine.description_table import described_machine
 from legcal.machine.kinematics import platform_in_base, pose_differences
 from legcal.machine.leg import Leg, LegKind, radius_name
 from legcal.machine.loader import load_mechanism
@@ -78,9 +76,10 @@ SHIPPED = (
     "3-rpr",
     *CARRIED,
 )
-# Machines of families whose arms are cylinders, of this radius [mm], and are seen
+# Shipped machines with arms that are cylinders, of this radius [mm], and are seen
 ROUND_ARMS = {"delta-round-arms": ("delta", 8.0), "servo-round-arms": ("servo-hexapod", 3.0)}
 KINDS = Path(__file__).with_name("machine_kinds.yaml")
+TABLES = Path(__file__).parents[1] / "models" / "tables"
 _MANY_LEGS, _MOST_LEGS = 6, 4  # of six or more that a view is said to see, as in the paper
 _SEED = 2002  # of what is the same in all runs
 _CLOSED = 1e-13  # [m]
@@ -109,14 +108,13 @@ def made(kind: str, folder: Path) -> Machine:
     """Write a machine that is not shipped as a model and load it."""
     folder.mkdir(parents=True, exist_ok=True)
     if kind in ROUND_ARMS:
-        family, radius = ROUND_ARMS[kind]
-        size = Dimensions(family=family, unit="mm", name=kind, arm_radius=radius)
-        described = description_of(None, size)
-        return create_model(described, folder, force=True).machine
-    table = folder / f"{kind}-table.yaml"
-    text = {"legcal_table": 1, "name": kind, "unit": "mm", **kinds()[kind]}
-    table.write_text(yaml.safe_dump(text, sort_keys=False))
-    described = description_of(table, Dimensions())
+        name, radius = ROUND_ARMS[kind]
+        table = dict(read_yaml(TABLES / f"{name}.yaml", "table"), name=kind)
+        for motor in table["actuators"].values():
+            motor["arm_radius"] = radius
+    else:
+        table = {"legcal_table": 1, "name": kind, "unit": "mm", **kinds()[kind]}
+    described = described_machine(table, Path(kind))
     return create_model(described, folder, force=True).machine
 
 

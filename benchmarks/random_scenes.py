@@ -60,6 +60,8 @@ class Given:
     cylinders : tuple, for each leg a tuple of SolidCylinder
         What can be seen of the nominal legs.
     leg_names : tuple of str
+    size : float
+        Mean leg length [m].
     """
 
     images: tuple[Image, ...]
@@ -68,6 +70,7 @@ class Given:
     B_base: Array
     cylinders: tuple[tuple[Visible, ...], ...]
     leg_names: tuple[str, ...]
+    size: float
 
     @property
     def camera(self) -> Camera:
@@ -161,6 +164,7 @@ def draw(seed: int) -> Scene:
             B,
             tuple(leg.cylinders for leg in nominal.legs),
             nominal.leg_names,
+            nominal.size,
         ),
         Truth(T, A_true, B_true, cylinders, shown_legs, width),
         settings,

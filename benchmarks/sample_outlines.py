@@ -132,7 +132,8 @@ def main() -> None:
 
     A, B = joint_centres(machine, measurements)
     rough = [view.T_base_camera for view in measurements.views]
-    search, rows = Search(load, measurements, A, B, cylinders, wanted, names), np.arange(len(A))
+    search = Search(load, measurements, A, B, cylinders, wanted, names, machine.size)
+    rows = np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
         placed = place_views(search, rows, hints).recognised()

@@ -46,7 +46,7 @@ from legcal.workers import worker_pool
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
 SAME_TURN, SAME_PLACE = np.deg2rad(10.0), 0.15  # of one camera: angle, part of the distance
-IDEAL = (0.008, 0.006, 0.004, 0.003, 0.003)  # tolerances of ideal edges, on the sensor plane
+IDEAL = (0.02, 0.015, 0.01, 0.0075, 0.0075)  # tolerances of ideal edges, of the leg length
 AS_WELL = 0.9  # of the support of the true pose by ideal edges, that leaves a doubt
 COLOURS = ((60, 60, 255), (60, 220, 60), (255, 120, 40), (0, 200, 255), (255, 60, 220),
            (220, 220, 0), (120, 160, 255))  # fmt: skip
@@ -67,7 +67,7 @@ def find(given: Given) -> Found:
     wanted = np.ones((1, n_legs), dtype=np.bool_)
     search = Search(
         lambda row: grey_levels(given.images[row]), m, given.A_base, given.B_base,
-        given.cylinders, wanted, given.leg_names,
+        given.cylinders, wanted, given.leg_names, given.size,
     )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
@@ -189,7 +189,8 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
             pixel,
         )
         targets = leg_segments(given.A_base[row], given.B_base[row], given.cylinders, legs)
-        pictures.append(Picture(pairs, targets, np.array(field_of_view(camera))))
+        corners = np.array(field_of_view(camera))
+        pictures.append(Picture(pairs, targets, corners, given.size))
     return pictures
 
 

@@ -1,16 +1,12 @@
 from .calibration.camera_calibration.calibration import calibrate_camera as calibrate_camera
 from .calibration.evaluation import evaluate as evaluate
 from .calibration.examination import doctor as doctor
-from .calibration.fleet import FleetMachine as FleetMachine
-from .calibration.fleet import FleetOptions as FleetOptions
-from .calibration.fleet import calibrate_fleet as calibrate_fleet
 from .calibration.identify.identifiability import identifiability as identifiability
 from .calibration.location.document import Location as Location
 from .calibration.location.document import load_location as load_location
 from .calibration.location.document import write_location as write_location
 from .calibration.location.locate import locate as locate
 from .calibration.location.tool_poses import ToolPoses as ToolPoses
-from .calibration.measurement_noise.comparison import measure_noise as measure_noise
 from .calibration.outline_detection import detect as detect
 from .calibration.pipeline import calibrate as calibrate
 from .calibration.result_folder import load_result as load_result
@@ -20,6 +16,7 @@ from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
 from .exports.subject import ExportOptions as ExportOptions
 from .machine.configurations import random_configurations as random_configurations
+from .machine.drawing import plot_machine as plot_machine
 from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
 from .machine.kinematics import inverse_kinematics as inverse_kinematics

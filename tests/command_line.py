@@ -12,7 +12,4 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     """Run a command, its images in this process too, and return its exit code."""
     monkeypatch.setattr("legcal.cli.options.MAX_IMAGE_WORKERS", 1)
     monkeypatch.setattr(sys, "argv", ["legcal", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert isinstance(stop.value.code, int)
-    return stop.value.code
+    return cli.run_command()

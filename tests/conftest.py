@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Generator, Iterator
 from dataclasses import replace
@@ -49,6 +50,20 @@ def _temporary_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
         yield
 
 
+@pytest.fixture
+def answered_signals() -> Iterator[None]:
+    """Answer signals as Python does, also where the tests were started with them ignored."""
+    handlers = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _commands_and_models_are_read_once() -> Iterator[None]:
     """Read the signatures of commands, and each model or copy of one, once a process."""
@@ -79,7 +94,7 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
         return source
 
     def load_once(source: Source) -> Machine:
-        if source.words or source.notes or source.poses is not None:
+        if source.file.legcal is None or source.notes or source.poses is not None:
             return load(source)
         key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
         if key not in machines:

@@ -18,10 +18,8 @@ from legcal.calibration.documents import (
     Result,
 )
 from legcal.calibration.examination import ExaminationDocument
-from legcal.calibration.fleet import FleetDocument
 from legcal.calibration.identify.report import IdentifyDocument
 from legcal.calibration.location.document import LocationFile
-from legcal.calibration.measurement_noise.document import NoiseDocument
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.exports.formats import ExportDocument
@@ -106,11 +104,9 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "result": Result,
     "check": CheckDocument,
     "evaluate": EvaluationDocument,
-    "fleet": FleetDocument,
     "detect": DetectionDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,
-    "noise": NoiseDocument,
 }
 
 

@@ -14,6 +14,7 @@ from legcal.vision.cylinder import outlines_of_axis
 
 PIXEL = 1.0 / 600.0  # of the pictures, on the sensor plane
 CORNERS = np.array([[-0.45, -0.36], [0.45, 0.36]])
+SIZE = 0.4  # of the machine, about its mean leg length [m]
 TUBE, ROD = 0.013, 0.009
 CYLINDERS = (
     Cylinder("tube", TUBE, "base", 0.0, 0.24),
@@ -132,7 +133,7 @@ def picture(
         step = lines[..., 1, :] - lines[..., 0, :]
         part = rng.uniform(0.0, 0.15, (*step.shape[:2], 2, 1)) * [[1.0], [-1.0]]
         lines = lines + part * step[..., None, :] + noise * PIXEL * rng.normal(size=lines.shape)
-    return Picture(find_candidate_pairs(segments(lines)), pieces(*nominal), CORNERS)
+    return Picture(find_candidate_pairs(segments(lines)), pieces(*nominal), CORNERS, SIZE)
 
 
 def pictures(

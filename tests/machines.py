@@ -10,6 +10,7 @@ from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
+from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.leg import LegKind, main_cylinders
@@ -148,9 +149,29 @@ def read_table(path: Path, unit: str | None = None, name: str | None = None) -> 
     return description_of(path, Dimensions(unit=unit, name=name))
 
 
-def read_family(family: str, unit: str | None = "mm", **dimensions: Any) -> Any:
-    """Return what a family with some dimensions describes."""
-    return description_of(None, Dimensions(family=family, unit=unit, **dimensions))
+def regular(legs: str, platform_radius: float = 150.0) -> Any:
+    """Return legs between two regular polygons, ``8-SPS``, 400 mm apart in space."""
+    n, kind = int(legs.split("-")[0]), legs.split("-")[1]
+    angles = np.linspace(0.0, 360.0, n, endpoint=False).tolist()
+    flat = kind == "RPR"
+    table = {
+        "legcal_table": 1, "name": "regular", "unit": "mm", "type": legs, "radius": 8,
+        "base_joints": ring(angles, 300.0).tolist(),
+        "platform_joints": ring(angles, platform_radius).tolist(),
+        "home": {"xyz": [0, 0, 0 if flat else 400], "rpy_deg": [0, 0, 30 * flat]},
+    }  # fmt: skip
+    if "P" in kind:
+        low, high = (100, 300) if flat else (350, 530)
+        table |= {"min_length": low, "max_length": high}
+    return described_machine(table, Path("regular"))
+
+
+def with_round_arms(name: str, radius: float = 8.0) -> Any:
+    """Return a shipped machine with arms that are cylinders [mm]."""
+    table = yaml.safe_load((ROOT / "models" / "tables" / f"{name}.yaml").read_text())
+    for motor in table["actuators"].values():
+        motor["arm_radius"] = radius
+    return described_machine(table, Path(name))
 
 
 def made(folder: Path, **changes: Any) -> Machine:

@@ -6,6 +6,7 @@ import numpy as np
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import ENCODING, QUALITY, Outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.vision.camera import Camera
@@ -103,7 +104,9 @@ def outlines_of(
         ends=ends,
         covariance=covariance,
         used=used,
-        reason=tuple("" if ok else 'hidden, by "another" leg' for ok in used),
+        reason=tuple(
+            USED if ok else Rejection(Reason.OTHER, 'hidden, by "another" leg') for ok in used
+        ),
         source=(source,) * len(places),
         contrast=quality[:, 0],
         length=quality[:, 1],

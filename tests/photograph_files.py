@@ -14,8 +14,8 @@ Said = str | int | float | bytes
 
 TAGS = {
     "make": 0x010F, "model": 0x0110, "orientation": 0x0112, "software": 0x0131,
-    "exposure": 0x829A, "focus": 0x9206, "focal": 0x920A, "comment": 0x9286, "width": 0xA002,
-    "height": 0xA003, "rendered": 0xA401, "zoom": 0xA404, "focal35": 0xA405, "serial": 0xA431,
+    "exposure": 0x829A, "focus": 0x9206, "focal": 0x920A, "width": 0xA002,
+    "height": 0xA003, "zoom": 0xA404, "focal35": 0xA405, "serial": 0xA431,
     "lens": 0xA434, "taken": 0x9003,
 }  # fmt: skip
 _OF_CAMERA = ("make", "model", "orientation", "software")  # in the first directory
@@ -56,14 +56,12 @@ def _directory(order: str, at: int, values: Mapping[int, Said]) -> bytes:
     return struct.pack(order + "H", len(values)) + entries + bytes(4) + after
 
 
-def jpeg(image: Image, quality: int = 95, block: bytes = b"", xmp: bytes = b"") -> bytes:
-    """Return a JPEG with EXIF and XMP."""
+def jpeg(image: Image, quality: int = 95, block: bytes = b"") -> bytes:
+    """Return a JPEG with EXIF."""
     content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-    for body in (xmp and b"http://ns.adobe.com/xap/1.0/\0" + xmp, block and b"Exif\0\0" + block):
-        if body:
-            segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
-            content = content[:2] + segment + content[2:]
-    return content
+    body = block and b"Exif\0\0" + block
+    segment = body and b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
+    return bytes(content[:2] + segment + content[2:])
 
 
 def png(image: Image, block: bytes = b"", **texts: str) -> bytes:
@@ -76,6 +74,15 @@ def png(image: Image, block: bytes = b"", **texts: str) -> bytes:
         for kind, data in chunks
     )
     return content[:33] + added + content[33:]
+
+
+def undecodable_png(image: Image) -> bytes:
+    """Return a PNG whose checksums are right and whose data are no picture."""
+    content = cv2.imencode(".png", image)[1].tobytes()
+    body = zlib.compress(b"junk")
+    chunk = b"IDAT" + body
+    checksum = struct.pack(">I", zlib.crc32(chunk))
+    return content[:33] + struct.pack(">I", len(body)) + chunk + checksum + content[-12:]
 
 
 def tiff(image: Image, compression: int = 1) -> bytes:

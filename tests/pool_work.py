@@ -3,10 +3,7 @@
 import time
 from pathlib import Path
 
-import numpy as np
-
 from legcal.errors import DatasetError
-from legcal.workers import KeptArrays
 
 
 def row_zero_after_row_five(done: Path, row: int) -> int:
@@ -16,13 +13,6 @@ def row_zero_after_row_five(done: Path, row: int) -> int:
     if row == 5:
         done.touch()
     return row
-
-
-def keep_row(kept: KeptArrays, row: int) -> bool:
-    """Say whether the array of a row was kept before; keep it."""
-    before = kept.get(row) is not None
-    kept.keep(row, np.full((2, 3), row, dtype=np.float32))
-    return before
 
 
 def negative(row: int, refused: int = -1) -> int:

@@ -42,7 +42,7 @@ def test_commands_know_that_joints_at_A_move(
         distance = float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))
         assert float(sigma) == 0.1
         assert 0.0 < abs(float(value) - 1e3 * distance) < 0.5
-    known = ["--prior", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
+    known = ["--set", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
     assert "where their motors read 0" in said("calibrate", session, "-o", out, "-q", *known)
     compared = said("evaluate", f"{out}/calibrated.yaml", name)
     assert "where their motors read 0" in " ".join(compared.split())
@@ -65,7 +65,7 @@ def test_commands_know_that_joints_at_A_move(
     figures = json.loads(corrected)
     assert figures["residual"]["rms_dX_m"] < 0.2 * figures["uncorrected"]["rms_dX_m"]
     if name == "delta":  # whose scale nothing fixes here
-        free = ["--free", "*.radius.*"]
+        free = ["--set", "*.radius.*=free"]
         assert run(monkeypatch, "calibrate", session, "-o", tmp_path / "never", "-q", *free) == 1
         refusal = " ".join(capsys.readouterr().err.split())
         assert "carry no length" in refusal

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import yaml
 from dataset_folder import dataset_of_readings
-from machines import ROOT, check_same, read_family, read_table
+from machines import ROOT, check_same, read_table, with_round_arms
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.pipeline import calibrate
 from legcal.data.dataset import load_dataset
-from legcal.errors import LegcalError, ModelError, NotIdentifiable, UsageError
+from legcal.errors import LegcalError, ModelError, NotIdentifiable
 from legcal.exports.formats import export
 from legcal.exports.subject import Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
+from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.home import home_of_legs
@@ -26,10 +27,10 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, joint_values, readings_at
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
+from legcal.machine.parameter_id import ARMS as ARM_KINDS
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
-    ARM_KINDS,
     geometries,
-    kind_of_parameter,
     moved_legs,
     parametrization_of,
     vector_of,
@@ -47,22 +48,12 @@ COUNTS = {  # parameters with radii known, of the motors alone, and those that d
 }
 
 
-def family(folder: Path, name: str, **dimensions: Any) -> Machine:
-    """Return the machine of a family."""
-    return create_model(read_family(name, **dimensions), folder).machine
-
-
 # --- what is shipped ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_the_family_is_what_is_shipped_and_has_the_unknowns_of_its_class(
-    name: str, tmp_path: Path
-) -> None:
-    machine, shipped = family(tmp_path, name), load_mechanism(name)
-    for key in ("A_base", "B_platform", "q0"):
-        np.testing.assert_allclose(getattr(machine, key), getattr(shipped, key), atol=1e-12)
-    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
+def test_what_is_shipped_has_the_unknowns_of_its_class(name: str) -> None:
+    machine = load_mechanism(name)
     names = parametrization_of(machine).names
     of_motors = [n for n in names if n.split(".")[0] in {a.joint for a in machine.actuators}]
     assert (len(names), len(of_motors)) == COUNTS[name]
@@ -76,7 +67,8 @@ def test_the_family_is_what_is_shipped_and_has_the_unknowns_of_its_class(
 def test_an_arm_that_is_a_cylinder_is_a_line_of_the_first_rod_on_it(
     name: str, first: tuple[str, ...], tmp_path: Path
 ) -> None:
-    machine, bare = family(tmp_path, name, arm_radius=4.0), load_mechanism(name)
+    machine = create_model(with_round_arms(name, 4.0), tmp_path).machine
+    bare = load_mechanism(name)
     assert parametrization_of(machine).names == parametrization_of(bare).names
     arms = [leg.arm for leg in machine.legs if leg.arm is not None]
     assert tuple(arm.leg for arm in arms) == (first or machine.leg_names)
@@ -97,7 +89,7 @@ def test_an_arm_that_is_a_cylinder_is_a_line_of_the_first_rod_on_it(
     again = load_mechanism(write_model_with(machine, moved, home, tmp_path / "moved", {}))
     apart = vector_of(found, geometries(again), legs) - vector_of(found, moved, legs)
     np.testing.assert_allclose(apart, 0.0, atol=1e-12)
-    of_arms = [i for i, n in enumerate(found.names) if kind_of_parameter(n) in ARM_KINDS]
+    of_arms = [i for i, n in enumerate(found.names) if ParameterId.parse(n).kind in ARM_KINDS]
     assert len(of_arms) == 4 * len(arms)
     assert np.abs(vector_of(found, moved, legs)[of_arms]).min() > 1e-7
 
@@ -143,7 +135,8 @@ def test_a_delta_moves_by_its_closed_forms(tmp_path: Path) -> None:
     (1991), and R. L. Williams II, The Delta Parallel Robot (2016).
     """
     R, r, arm, rod = 0.14, 0.045, 0.2, 0.4
-    machine = family(tmp_path, "delta", base_radius=140.0, platform_radius=45.0)
+    size = Dimensions(family="delta", unit="mm", base_radius=140.0, platform_radius=45.0)
+    machine = create_model(description_of(None, size), tmp_path).machine
     z = np.array([0.0, 0.0, 1.0])
     for q in np.radians([[20.0, 20.0, 20.0], [5.0, 40.0, 25.0], [-20.0, 30.0, 60.0]]):
         elbows = [
@@ -166,16 +159,16 @@ def test_a_delta_moves_by_its_closed_forms(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, np.repeat(q, 2), atol=1e-9)
 
 
-def test_linear_deltas_and_orthoglides_move_by_three_spheres(tmp_path: Path) -> None:
-    machine = family(tmp_path, "linear-delta", base_radius=260.0)
+def test_linear_deltas_and_orthoglides_move_by_three_spheres() -> None:
+    machine = load_mechanism("linear-delta")
     q, z = np.array([0.02, 0.11, 0.16]), np.array([0.0, 0.0, 1.0])
-    down = np.sqrt(0.4**2 - 0.2**2)
-    carriages = [0.2 * outwards(k) + (0.15 + down + a - 0.1) * z for k, a in enumerate(q)]
+    down = np.sqrt(0.4**2 - 0.19**2)
+    carriages = [0.19 * outwards(k) + (0.15 + down + a - 0.1) * z for k, a in enumerate(q)]
     T = forward_kinematics(machine, np.repeat(q, 2))
     np.testing.assert_allclose(
         T.translation, trilaterated(np.array(carriages), 0.4, -1.0), atol=1e-9
     )
-    machine = family(tmp_path, "orthoglide")
+    machine = load_mechanism("orthoglide")
     p = np.array([0.03, -0.04, 0.05])
     across = np.sqrt(0.4**2 - (p @ p - p**2))
     wanted = p - across + 0.4 + 0.1  # of the carriages, at mid-travel at home
@@ -319,32 +312,6 @@ def test_what_a_table_of_motors_cannot_say(
     assert [p.name for p in tmp_path.iterdir()] == ["table.yaml"]
 
 
-@pytest.mark.parametrize(
-    ("name", "dimensions", "named"),
-    [
-        ("delta", {"tilt": 5.0}, ("--tilt", "--arm-length")),
-        ("hexaglide", {"arm_length": 20.0}, ("--arm-length", "--rod-length")),
-        ("linear-delta", {"arm_radius": 5.0}, ("--arm-radius", "--rod-length")),
-        ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
-        ("delta", {"height": 374.0}, ("--height 374", "negative")),
-        ("delta", {"rod_length": 100.0, "unit": None}, ("no unit", "--unit mm")),
-        ("3-prs", {"rod_length": -1.0}, ("--rod-length -1", "positive")),
-        ("orthoglide", {"travel": (5.0, 1.0)}, ("--travel 5 1",)),
-        ("delta", {"travel": (-0.5, 1.2)}, ("looks like radians", "--travel -28.65 68.75")),
-        ("linear-delta", {"leg_radius": 40.0}, ("60 mm apart", "80 mm thick", "--rod-spacing")),
-        ("6-UPS", {"rod_length": 100.0}, ("--rod-length",)),
-        ("6-UPS", {"arm_radius": 5.0}, ("--arm-radius", "without arms")),
-        ("5-PSS", {}, ("'5-PSS'", "hexaglide")),
-    ],
-)
-def test_what_a_family_of_motors_cannot_be(
-    name: str, dimensions: dict[str, Any], named: tuple[str, ...]
-) -> None:
-    with pytest.raises(UsageError) as caught:
-        read_family(name, **dimensions)
-    assert all(word in str(caught.value) for word in named), str(caught.value)
-
-
 # --- files that are outside the method -----------------------------------------------------------
 
 
@@ -399,7 +366,7 @@ def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path:
         ),
         ("home:\n", "home_readings: {arm7: 0.1}\n  home:\n", ("home_readings.arm7", "arm1")),
         ("home:\n", "home_readings: {arm1: 20}\n  home:\n", ("home_readings.arm1", "20 rad")),
-        (HOME, "", ("home is ambiguous", "no legcal.home", "0.2373", "-0.3741")),
+        (HOME, "", ("home is ambiguous", "write legcal.home,", "0.2373", "-0.3741")),
         (MOTORS, f"{MOTORS}- leg1_a2\n", ("'leg1_a2'", "one motor for each leg")),
         (MOTORS, "name_mot:\n", ("'arm1'", "carries 2 rods", "a motor in name_mot")),
         (A2, '"leg1_a2" type="prismatic"', ("slider 'leg1_a2'", "'arm1'")),
@@ -426,3 +393,18 @@ def test_exported_robots_are_the_same_machine(to: str, suffix: str, tmp_path: Pa
         for m in (machine, back)
     ]
     np.testing.assert_allclose(poses[1].as_matrix(), poses[0].as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])
+def test_of_two_readings_at_home_the_one_that_a_file_draws_is_taken(
+    to: str, suffix: str, tmp_path: Path
+) -> None:
+    motors = ARMS["actuators"]
+    wide = {name: arm | {"travel_deg": [-175, 175]} for name, arm in motors.items()}
+    table = ARMS | {"actuators": wide, "home_readings_deg": dict.fromkeys(motors, 20)}
+    machine = create_model(described_machine(table, Path("wide")), tmp_path).machine
+    export(Subject(machine, "wide"), to, tmp_path / f"wide.{suffix}")
+    back = load_mechanism(tmp_path / f"wide.{suffix}")
+    assert [leg.mode for leg in back.legs] == [leg.mode for leg in machine.legs]
+    if to == "mjcf":  # which has the joint values of home; a URDF has zeros
+        np.testing.assert_allclose(readings_at(back, back.home), np.radians(20.0), atol=1e-9)

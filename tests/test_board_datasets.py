@@ -15,6 +15,7 @@ from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import Measurements, View
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DatasetError
 from legcal.vision.board import FixedBoard
 
@@ -35,7 +36,7 @@ def _lines(place: str, n: int = 6) -> list[str]:
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join([",".join(COLUMNS), *lines]) + "\n")
+    path.write_text("\n".join([",".join(COLUMNS[:-1]), *lines]) + "\n")
 
 
 def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: Folder) -> None:
@@ -144,7 +145,7 @@ def tables(draw: st.DrawFn) -> Corners:
     px = np.array(draw(st.lists(st.tuples(number, number), min_size=n, max_size=n)))
     sigma = np.array(draw(st.lists(st.floats(1e-3, 5.0), min_size=n, max_size=n)))
     used = np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n)))
-    reason = tuple("" if u else 'far, "off"' for u in used)
+    reason = tuple(USED if u else Rejection(Reason.OTHER, 'far, "off"') for u in used)
     source = tuple(draw(st.lists(st.sampled_from(["detected", "edited"]), min_size=n, max_size=n)))
     return Corners(row, corner, px, sigma, used, reason, source)
 

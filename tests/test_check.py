@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
-from machines import read_family
+from machines import with_round_arms
 from simulated import files_of, simulated
 
 from legcal import calibrate, check
@@ -373,7 +373,7 @@ def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
 ) -> None:
     round_arms = model == "round arms"
     machine = (
-        create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
+        create_model(with_round_arms("delta"), tmp_path).machine
         if round_arms
         else load_mechanism(model)
     )

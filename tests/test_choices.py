@@ -17,8 +17,9 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
-from legcal.data.overrides import overrides_of_call
+from legcal.data.overrides import overrides_of_call, overrides_of_settings
 from legcal.errors import DatasetError, UsageError
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import parametrization_of
 
 __all__ = ["folder"]
@@ -265,3 +266,31 @@ def test_a_malformed_block_of_a_dataset_is_refused(
     with pytest.raises(DatasetError, match=found) as refusal:
         chosen(folder, block)
     assert "dataset.yaml" in str(refusal.value)
+
+
+@pytest.mark.parametrize("leg", ["leg1", "z_axis", "left.front", "base.x"])
+def test_a_name_says_whose_number_it_is_whatever_the_leg_is_called(leg: str) -> None:
+    kinds = [
+        *((kind, axis) for kind in ("base", "platform") for axis in "xyz"),
+        *((kind, angle) for kind in ("base_axis", "platform_axis", "arm_point") for angle in "12"),
+        *((kind, "") for kind in ("offset", "length", "twist", "gain")),
+        ("radius", f"{leg}.rod"),
+    ]
+    for kind, component in kinds:
+        parameter = ParameterId(leg, kind, component)
+        assert ParameterId.parse(str(parameter)) == parameter
+
+
+@pytest.mark.parametrize(
+    ("text", "argument"),
+    [
+        ("leg1.offset", {"fixed": ["leg1.offset"]}),
+        ("leg1.offset=350mm", {"fixed": ["leg1.offset=350mm"]}),
+        ("leg1.offset=350±0.1mm", {"priors": ["leg1.offset=350±0.1mm"]}),
+        ("leg1.offset=0.35+-1e-4", {"priors": ["leg1.offset=0.35+-1e-4"]}),
+        ("*.radius.*=free", {"free": ["*.radius.*"]}),
+    ],
+)
+def test_one_option_fixes_frees_and_gives_priors(text: str, argument: dict[str, Any]) -> None:
+    nothing: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
+    assert overrides_of_settings([text]) == nothing | argument

@@ -10,7 +10,6 @@ import pytest
 from command_line import run
 from hexapod_example import Run, copy_of_the_example
 
-from legcal.cli.gone import GONE
 from legcal.errors import ModelError, NotVisible
 
 
@@ -64,13 +63,18 @@ def test_inspect_prints_a_table_of_80_columns(
     assert max(len(line) for line in out.splitlines()) <= 80
 
 
-def test_calibrate_prints_the_table_and_the_verdict(
+def test_calibrate_prints_one_screen_and_all_parameters_with_verbose(
     example_run: Run,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", tmp_path / "out") == 0
+    words = ("calibrate", example_run.folder, "-o", tmp_path / "out")
+    assert run(monkeypatch, *words) == 0
+    screen = capsys.readouterr().out.splitlines()
+    assert len(screen) <= 32
+    assert screen[0].startswith("Calibrated:")
+    assert run(monkeypatch, *words, "--verbose") == 0
     captured = capsys.readouterr()
     assert "Joints of the platform in the link platform [mm]" in captured.out
     assert re.search(r"leg1 +x( +-168.8750){2} +[+]0.0000 +0.0000 +defines R_e", captured.out)
@@ -162,16 +166,60 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     assert f"; legcal {words[0]} --help lists" in line
 
 
-def test_options_of_earlier_versions_are_refused_with_what_takes_their_place(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("simulate", "hexapod", "-o", "x", "--poses="), ("empty text", "--poses=")),
+        (
+            ("calibrate", "x", "--check", "y", "--criteria", "literal", "--holdout", "0.2"),
+            ("--criteria", "--holdout", "--check"),
+        ),
+        (("calibrate", "a", "b", "-o", "out"), ("needed one dataset", "docs/python.md")),
+    ],
+)
+def test_options_without_sense_are_refused_by_name(
+    words: tuple[str, ...],
+    named: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for command, options in GONE.items():
-        for option, instead in options.items():
-            for words in ([option], option.split("=")):
-                assert run(monkeypatch, *command.split(), "x", "-o", "y", *words) == 2
-                (line,) = capsys.readouterr().err.splitlines()
-                assert line.startswith(f"legcal: {option.replace('=', ' ')} could not be used")
-                assert line.endswith(f"needed {instead}.")
+    assert run(monkeypatch, *words) == 2
+    said = capsys.readouterr().err
+    assert [word for word in named if word not in said] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("noise", "dataset", "--json"), ["legcal noise is gone: calibrate", "plan --noise"]),
+        (("init", "photos", "--match=order"), ["--match of legcal init is gone", "column image"]),
+        (("import", "a.bag", "--still", "1"), ["--still of legcal import is gone", "0.3 s"]),
+        (("calibrate", "x", "--fix", "leg1.offset"), ["--fix of", "--set NAME=VALUE"]),
+        (("calibrate", "x", "--free", "c1.fx"), ["--free of", "--set NAME=free"]),
+        (("calibrate", "x", "--prior", "a=1+-1"), ["--prior of", "--set NAME=VALUE±SIGMA"]),
+        (("calibrate", "x", "--significance=0.05"), ["legcal.check"]),
+        (("calibrate", "--list", "machines.csv"), ["docs/python.md"]),
+        (("calibrate", "x", "--resume"), ["docs/python.md"]),
+        (("simulate", "hexapod", "-o", "x", "--views", "2"), ["SimulationSettings(views=N)"]),
+        (("simulate", "hexapod", "-o", "x", "--level", "axes"), ["--level axes", 'level="axes"']),
+        (("simulate", "hexapod", "-o", "x", "--level=axes"), ["--level axes", 'level="axes"']),
+        (("simulate", "hexapod", "-o", "x", "--force"), ["--force", "empty folder"]),
+        (("study", "paper", "--part", "1/3"), ["--part of legcal study", "--cluster"]),
+        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
+        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
+    ],
+)
+def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(
+    words: tuple[str, ...],
+    named: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words) == 2
+    printed = capsys.readouterr()
+    said = printed.err or json.loads(printed.out)["error"]["message"]
+    assert [word for word in named if word not in said] == []
+    assert said.count("is gone") == 1
 
 
 @pytest.mark.parametrize("workers", ["0", "-1", "257", "1000000"])
@@ -185,6 +233,15 @@ def test_impossible_numbers_of_processes_are_refused_before_any_is_started(
     assert run(monkeypatch, *words, "--workers", workers) == 2
     said = capsys.readouterr().err
     assert f"--workers could not be used: found {workers}, needed 1 to 256 processes" in said
+
+
+@pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
+def test_a_number_of_processes_beside_a_cluster_is_refused(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LEGCAL_CLUSTER", "tcp://127.0.0.1:1")
+    assert run(monkeypatch, *words, "--workers", "2") == 2
+    assert "found --workers beside a cluster" in capsys.readouterr().err
 
 
 def test_help_names_the_unit_of_the_tool_position(

@@ -19,10 +19,11 @@ from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, load_dataset
-from legcal.calibration.detection import Detection, _caption, _counted_reason, _page
+from legcal.calibration.detection import Detection, _caption, _page
 from legcal.data.corners import found_corners
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
@@ -35,7 +36,6 @@ from legcal.perception.overlays import (
     marks_of_corners,
     marks_of_image,
     marks_of_pairs,
-    short_reason,
 )
 from legcal.perception.photographs import MeasuredImages, Photographs, place_and_measure
 from legcal.vision.camera import Camera
@@ -253,7 +253,7 @@ def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
     assert (out / "observations.csv").read_bytes() == edited
     (one_image.path / "observations.csv").write_bytes(edited)
     found = detect(one_image.path, output=out)
-    assert found.outlines.reason[3] == "a cable"
+    assert found.outlines.reason[3] == Rejection(Reason.OTHER, "a cable")
     assert found.outlines.source.count("edited") == 1
     kept = read_rows(out / "observations.csv")[3]
     assert (kept["verdict"], kept["source"], kept["contrast"]) == ("rejected", "edited", "")
@@ -351,7 +351,7 @@ def outlines(cam: Camera) -> Outlines:
         ends=cam.project(touching),
         covariance=np.tile(1e-4 * np.eye(2), (2, 1, 1)),
         used=np.ones(2, dtype=np.bool_),
-        reason=("", ""),
+        reason=(USED, USED),
         source=("detected",) * 2,
     )
 
@@ -393,7 +393,9 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
 def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_should_be() -> None:
     cam = camera("plumb_bob")
     found = outlines(cam)
-    one = replace(found, used=np.array([True, False]), reason=("", "low contrast, 2.1 grey levels"))
+    one = replace(
+        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.CONTRAST, "2.1"))
+    )
     part = marked(cam, one)
     assert list(curves(part)) == ["edge 1", "rejected"]
     assert (part.name, part.reason) == ("leg1", "edge 2: low contrast")
@@ -402,7 +404,7 @@ def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_
         h=np.full((2, 3), np.nan),
         ends=np.full((2, 2, 2), np.nan),
         used=np.zeros(2, dtype=np.bool_),
-        reason=("no convincing pair of edges",) * 2,
+        reason=(Rejection(Reason.NO_PAIR),) * 2,
     )
     part = marked(cam, lost)
     assert [mark.kind for mark in part.marks] == ["predicted", "predicted"]
@@ -410,7 +412,7 @@ def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_
     h = predicted(cam)[0].outlines[0]
     for mark, line in zip(part.marks, h, strict=True):
         assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
-    gone = replace(lost, reason=("outside the image",) * 2)
+    gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
     assert marks_of_image(cam, gone, predicted(cam), NAMES) == []
 
 
@@ -442,7 +444,9 @@ def test_pictures_of_every_size_have_lines_and_letters_of_the_same_share(factor:
 def test_corners_of_boards_are_crosses_where_they_were_found() -> None:
     px, none = np.array([[300.2, 200.0], [1200.0, 700.5]]), np.zeros(2, dtype=np.intp)
     found = found_corners(none, none, px, np.ones(2))
-    found = replace(found, used=np.array([True, False]), reason=("", "far off"))
+    found = replace(
+        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.OTHER, "far off"))
+    )
     grey = np.full((1200, 1600), 100.0)
     picture = draw(grey, [], "c1 a.png", marks_of_corners(found)).astype(int)
     for (x, y), colour in zip(px, (COLOURS["corner"], COLOURS["rejected"]), strict=True):
@@ -487,12 +491,3 @@ def test_texts_of_rods_in_parallel_pairs_stand_apart() -> None:
         assert np.all(box >= 0)
         assert np.all(box <= [width, height])
         assert all(np.any((box[0] >= o[1]) | (box[1] <= o[0])) for o in boxes[:i])
-
-
-def test_reasons_are_counted_without_their_figures() -> None:
-    assert short_reason("width inconsistent with the radius, 12 px for 14 px") == (
-        "width inconsistent with the radius"
-    )
-    assert short_reason("its other outline: edge hardly visible") == "other outline fails"
-    assert _counted_reason("hidden by leg3") == "hidden by another leg"
-    assert _counted_reason("") == "no reason given"

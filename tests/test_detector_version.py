@@ -37,7 +37,7 @@ def measured() -> dict[str, list[Any]]:
 def _listed(outlines: Outlines) -> list[Any]:
     """Return what is compared of each outline: its key, what is wrong, ends [px], covariance."""
     return [
-        [*key, reason.split(",")[0], *np.nan_to_num(ends, nan=-1.0).ravel().round(5).tolist(),
+        [*key, reason.reason, *np.nan_to_num(ends, nan=-1.0).ravel().round(5).tolist(),
          *np.nan_to_num(C[[0, 0, 1], [0, 1, 1]], nan=-1.0).round(8).tolist()]
         for key, reason, ends, C in zip(
             outlines.row_keys(), outlines.reason, outlines.ends, outlines.covariance, strict=True

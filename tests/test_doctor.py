@@ -12,7 +12,7 @@ from characterisation.running import fits_schema
 from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
-from photograph_files import exif, jpeg
+from photograph_files import exif, jpeg, undecodable_png
 from simulated import simulated
 
 from legcal import SimulationSettings, doctor, simulate
@@ -52,8 +52,9 @@ def test_photographs_that_cannot_be_used_are_named_and_the_others_judged(tmp_pat
     gone, cut, spoilt = (str(session.row("c1", k)["image"]) for k in range(3))
     (session.path / gone).unlink()
     (session.path / cut).write_bytes((session.path / cut).read_bytes()[:-300])
-    content = (session.path / spoilt).read_bytes()
-    (session.path / spoilt).write_bytes(content[:-4000] + b"x" * 3900 + content[-100:])
+    picture = cv2.imread(str(session.path / spoilt), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    (session.path / spoilt).write_bytes(undecodable_png(picture))
     black = session.change("c2", 0, lambda picture: 0 * picture)
     first, same = (str(session.row("c3", k)["image"]) for k in range(2))
     shutil.copy(session.path / first, session.path / same)

@@ -43,7 +43,6 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
@@ -51,6 +50,7 @@ from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.calibration.outlier_images import outlier_images
 from legcal.data.axes import axes_from_outlines
 from legcal.data.outlines import no_outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber
@@ -255,7 +255,7 @@ def _outlier_image() -> None:
     found = refine(session.legs, session.measurements, session.outlines, disturbed_start(session))
     o = found.outlines
     wrong = o.row == 1
-    reason = tuple(DISAGREES if out else "" for out in wrong.tolist())
+    reason = tuple(Rejection(Reason.DISAGREES) if out else USED for out in wrong.tolist())
     rejected = replace(found, outlines=replace(o, used=o.used & ~wrong, reason=reason))
     assert outlier_images(session.measurements, load_mechanism("hexapod"), rejected)
 
@@ -267,7 +267,9 @@ def _view_of_outlines() -> None:
     ends = np.array([T.apply(B) for T in start.T_Rb_Re])
     every = np.ones((len(m.views), len(A)), dtype=np.bool_)
     cylinders = [leg.cylinders for leg in start.legs]
-    search = Search(_no_image, m, np.broadcast_to(A, ends.shape), ends, cylinders, every, m.image)
+    size = float(np.linalg.norm(ends[0] - A, axis=1).mean())
+    A_of_rows = np.broadcast_to(A, ends.shape)
+    search = Search(_no_image, m, A_of_rows, ends, cylinders, every, m.image, size)
     rough = [T.inv() for T in start.T_camera_Rb]
     to_first = [start.T_camera_Rb[0] * T for T in rough]  # two cameras on one mount
     (group, _) = group_views(m, np.arange(m.n_rows), rough, [*to_first[:2], None])

@@ -10,17 +10,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import pytest
 from command_line import run as run_command
 from dataset_folder import HEXAPOD, Folder, folder
-from pool_work import keep_row, row_zero_after_row_five
+from pool_work import row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_dataset, load_mechanism
@@ -28,24 +27,12 @@ from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files.folder import check_destination, result_folder, write_atomically
 from legcal.files.schema import closest, parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
-from legcal.workers import KeptArrays, Run, worker_pool
+from legcal.workers import Run, worker_pool
 
 __all__ = ["folder"]
 
 LONG = "a" * 400
-Handler = Callable[[int, FrameType | None], object]
 
-KEPT = """
-from functools import partial
-from pool_work import keep_row
-from legcal.workers import KeptArrays, worker_pool
-
-kept = KeptArrays(12, 8 * 24)
-with worker_pool(2) as run:
-    print(*(sum(run(partial(keep_row, kept), range(12))) for _ in range(2)))
-values = [kept.get(row) for row in range(12)]
-print(all(one is None or (one == row).all() for row, one in enumerate(values)))
-"""
 POOL = """
 import multiprocessing, os, time
 from legcal.workers import worker_pool
@@ -58,16 +45,7 @@ if __name__ == "__main__":
 """
 
 
-@contextmanager
-def handled(number: signal.Signals, by: signal.Handlers | Handler) -> Iterator[None]:
-    """Handle a signal in one way for a while, whatever the tests were started under."""
-    before = signal.signal(number, by)
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
-
-
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) -> None:
     number, ended = signal.Signals[name], []
@@ -82,50 +60,27 @@ def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) 
                 raise_if_stopped()
             ended.append(True)
 
-    with handled(number, signal.default_int_handler):
-        with pytest.raises(KeyboardInterrupt):
-            work()
-        assert ended
-        assert signal.getsignal(number) is signal.default_int_handler
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert ended
+    assert signal.getsignal(number) is before
     raise_if_stopped()
 
 
-def test_an_interrupt_that_is_swallowed_is_raised_again_but_not_in_its_clean_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    cleaned = []
-    monkeypatch.setattr("legcal.signals._AGAIN", 0.2)
-
-    @stopped_by_signals()
-    def work() -> None:
-        try:
-            with suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-            time.sleep(20.0)
-        finally:
-            time.sleep(0.3)
-            cleaned.append(True)
-
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
-        work()
-    assert cleaned
-
-
-@pytest.mark.parametrize("error", [ImportError("numpy"), SystemExit(0), None])
-def test_a_block_that_heard_a_signal_is_interrupted_whatever_came_of_it(
-    error: BaseException | None,
-) -> None:
+@pytest.mark.usefixtures("answered_signals")
+def test_an_error_that_a_library_made_of_a_signal_is_an_interrupt() -> None:
     @stopped_by_signals()
     def work() -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-        if error is not None:
-            raise error
+        raise ImportError("numpy")
 
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt):
         work()
 
 
+@pytest.mark.usefixtures("answered_signals")
 def test_nothing_is_written_once_a_signal_was_heard(tmp_path: Path) -> None:
     def write_file() -> None:
         write_atomically(tmp_path / "file", b"new")
@@ -142,18 +97,18 @@ def test_nothing_is_written_once_a_signal_was_heard(tmp_path: Path) -> None:
             with pytest.raises(KeyboardInterrupt):
                 write()
 
-    with handled(signal.SIGINT, signal.default_int_handler), pytest.raises(KeyboardInterrupt):
-        work()
+    work()
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
 def test_a_signal_that_was_ignored_stays_so(name: str) -> None:
     number = signal.Signals[name]
-    with handled(number, signal.SIG_IGN):
-        with stopped_by_signals():
-            signal.raise_signal(number)
-        assert signal.getsignal(number) is signal.SIG_IGN
+    signal.signal(number, signal.SIG_IGN)
+    with stopped_by_signals():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is signal.SIG_IGN
 
 
 @pytest.mark.system
@@ -251,25 +206,6 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
     assert sorted([first, *rest]) == taken == list(range(40))
     (tmp_path / "done").unlink()
     assert list(two_processes(work, range(6))) == list(range(6))
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs memory files")
-def test_what_a_process_keeps_others_find_while_there_is_room() -> None:
-    kept = KeptArrays(12, 8 * 24)
-    before = KeptArrays(3, 100)
-    kept.keep(0, np.arange(6, dtype=np.uint8).reshape(2, 3))
-    assert before.get(0) is None
-    with worker_pool(1) as run:
-        assert list(run(partial(keep_row, kept), [0, 1, 1])) == [True, False, True]
-    found = kept.get(0)
-    assert found is not None
-    assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, [[0, 1, 2], [3, 4, 5]])
-    program = subprocess.run(
-        [sys.executable, "-c", KEPT], capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert program.stdout.split() == ["0", "8", "True"]
 
 
 @pytest.mark.system

@@ -167,7 +167,7 @@ def test_a_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(
         f"""
         import time
         from pathlib import Path
-        from legcal.files import result_folder
+        from legcal.files.folder import result_folder
         with result_folder(Path({str(out)!r})) as folder:
             (folder / "result.json").write_text("half")
             print("writing", flush=True)

@@ -22,6 +22,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.scale import naming_missing_lengths
 from legcal.data.measurements import Measurements, View
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
@@ -225,6 +226,7 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         cylinders,
         np.ones((2, machine.n_legs), dtype=np.bool_),
         machine.leg_names,
+        machine.size,
         pairs,
     )
     found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None)
@@ -287,7 +289,7 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     open_ones = session.measurements.pose[few.row] < 4
     np.testing.assert_array_equal(found.outlines.used, ~open_ones)
     assert {why for why, out in zip(found.outlines.reason, open_ones, strict=True) if out} == {
-        "shows too few legs to place the platform"
+        Rejection(Reason.FEW_LEGS)
     }
 
 

@@ -17,7 +17,7 @@ from command_line import run
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import SHIPPED_URDF, SHIPPED_YAML, read_family
+from machines import SHIPPED_URDF, SHIPPED_YAML, regular
 from rich.console import Console
 from thinned import thinned
 
@@ -288,7 +288,7 @@ def test_the_legs_of_a_datasets_views_count(
 
 def test_choices_determine_what_they_say_and_no_more() -> None:
     names = parametrization_of(two_images().machine).names
-    with pytest.raises(NotIdentifiable, match="or state what is known of them with --prior"):
+    with pytest.raises(NotIdentifiable, match="or state what is known of them with --set"):
         check_identifiable(two_images())
     known, vague = (
         Choices(priors={name: Prior(0.3, sigma) for name in names}) for sigma in (1e-4, 100.0)
@@ -329,9 +329,7 @@ def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
     few = legcal.identifiability(machine, [["leg1", "leg2"]])
     assert few.full.weak[0].dX_m is None
     assert not few.identifiable
-    size: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 150.0, "height": 400.0}
-    regular = read_family("6-SPS", **size, base_spread=60.0, platform_spread=60.0)  # hexagons
-    machine = create_model(regular, tmp_path / "regular").machine
+    machine = create_model(regular("6-SPS"), tmp_path / "regular").machine
     text = machine.urdf_path.read_text()
     text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
     machine.urdf_path.write_text(text)

@@ -11,7 +11,7 @@ from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types, read_family
+from machines import MACHINES, of_types, with_round_arms
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -157,7 +157,7 @@ def test_rows_equal_finite_differences_of_axes_cut_in_the_camera_and_of_legs(see
 
 def round_arms(folder: Path) -> Machine:
     """Return a Delta whose arms are cylinders."""
-    return create_model(read_family("delta", arm_radius=8.0), folder).machine
+    return create_model(with_round_arms("delta"), folder).machine
 
 
 def test_rows_of_arms_equal_finite_differences_of_their_axes(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_rows_of_arms_equal_finite_differences_of_their_axes(tmp_path: Path) -> 
     named = parametrize(machine.leg_names, session.legs, machine.frame_legs, twists=True)
     session = replace(session, parametrization=named)
     base, platform = at_base_joints(session), at_platform_joints(session)
-    n, n_q, L = session.n_legs, session.moving.shape[1], session.mean_length
+    n, n_q, L = session.n_legs, session.q.shape[1], session.mean_length
     assert list(session.arms) == [0, 2, 4]
     assert not base.gradient[session.view == 1, n].any()  # it shows no rod on this arm
 
@@ -456,7 +456,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         random_postures_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
     monkeypatch.setattr(
         "legcal.machine.configurations._Drive.is_regular",
-        lambda _self, _R, t, _wanted: rng.random(len(t)) < 0.75,  # in each of five steps
+        lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
     )
     assert len(planned_observations(machine, [range(6)], 60).t) == 60
 

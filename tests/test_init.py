@@ -173,43 +173,7 @@ def test_photographs_are_matched_by_name_order_or_time(
     load_dataset(tmp_path / "dataset")
 
 
-IN_NAMES = ("c1_IMG_2.jpg", "c1_IMG_10.jpg", "c2_IMG_2.jpg", "c2_IMG_10.jpg")
 AT_THE_END = ("002-left.png", "002-right.png", "010-left.png", "010-right.png")
-
-
-@pytest.mark.parametrize(
-    ("photographs", "pattern", "columns", "expected"),
-    [
-        (IN_NAMES, "{view}_*", {}, [("c1", 0), ("c1", 1), ("c2", 0), ("c2", 1)]),
-        (IN_NAMES, "{view}_IMG*", {"image": ("10", "2")},
-         [("c1", 0), ("c1", 1), ("c2", 0), ("c2", 1)]),
-        (AT_THE_END, "*-{view}", {"image": ("2", "10")},
-         [("left", 0), ("left", 1), ("right", 0), ("right", 1)]),
-        (AT_THE_END, "*-{view}.png", {"image": ("010", "002")},
-         [("left", 0), ("left", 1), ("right", 0), ("right", 1)]),
-    ],
-)  # fmt: skip
-def test_views_are_found_in_names_of_photographs_in_one_folder(
-    photographs: Sequence[str],
-    pattern: str,
-    columns: Columns,
-    expected: list[tuple[str, int]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    table(own_folder(tmp_path, photographs), columns, 2)
-    assert init(monkeypatch, tmp_path, "--view-pattern", pattern) == 0
-    shown = capsys.readouterr().out
-    found = pairs(tmp_path)
-    assert [(view, k) for view, _, k in found] == expected
-    for view, image, k in found:
-        name = image.removeprefix("images/")
-        assert view in name
-        number = int(columns.get("image", ("2", "10"))[k])
-        assert int("".join(x for x in name.replace(view, "") if x.isdigit())) == number
-        assert name in shown
-    load_dataset(tmp_path / "dataset")
 
 
 def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
@@ -220,7 +184,7 @@ def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
     said = " ".join(capsys.readouterr().out.split())
     assert "Views left, right are taken from the names of the photographs, '*-{view}'" in said
     table(tmp_path, {"view": ("a", "a", "b", "b")}, n=4)  # or a column says it
-    assert init(monkeypatch, tmp_path, "--match", "order", output="other") == 0
+    assert init(monkeypatch, tmp_path, output="other") == 0
     by_names, by_column = (
         {Path(row["image"]).name: row["view"] for row in read_rows(tmp_path / name)}
         for name in ("dataset/measurements.csv", "other/measurements.csv")
@@ -231,7 +195,7 @@ def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
     numbered.mkdir()
     table(own_folder(numbered, ("1_01.png", "1_02.png", "2_01.png", "2_02.png")), n=4)
     assert init(monkeypatch, numbered) == 0
-    assert "give --view-pattern '{view}_*'" in " ".join(capsys.readouterr().out.split())
+    assert "look ('{view}_*'), put those of each" in " ".join(capsys.readouterr().out.split())
     assert {view for view, *_ in pairs(numbered)} == {"c1"}
 
 
@@ -292,7 +256,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"n": 2}, (), ("3 photographs for 2 rows", "column image")),
     (FLAT, {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
      ("row 3 (line 4)", "'IMG_12'", "'IMG_11.JPG'")),
-    (FLAT, {"columns": {"image": ("a", "b", "c")}}, (), ("'a'", "'IMG_2.JPG'", "--match order")),
+    (FLAT, {"columns": {"image": ("a", "b", "c")}}, (), ("'a'", "'IMG_2.JPG'", "in order")),
     (FLAT, {"columns": {"image": ("IMG_2", "img_2.jpg", "IMG_10")}}, (), ("row 2", "row 1")),
     (("1.jpg", "1.png", "2.png"), {"columns": {"image": "112"}}, (), ("row 1", "1.jpg, 1.png")),
     (SAME, {"n": 6, "columns": {"image": "123123"}}, (), ("a/1.png", "column view")),
@@ -302,20 +266,15 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
     (FLAT, {"add": 345.0}, (), ("lengths of legs in mm", "add --lengths")),
     (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),
-    (FLAT, {}, ("--unit", "m"), ("readings in mm", "give the unit mm")),
+    (FLAT, {}, ("--unit", "m"), ("readings in mm", "state the unit mm")),
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
-    (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "--unit")),
+    (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "headings")),
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
     (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
     (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),
-    (FLAT, {}, ("--view-pattern", "img_*"), ("'img_*'", "{view} once")),
-    (FLAT, {}, ("--view-pattern", "{view}-*"), ("'IMG_2.JPG'", "'{view}-*'")),
     (FLAT, {}, ("--camera", str(HEXAPOD / "camera_info.yaml")), ("IMG_2.JPG", "64 x 48", "1024")),
-    (FLAT, {}, ("--match", "time"), ("by time", "column 'time'")),
     (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
-    (FLAT, {}, ("--views", "c9"), ("c9", "--views")),
-    (FLAT, {}, ("--views", ".,c9"), ("found none in 'c9'", "--views")),
     (FLAT, {}, ("--encoder-sigma", "5m"), ("5 m", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "50mm"), ("50 mm", "20% of the travel", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "0um"), ("0 m", "--encoder-sigma")),
@@ -348,8 +307,6 @@ def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_ph
     table(own_folder(tmp_path, FLAT))
     assert init(monkeypatch, tmp_path, output="photos/dataset") == 2
     assert "folder of the photographs, which is not changed" in capsys.readouterr().err
-    assert init(monkeypatch, tmp_path, "--dry-run") == 0
-    assert not (tmp_path / "dataset").exists()
     # beside the photographs: they are named where they are
     (tmp_path / "camera_info.yaml").rename(tmp_path / "lens.yaml")
     words = ("--camera", str(tmp_path / "lens.yaml"), "--json")

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from csv_rows import read_rows, write_rows
-from machines import ROOT, read_family
+from layouts import Layout, write_machine
+from machines import ROOT, of_types, regular
 from rich.console import Console
 from simulated import simulated
 
@@ -116,21 +117,27 @@ def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "found", "notes"),
+    ("legs", "found", "notes"),
     [
         ("4-RPR", "more than it needs", ["more motors than the pose needs: mobility 3"]),
         ("8-SPS", "NOT determined", ["motors 8, which hold only 5", "is singular at home"]),
         ("3-SPS", "NOT determined", ["do not determine the pose: mobility 6"]),
-        ("6-SS", "it cannot move", ["the platform cannot move: mobility 0"]),
     ],
 )
 def test_motors_that_are_too_many_or_hold_nothing_are_noted(
-    family: str, found: str, notes: list[str], tmp_path: Path
+    legs: str, found: str, notes: list[str], tmp_path: Path
 ) -> None:
-    sizes: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 150.0, "height": 400.0}
-    if family.endswith("RPR"):
-        del sizes["height"]
-    description = machine_document(create_model(read_family(family, **sizes), tmp_path).machine)
+    description = machine_document(create_model(regular(legs), tmp_path).machine)
+    _check_notes(description, found, notes)
+
+
+def test_a_platform_that_cannot_move_is_noted(tmp_path: Path) -> None:
+    rods = of_types(["SS"] * 6, ["constant"] * 6)
+    description = machine_document(load_mechanism(write_machine(tmp_path, rods, Layout())))
+    _check_notes(description, "it cannot move", ["the platform cannot move: mobility 0"])
+
+
+def _check_notes(description: dict[str, Any], found: str, notes: list[str]) -> None:
     assert found in _printed(inspect_table(description))
     said = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
     assert len(said) == len(notes)
@@ -139,8 +146,7 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
 
 def test_the_mobility_is_that_of_other_poses_where_home_is_singular(tmp_path: Path) -> None:
     """Legs of a 3-UPU that are parallel leave the platform two turns more, at home alone."""
-    sizes: dict[str, Any] = {"base_radius": 300.0, "platform_radius": 300.0, "height": 400.0}
-    machine = create_model(read_family("3-UPU", **sizes), tmp_path).machine
+    machine = create_model(regular("3-UPU", platform_radius=300.0), tmp_path).machine
     assert machine.mobility == 3
     assert any("is singular at home" in note for note in machine.diagnostics)
 

@@ -59,7 +59,8 @@ from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind, parameters_of_legs, radius_name
-from legcal.machine.parameters import ARM_KINDS, kind_of_parameter, moved_legs, parametrize
+from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
@@ -99,7 +100,7 @@ def fit_of_everything(session: MachineSession, *, known_radii: bool) -> Solution
     legs = session.legs if known_radii else shaken_radii(session)
     names = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
     every = legs.parametrization.names
-    arms = frozenset(name for name in every if kind_of_parameter(name) in ARM_KINDS)
+    arms = frozenset(name for name in every if ParameterId.parse(name).kind in ARMS)
     choices = Choices(fixed=names, free=arms) if known_radii else Choices(free=names | arms)
     return refine(legs, session.measurements, session.outlines, session.start, choices=choices)
 
@@ -161,7 +162,7 @@ def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px:
     offsets = px * bent[:, None] * rng.choice([-1.0, 1.0], (len(seen), 2))
     moved = shifted(session, seen, offsets)
     radii = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
-    arms = [n for n in legs.parametrization.names if kind_of_parameter(n) in ARM_KINDS]
+    arms = [n for n in legs.parametrization.names if ParameterId.parse(n).kind in ARMS]
     straight = frozenset(n for n in arms if not n.startswith("arm2"))
     choices = Choices(fixed=radii, free=straight)
     found = refine(legs, session.measurements, moved, session.start, choices=choices)

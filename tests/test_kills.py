@@ -8,40 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fuzzing.kills import (
-    QUICK,
-    SIGNALS,
-    STOPPED,
-    WITH_SIGNALS,
-    Kill,
-    answers,
-    drawn_kills,
-    faults_of,
-    remove_finished,
-)
+from kills import STOPPED, WITH_SIGNALS, answers, drawn_kills, faults_of, remove_finished
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="looks at processes in /proc"
 )
-PER_TEST = 10  # undisturbed runs, which tests in several processes repeat, take as long
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _removed() -> Iterator[None]:
-    yield
-    remove_finished()
-
-
-def _faults(kills: list[Kill]) -> list[str]:
-    return [f"{kill}: {fault}" for kill in kills for fault in faults_of(kill)]
-
-
-@pytest.mark.system
-def test_a_kill_by_each_signal_leaves_no_half_result() -> None:
-    kills = [drawn_kills(6, 0, QUICK)[k] for k in (0, 1, 3)]  # calibrate once: it takes longest
-    assert [kill.number for kill in kills] == list(SIGNALS)
-    assert {kill.command for kill in kills} == set(QUICK)
-    assert _faults(kills) == []
 
 
 def _started(folder: Path) -> subprocess.Popen[str]:
@@ -58,7 +29,7 @@ def _started(folder: Path) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_answered_while_libraries_are_loaded(
     number: signal.Signals, tmp_path: Path
 ) -> None:
@@ -85,7 +56,14 @@ def test_nothing_that_takes_time_is_loaded_before_signals_are_answered() -> None
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
+@pytest.fixture
+def _removed() -> Iterator[None]:
+    yield
+    remove_finished()
+
+
 @pytest.mark.system
-@pytest.mark.parametrize("part", range(4))
-def test_forty_kills_of_all_commands_lose_and_falsify_nothing(part: int) -> None:
-    assert _faults(drawn_kills(4 * PER_TEST, 1)[part::4]) == []
+@pytest.mark.usefixtures("_removed")
+def test_a_kill_by_each_signal_leaves_no_half_result() -> None:
+    kills = drawn_kills(12, 1)  # of each command, and four of each signal
+    assert [f"{kill}: {fault}" for kill in kills for fault in faults_of(kill)] == []

@@ -50,6 +50,7 @@ Rows = list[tuple[str, str, tuple[str, ...]]]  # text, what is put in its place,
 
 URDF: Rows = [
     ('xyz="0.0 0.195 0.0"', 'xyz="0.0 1e999 0.0"', ("line", "3 finite numbers")),
+    ('xyz="0.0 0.195 0.0"', 'xyz="0.0 1e300 0.0"', ("line", "1e300")),
     ('xyz="0.0 0.195 0.0"', 'xyz="a b c"', ("line", "3 finite numbers")),
     ('upper="0.144"', 'upper="NaN"', ("line", 'upper="NaN"')),
     ('upper="0.144"', 'upper="-0.004"', ("line", "'leg1_prismatic'", "-0.004")),
@@ -57,6 +58,7 @@ URDF: Rows = [
     ('lower="-0.004" ', "", ("line", "lacks lower")),
     ('axis xyz="0.0 0.0 1.0"', 'axis xyz="0.0 nan 1.0"', ("line", "'leg1_prismatic'")),
     ('axis xyz="1.0 0.0 0.0"', 'axis xyz="0 0 0"', ("line", "zero axis")),
+    ('axis xyz="0.0 0.0 1.0"', 'axis xyz="0.0 0.0 2.0"', ("line", "'leg1_prismatic'", "length 2")),
     ('radius="0.01"', 'radius="1e11"', ("<visual> cylinder", "1e+14 mm", "0.0002 to 0.5")),
     ('radius="0.01"', 'radius="0.25"', ("<visual> cylinder", "250 mm", "along leg")),
     ('type="floating"', 'type="universal"', ("line", "'universal'")),
@@ -86,6 +88,8 @@ YAML: Rows = [
     ("  version: 1\n", "", ("legcal.version",)),
     ("0.38274", ".inf", ("legcal.home.xyz.2", "finite")),
     ("joint_name: []", "name_mot: []", ("name_mot",)),
+    ("- leg1_prismatic\n", "- leg2_prismatic\n", ("name_mot", "'leg2_prismatic'")),
+    ("- 3d\n", "", ("closed_loop", "type", "6", "5")),
     ("    leg6: leg6_prismatic\n", "", ("no name", "'leg6_prismatic'")),
     ("leg2: leg2_prismatic", "leg2: leg1_b1", ("already named 'leg1'",)),
     ("leg2: leg2_prismatic", "leg2: platform_free", ("on no leg between base and platform",)),
@@ -276,7 +280,7 @@ MJCF: Rows = [
 ]  # fmt: skip
 MJCF_OUT_OF_CLASS: Rows = [
     (CONNECT, CONNECT.replace("leg1_seat", "leg2_tube"),
-     ("; check <equality> and that the root is the base.",)),
+     ("check <equality>", "root of the tree is the base")),
     ("</worldbody>", '<body name="arm"><joint name="elbow"/></body></worldbody>',
      ("joints of something else", "'elbow'")),
 ]  # fmt: skip
@@ -587,6 +591,30 @@ def _couplers() -> Drawing:
     return drawing
 
 
+def _bars(joint: str, n_bars: int) -> Drawing:
+    """Return four arms whose rods end on the platform, or on bars that a joint connects to it.
+
+    With two hinges they are those of an H4, with one guide those of an I4.
+    """
+    drawing = Drawing()
+    for i in range(n_bars):
+        drawing.add(f"bar{i}", joint, "platform", np.array([0.0, 0.1 * i - 0.05, 0.0]), Z)
+    for j in range(4):
+        turn = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True)
+        pivot, elbow, end = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
+        axis = turn.apply([0.0, 1.0, 0.0])
+        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        drawing.motors.append(f"j_arm{j}")
+        i = j // 2
+        on = (f"bar{i}", np.array([0.0, 0.1 * i - 0.05, HEIGHT])) if i < n_bars else None
+        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+            at = ("platform", HEIGHT * Z) if on is None else on
+            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
+            drawing.legs[name] = f"j_{name}_0"
+    return drawing
+
+
 def _prs() -> Drawing:
     drawing = Drawing()
     for j in range(3):
@@ -632,7 +660,13 @@ DRAWN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
 
 
 LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
+SEVERAL = ("a platform of several bodies", "H4 or I4", "legs end on link 'bar", "joint 'j_bar0'")
 DRIVEN: dict[str, tuple[Callable[[], Drawing], bool, tuple[str, ...]]] = {
+    "H4": (lambda: _bars("revolute", 2), True, SEVERAL),
+    "H4 without a block": (lambda: _bars("revolute", 2), False, SEVERAL),
+    "I4": (lambda: _bars("prismatic", 1), True, SEVERAL),
+    "a Delta with a fourth arm": (lambda: _bars("revolute", 0), True, (
+        "overconstrained (1 of the 4", "joints at A that move")),
     "a Delta with couplers": (_couplers, True, LOOP),
     "arm on arm": (lambda: _delta(parallelograms=False, elbows=2), True, (
         "the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of")),
@@ -647,6 +681,21 @@ def test_machines_of_arms_outside_the_method_are_refused_by_name(name: str, tmp_
     draw, block, named = DRIVEN[name]
     (problem,) = refused(draw().write(tmp_path, block=block), OutOfClass)
     assert all(word in problem for word in named), problem
+
+
+def test_a_platform_named_beside_the_middle_of_an_h4_is_refused(tmp_path: Path) -> None:
+    path = _bars("revolute", 2).write(tmp_path)
+    path.write_text(path.read_text().replace("platform: platform\n", "platform: bar1\n"))
+    text = path.with_suffix(".urdf").read_text()
+    free = '<joint name="free" type="floating"><parent link="base"/>'
+    text = text.replace(f'{free}<child link="platform"/></joint>', "")
+    path.with_suffix(".urdf").write_text(
+        text.replace(
+            '<parent link="platform"/><child link="bar1"/>',
+            '<parent link="bar1"/><child link="platform"/>',
+        ).replace(END, f'{free}<child link="bar1"/></joint>{END}')
+    )
+    assert "legs end on link 'bar0'" in refused(path, OutOfClass)[0]
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -710,7 +759,7 @@ SPECIFIED: dict[str, tuple[Callable[[], MachineSpec], tuple[str, ...]]] = {
     **{
         f"slider off, {types}": (
             partial(_missing, types, 0.002),
-            ("'leg2_slider'", "by 2 mm", "0.01 mm"),
+            ("'leg2_slider'", "by 2 mm", "needed at most 0.01"),
         )
         for types in ("US", "RS", "UU", "RR")
     },
@@ -739,9 +788,15 @@ def test_legs_outside_the_method_are_refused_with_the_amount(name: str, tmp_path
     assert all(word in problem for word in named), problem
 
 
-@pytest.mark.parametrize("types", ["US", "RS", "UU"])
-def test_a_slider_that_misses_its_joint_by_a_hair_is_accepted(types: str, tmp_path: Path) -> None:
-    load_mechanism(write_machine(tmp_path, _missing(types, 2e-6), Layout()))
+@pytest.mark.parametrize(("types", "scale"), [("US", 1.0), ("RS", 0.1), ("UU", 25.0)])
+def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(
+    types: str, scale: float, tmp_path: Path
+) -> None:
+    near = load_mechanism(write_machine(tmp_path, _scaled(_missing(types, 4e-6), scale), Layout()))
+    assert near.home.translation[2] == pytest.approx(0.6 * scale, rel=1e-4)
+    path = write_machine(tmp_path, _scaled(_missing(types, 4e-5), scale), Layout())
+    (problem,) = refused(path, OutOfClass)
+    assert f"by {0.04 * scale:.4g} mm" in problem
 
 
 def test_three_axes_that_meet_in_two_points_are_no_spherical_joint(tmp_path: Path) -> None:

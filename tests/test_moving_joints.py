@@ -233,7 +233,7 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     )
     dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
     wanted = (
-        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--prior"
+        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--set"
     )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)
@@ -245,7 +245,7 @@ def test_random_poses_are_closed_and_inside_the_travel_of_actuators(name: str) -
     home = RigidTransform.from_components(t0, Rotation.from_matrix(R0))
     travel = np.array([leg.actuator.travel for leg in legs if leg.actuator])
     rng = np.random.default_rng(0)
-    R, t, _ = random_postures_of_legs(legs, frame_legs(6), home, travel, 12, rng)
+    R, t = random_postures_of_legs(legs, frame_legs(6), home, travel, 12, rng)
     q = readings_of_rods(legs, R, t)
     assert np.ptp(q, axis=0).min() > 0.3 * np.ptp(travel, axis=1).min()
     for leg, a, (low, high) in zip(legs, actuator_index(legs), travel, strict=True):

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_family, read_table, write_table
+from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
@@ -23,6 +23,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
+from legcal.machine.table_template import write_template
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
@@ -265,83 +266,86 @@ def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
 
 # --- families -----------------------------------------------------------------------------------
 
-GOUGH = {"base_radius": 300.0, "platform_radius": 150.0, "height": 400.0}
+
+@pytest.mark.parametrize(
+    ("family", "dimensions", "legs"),
+    [
+        ("hexapod", {}, ["UPS"] * 6),
+        ("hexapod", {"type": "SPU", "base_radius": 250.0}, ["SPU"] * 6),
+        ("delta", {}, ["RSS"] * 6),
+        ("Delta", {"arm_length": 160.0, "rod_length": 380.0, "height": -350.0}, ["RSS"] * 6),
+    ],
+)
+def test_a_family_is_the_table_that_is_written_of_it(
+    family: str, dimensions: dict[str, Any], legs: list[str], tmp_path: Path
+) -> None:
+    given = Dimensions(family=family, unit="mm", name="mine", **dimensions)
+    machine = create_model(description_of(None, given), tmp_path / "model").machine
+    assert [leg.type for leg in machine.legs] == legs
+    assert machine.mobility == len(machine.motors)
+    assert singularity(machine, machine.home) > 0.05
+    in_m = {k: v if k == "type" else 1e-3 * v for k, v in dimensions.items()}
+    described = description_of(None, Dimensions(family=family, unit="m", name="mine", **in_m))
+    tables = [read_table(path) for path in write_template(tmp_path, given)]
+    for i, table in enumerate((described, *tables)):
+        again = create_model(table, tmp_path / str(i)).machine
+        for key in ("A_base", "B_platform", "q0"):
+            np.testing.assert_allclose(getattr(again, key), getattr(machine, key), atol=1e-7)
+        np.testing.assert_allclose(again.home.as_matrix(), machine.home.as_matrix(), atol=1e-4)
 
 
-def family(folder: Path, kind: str, unit: str = "mm", **dimensions: Any) -> Machine:
-    given = {key: value for key, value in (GOUGH | dimensions).items() if value is not None}
-    description = read_family(kind, unit, **given)
-    machine = create_model(description, folder).machine
-    check_same(machine, description)
-    return machine
+def test_dimensions_of_a_hexapod_are_those_that_were_given(tmp_path: Path) -> None:
+    given = Dimensions(
+        family="hexapod", unit="mm", base_radius=250.0, platform_radius=100.0, height=420.0,
+        min_length=380.0, max_length=505.0, leg_radius=12.5,
+    )  # fmt: skip
+    machine = create_model(description_of(None, given), tmp_path).machine
+    for points, radius, angles in (
+        (machine.A_base, 0.25, [15, 105, 135, 225, 255, 345]),
+        (machine.B_platform, 0.1, [45, 75, 165, 195, 285, 315]),
+    ):
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), radius, atol=1e-7)
+        found = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+        np.testing.assert_allclose(found, angles, atol=1e-4)
+    np.testing.assert_allclose(machine.home.as_matrix()[:3, 3], [0.0, 0.0, 0.42], atol=1e-12)
+    np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
+    assert {leg.travel for leg in machine.legs} == {(0.0, 0.125)}
+    assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.0125}
+
+
+def test_the_delta_is_the_shipped_one(tmp_path: Path) -> None:
+    described = description_of(None, Dimensions(family="delta"))
+    machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
+    for key in ("A_base", "B_platform", "q0"):
+        np.testing.assert_allclose(getattr(machine, key), getattr(shipped, key), atol=1e-12)
+    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
 
 
 @pytest.mark.parametrize(
-    ("name", "mobility"),
+    ("family", "dimensions", "named"),
     [
-        *[(f"6-{kind}", 6) for kind in ("UPS", "SPU", "SPS")],
-        *[(f"3-{kind}", 3) for kind in ("RPS", "SPR", "UPU", "RPR")],
-        ("4-UPU", 3),
-        ("5-SPU", 6),
+        ("6-SPS", {}, ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
+        ("3-UPU", {}, ("--family 3-UPU", "hexapod or delta", "--template")),
+        ("hexapod", {"platform_radius": float("nan")}, ("--platform-radius nan", "positive")),
+        ("hexapod", {"arm_length": 20.0}, ("--arm-length", "--base-radius")),
+        ("hexapod", {"type": "RSS"}, ("--type RSS", "with a slider")),
+        ("hexapod", {"type": "UPX"}, ("--type UPX", "with a slider")),
+        ("hexapod", {"min_length": 600.0}, ("--family hexapod", "min_length 600")),
+        ("hexapod", {"name": "../up"}, ("'../up'",)),
+        ("delta", {"unit": "inch"}, ("'inch'", "mm or m")),
+        ("delta", {"unit": None, "rod_length": 400.0}, ("--rod-length", "--unit mm")),
+        ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
+        ("delta", {"height": 374.0}, ("--height 374", "negative")),
+        ("delta", {"leg_radius": 40.0}, ("60 mm apart", "80 mm thick", "--leg-radius")),
+        ("delta", {"type": "UPS"}, ("--type", "--arm-length")),
     ],
 )
-def test_families_have_the_mobility_of_their_type(name: str, mobility: int, tmp_path: Path) -> None:
-    machine = family(tmp_path, name, height=None if name == "3-RPR" else 400.0)
-    assert (machine.mobility, machine.name) == (mobility, name.lower())
-    n, kind = name.split("-")
-    assert [leg.type for leg in machine.legs] == [kind] * int(n)
-    np.testing.assert_allclose(np.linalg.norm(machine.A_base, axis=1), 0.3, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(machine.B_platform, axis=1), 0.15, atol=1e-12)
-    if mobility == len(machine.motors):
-        assert singularity(machine, machine.home) > 0.05
-
-
-def test_a_family_has_up_to_as_many_legs_as_are_stated(tmp_path: Path) -> None:
-    assert len(family(tmp_path, "32-SPS").legs) == 32  # 129 joints that move
-
-
-def test_dimensions_of_a_family_are_those_that_were_given(tmp_path: Path) -> None:
-    spread: dict[str, Any] = {"base_spread": 20.0, "platform_spread": 40.0}
-    lengths: dict[str, Any] = {"offset": 380.0, "travel": (-5.0, 120.0), "leg_radius": 12.5}
-    machine = family(tmp_path, "6-UPS", turn=10.0, name="mine", **lengths)
-    assert machine.name == "mine"
-    np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
-    assert {leg.travel for leg in machine.legs} == {(-0.005, 0.12)}
-    assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.0125}
-    np.testing.assert_allclose(machine.home.rotation.magnitude(), np.radians(10.0), atol=1e-12)
-    np.testing.assert_allclose(machine.home.translation, [0.0, 0.0, 0.4], atol=1e-12)
-    machine = family(tmp_path, "6-UPS", **spread)
-    for points, angles in (
-        (machine.A_base, [10, 110, 130, 230, 250, 350]),
-        (machine.B_platform, [40, 80, 160, 200, 280, 320]),
-    ):
-        found = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
-        np.testing.assert_allclose(found, angles, atol=1e-9)
-
-
-def test_metres_and_millimetres_give_the_same_family(tmp_path: Path) -> None:
-    in_m: dict[str, Any] = {key: 1e-3 * value for key, value in GOUGH.items()}
-    found = [
-        texts(family(tmp_path / "mm", "6-UPS")),
-        texts(family(tmp_path / "m", "6-UPS", "m", **in_m)),
-    ]
-    assert found[0] == found[1]
-
-
-def test_tilted_axes_rise_on_the_base_and_stay_across_revolute_legs(tmp_path: Path) -> None:
-    for leg in family(tmp_path, "3-UPU", tilt=15.0).legs:
-        a, b = leg.base_axis, leg.platform_axis
-        assert a is not None
-        assert b is not None
-        np.testing.assert_allclose(np.degrees(np.arccos(abs(a @ b))), 30.0, atol=1e-9)
-        np.testing.assert_allclose(abs(a[2]), np.sin(np.radians(15.0)), atol=1e-12)
-    for kind in ("RPS", "SPR"):
-        machine = family(tmp_path, f"3-{kind}", tilt=-20.0)
-        for leg in machine.legs:
-            axis = leg.base_axis if leg.base_axis is not None else leg.platform_axis
-            assert axis is not None
-            assert abs(axis @ (machine.home.apply(leg.B) - leg.A)) < 1e-12
-            assert abs(axis[2]) > 0.1
+def test_what_a_family_cannot_be(
+    family: str, dimensions: dict[str, Any], named: tuple[str, ...]
+) -> None:
+    with pytest.raises((UsageError, ModelError)) as caught:
+        description_of(None, Dimensions(**{"family": family, "unit": "mm"} | dimensions))
+    assert all(word in str(caught.value) for word in named), str(caught.value)
 
 
 def test_a_3upu_turns_only_where_its_axes_are_tilted() -> None:
@@ -437,24 +441,6 @@ def test_a_csv_whose_file_name_is_no_name_needs_one(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"'my machine \(2\)'.*--name NAME"):
         read_table(path, "mm")
     assert read_table(path, "mm", "mine").name == "mine"
-
-
-@pytest.mark.parametrize(
-    ("name", "dimensions", "named"),
-    [
-        ("6-UPS", {"platform_radius": float("nan")}, ("--platform-radius nan",)),
-        ("6-SPS", {"tilt": 4.0}, ("--tilt",)),
-        ("6-UPS", {"base_spread": 0.0}, ("--base-spread 0 deg",)),
-        ("6-UPS", {"tilt": 90.0}, ("--tilt 90 deg",)),
-        ("6-UPS", {"offset": 1e12}, ("--offset 1e+12",)),
-    ],
-)
-def test_what_a_family_cannot_be(
-    name: str, dimensions: dict[str, Any], named: tuple[str, ...]
-) -> None:
-    with pytest.raises(UsageError) as caught:
-        read_family(name, **(GOUGH | dimensions))
-    assert all(word in str(caught.value) for word in named)
 
 
 def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:

@@ -67,12 +67,13 @@ from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementS
 from legcal.calibration.outline_detection import detect
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, no_outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception.outline import WRONG_WIDTH, used_as_before
+from legcal.perception.outline import used_as_before
 from legcal.simulation.dataset import simulate as simulate_folder
 from legcal.simulation.observe import moved_outlines
 from legcal.vision.cylinder import EPSILON
@@ -145,7 +146,7 @@ def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     free = sigma > 0.0  # all but twists
     assert not found.outlines.used[wrong].any()
     assert (~found.outlines.used[~wrong]).sum() <= 2
-    assert all("px" in found.outlines.reason[i] for i in np.flatnonzero(wrong))
+    assert all("px" in found.outlines.reason[i].detail for i in np.flatnonzero(wrong))
     of_clean, of_dirty = (
         np.sqrt(np.mean((_errors(session, one)[free] / sigma[free]) ** 2)) for one in (clean, found)
     )
@@ -202,10 +203,10 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     outlines = replace(outlines, h=h, ends=ends)
     found = refine(session.legs, session.measurements, outlines, disturbed_start(session))
     assert set(np.flatnonzero(~found.outlines.used)) == {*swaps, 99}
-    assert found.outlines.reason[99] == "disagrees with the fit by 5.4 px"
+    assert str(found.outlines.reason[99]) == "disagrees with the fit by 5.4 px"
     for wrong, (_, reason) in swaps.items():
-        assert found.outlines.reason[wrong].startswith("disagrees with the fit by ")
-        assert found.outlines.reason[wrong].endswith(reason)
+        assert found.outlines.reason[wrong].reason is Reason.DISAGREES
+        assert found.outlines.reason[wrong].detail.endswith(reason)
     assert np.abs(joint_errors(found.parameters)).max() < 1e-9
 
 
@@ -445,7 +446,7 @@ def test_a_fit_that_still_changes_a_lot_is_refused(session: HexapodSession) -> N
 
 def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> None:
     (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
-    assert "not quite converged" in note
+    assert "has not converged" in note
     assert " px to 0." in note
 
 
@@ -577,7 +578,7 @@ def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None
     assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
 
 
-def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlines:
+def trial(session: HexapodSession, gamma: float, lost: float = np.inf, seed: int = 4) -> Outlines:
     """Return outlines of a camera of LOG_GAMMA, measured with a gamma.
 
     Each knows its response to it to a third. Those that it moves by more than *lost* [px] are not
@@ -585,7 +586,7 @@ def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlin
     """
     away = LOG_GAMMA - np.log(gamma)
     outlines = encoded(session, away)
-    wrong = np.random.default_rng(4).normal(1.0, 0.33, len(outlines))
+    wrong = np.random.default_rng(seed).normal(1.0, 0.33, len(outlines))
     return replace(
         outlines,
         gamma=np.full(len(outlines), gamma),
@@ -594,24 +595,34 @@ def trial(session: HexapodSession, gamma: float, lost: float = np.inf) -> Outlin
     )
 
 
-@pytest.mark.parametrize("lost", [np.inf, 0.15])
-def test_the_most_likely_gamma_is_that_of_the_same_outlines(
-    session: HexapodSession, lost: float
-) -> None:
+def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solution, GammaTrials]:
+    """Return the fit with a gamma of 1, and all trials that follow it."""
     measurements, start = without_gamma(session.measurements), disturbed_start(session)
 
     def fitted(gamma: float) -> Solution:
-        return refine(session.legs, measurements, trial(session, gamma, lost), start)
+        return refine(session.legs, measurements, trial(session, gamma, lost, seed), start)
 
     first = fitted(1.0)
     trials = GammaTrials.begun(first, {})
     while gammas := trials.next():
         trials = trials.tried(gammas, fitted(gammas["c1"]))
-    found = trials.found()
-    assert found.keys() == {"c1", "c2", "c3"}
-    assert np.log(found["c1"]) == pytest.approx(LOG_GAMMA, abs=GAMMA_TOLERANCE)
-    assert trials.notes({}) == ()
-    assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
+    return first, trials
+
+
+@pytest.mark.parametrize("lost", [np.inf, 0.15])
+def test_the_most_likely_gamma_is_that_of_the_same_outlines(
+    session: HexapodSession, lost: float
+) -> None:
+    off = []
+    for seed in (3, 4, 5):
+        first, trials = gammas_tried(session, lost, seed)
+        found = trials.found()
+        assert found.keys() == {"c1", "c2", "c3"}
+        off.append(np.log(found["c1"]) - LOG_GAMMA)
+        assert trials.notes({}) == ()
+        assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
+    # A single one may be as far off as the tolerance.
+    assert np.sqrt(np.mean(np.square(off))) < 0.75 * GAMMA_TOLERANCE
 
 
 def test_fewer_outlines_speak_for_no_gamma(session: HexapodSession) -> None:
@@ -663,11 +674,15 @@ def test_outlines_of_another_gamma_are_used_as_before_whatever_their_width(
     session: HexapodSession,
 ) -> None:
     before = session.outlines.choose(np.arange(len(session.outlines)) < 4)
-    before = replace(before, used=np.array([True, True, True, False]), reason=("", "", "", "far"))
+    before = replace(
+        before,
+        used=np.array([True, True, True, False]),
+        reason=(USED, USED, USED, Rejection(Reason.OTHER, "far")),
+    )
     after = replace(
         before,
         used=np.array([False, False, True, True]),
-        reason=(f"{WRONG_WIDTH}, 9.0 px for 8.0 px", "edge too rough", "", ""),
+        reason=(Rejection(Reason.WIDTH, "9.0 px for 8.0 px"), Rejection(Reason.ROUGH), USED, USED),
     )
     found = used_as_before(after, before)
     assert found.used.tolist() == [True, False, True, False]

@@ -11,11 +11,12 @@ from six_photographs import six_photographs
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
-from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, PartVerdict, verdict
+from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
 from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone, _lines
 from legcal.perception.photographs import measure_photographs, with_measured_radii
 from legcal.perception.placement import Placement, Search
@@ -71,7 +72,9 @@ def detect_with_blur(
     names = [f"leg{i + 1}" for i in range(len(bars))]
     wanted, one_view = np.ones((1, len(bars)), dtype=np.bool_), measurements(cam, len(bars))
     cylinders = [cylinder(b, radius) for b in bars]
-    search = Search(lambda row: image.astype(np.float32), one_view, A, B, cylinders, wanted, names)
+    size = float(np.linalg.norm(B - A, axis=2).mean())
+    grey = image.astype(np.float32)
+    search = Search(lambda row: grey, one_view, A, B, cylinders, wanted, names, size)
     found, blur = measure_outlines(search, Placement(A, B, (IDENTITY,), blur=known), [0])
     return found, float(blur[0])
 
@@ -163,7 +166,7 @@ def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> 
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
     found = detect(cam, bars, clipped, off=1e-3)
     assert not np.any(found.used), errors(cam, bars, found)
-    assert any("the background is overexposed" in reason for reason in found.reason), found.reason
+    assert found.rejected_for(Reason.OVEREXPOSED).any(), found.reason
 
 
 def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background() -> None:
@@ -234,7 +237,7 @@ def test_a_leg_that_another_covers_is_left_out_by_its_name() -> None:
     front, behind = bar(0.0, 0.03, 60.0, 0.03, 0.6), bar(0.0, 0.04, 170.0, depth=0.9)
     image = render(cam, [front, behind], 30.0, blur=0.5, supersample=3)
     found = detect(cam, [front, behind], image.astype(np.uint8))
-    assert found.reason[2:] == ("hidden by leg1", "hidden by leg1")
+    assert found.reason[2:] == (Rejection(Reason.HIDDEN, "leg1"),) * 2
     assert np.all(np.isnan(found.h[2:]))
 
 
@@ -243,9 +246,9 @@ def test_what_is_not_there_is_rejected_with_the_reason() -> None:
     bars = [bar(0.0, 0.03, 150.0), bar(0.9, 0.0, 150.0)]
     image = render(cam, bars[:1], 40.0, blur=0.5, supersample=3).astype(np.uint8)
     found = detect(cam, bars, image)
-    assert found.reason[2:] == ("outside the image",) * 2
+    assert found.reason[2:] == (Rejection(Reason.OUTSIDE),) * 2
     empty = detect(cam, bars[:1], np.full_like(image, 90))
-    assert set(empty.reason) == {"no convincing pair of edges"}
+    assert set(empty.reason) == {Rejection(Reason.NO_PAIR)}
     noise = np.random.default_rng(0).integers(80, 100, image.shape).astype(np.uint8)
     assert not np.any(detect(cam, bars[:1], noise).used)
 
@@ -300,9 +303,8 @@ def test_tube_and_rod_are_two_parts() -> None:
         Cylinder("rod", 0.009, "platform", -0.8 * length, 0.0),
     )
     A, B, wanted = whole.A[None, None], whole.B[None, None], np.ones((1, 1), dtype=np.bool_)
-    search = Search(
-        lambda row: image.astype(np.float32), measurements(cam, 1), A, B, [parts], wanted, ["leg1"]
-    )
+    grey, m = image.astype(np.float32), measurements(cam, 1)
+    search = Search(lambda row: grey, m, A, B, [parts], wanted, ["leg1"], length)
     found, _ = measure_outlines(search, Placement(A, B, (IDENTITY,)), [0])
     assert found.part == ("rod", "rod", "tube", "tube")
     assert np.all(found.used), found.reason
@@ -435,14 +437,14 @@ def _judged(
 
 def test_an_outline_before_a_saturated_background_needs_some_of_its_step() -> None:
     whole, most = _edge(np.zeros(2)), replace(_edge(WIDTH), clipped=0.2)
-    assert _judged(0.0, whole, most).reasons == ("", "")
+    assert _judged(0.0, whole, most).reasons == (USED, USED)
     found = _judged(0.0, whole, replace(most, clipped=0.5))
-    assert found.reasons[1] == "the background is overexposed, 1.0 px of the step are left"
+    assert found.reasons[1] == Rejection(Reason.OVEREXPOSED, "1.0")
 
 
 def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:
     found = _judged(0.0, _edge(np.zeros(2)), _edge(WIDTH + 0.5))
-    assert found.reasons == ("", "")
+    assert found.reasons == (USED, USED)
     assert found.bias == 0.0
 
 
@@ -457,10 +459,10 @@ def test_after_a_fit_an_edge_away_from_its_prediction_is_not_the_outline(
     predicted = np.stack([np.zeros(2), WIDTH])
     edges = _edge(predicted[0] + off[0]), _edge(predicted[1] + off[1])
     pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
-    assert verdict(pair, predicted, LENGTH, edges).reasons == ("", "")
+    assert verdict(pair, predicted, LENGTH, edges).reasons == (USED, USED)
     found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
     for reason, is_used in zip(found.reasons, used, strict=True):
-        assert reason == "" if is_used else reason.startswith(WRONG_WIDTH)
+        assert reason.reason is (Reason.NONE if is_used else Reason.WIDTH)
 
 
 @pytest.mark.parametrize("surer", [0, 1])
@@ -469,8 +471,8 @@ def test_of_two_edges_too_near_to_each_other_the_surer_is_the_outline(surer: int
     sigma[surer] = 0.1
     one, two = _edge(np.zeros(2), sigma=sigma[0]), _edge(WIDTH - 3.0, sigma=sigma[1])
     found = _judged(-3.0, one, two)
-    assert found.reasons[surer] == ""
-    assert found.reasons[1 - surer].startswith(WRONG_WIDTH)
+    assert found.reasons[surer] == USED
+    assert found.reasons[1 - surer].reason is Reason.WIDTH
     assert found.bias == pytest.approx(3.0 * NARROW_BIAS)
 
 
@@ -484,7 +486,7 @@ def test_otherwise_edges_at_another_distance_are_not_used(
 ) -> None:
     one = _edge(np.zeros(2), sigma=sigma, is_step=is_step)
     found = _judged(off, one, _edge(WIDTH + off, sigma=0.3))
-    assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
+    assert all(reason.reason is Reason.WIDTH for reason in found.reasons)
 
 
 @pytest.mark.parametrize(
@@ -497,17 +499,17 @@ def test_an_edge_whose_partner_was_found_but_not_measured(
     off: float, alone: bool, kept: float, used: bool
 ) -> None:
     found = _judged(off, _edge(np.zeros(2), kept=kept), None, alone=alone)
-    expected = "" if used else "its other outline: edge hardly visible"
-    assert found.reasons == (expected, "edge hardly visible")
+    expected = USED if used else Rejection(Reason.PARTNER, Reason.FAINT)
+    assert found.reasons == (expected, Rejection(Reason.FAINT))
 
 
 @pytest.mark.parametrize(("beside", "used"), [(0.5, True), (3.0, False)])
 def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, used: bool) -> None:
     found = _judged(6.0, _edge(np.full(2, beside)), _edge(WIDTH + 6.0), window=5.0)
-    assert (found.reasons[0] == "") is used
-    assert found.reasons[1].startswith(WRONG_WIDTH)
+    assert (found.reasons[0] == USED) is used
+    assert found.reasons[1].reason is Reason.WIDTH
     lone = _judged(6.0, _edge(np.full(2, beside)), None, alone=True, window=5.0)
-    assert (lone.reasons[0] == "") is used
+    assert (lone.reasons[0] == USED) is used
 
 
 def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_them() -> None:

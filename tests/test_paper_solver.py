@@ -96,6 +96,7 @@ def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
         solve_least_squares(problem)
 
 
+@pytest.mark.usefixtures("answered_signals")
 def test_an_interrupt_inside_ipopt_reaches_the_caller() -> None:
     x = ca.SX.sym("x", 2)
     problem = _problem("A valley", x, ca.vertcat(1.0 - x[0], 10.0 * (x[1] - x[0] ** 2)), [-1.2, 1])
@@ -106,15 +107,11 @@ def test_an_interrupt_inside_ipopt_reaches_the_caller() -> None:
         while True:
             solve_least_squares(problem)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        for delay in np.linspace(0.001, 0.03, 12).tolist():
-            killer = Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
-            with pytest.raises(KeyboardInterrupt):
-                solve_until_killed(killer)
-            killer.join()
-    finally:
-        signal.signal(signal.SIGINT, before)
+    for delay in np.linspace(0.001, 0.03, 12).tolist():
+        killer = Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            solve_until_killed(killer)
+        killer.join()
     assert solve_least_squares(problem).status == "Solve_Succeeded"
 
 

@@ -19,7 +19,7 @@ import yaml
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
-from machines import read_family
+from machines import with_round_arms
 from rich.console import Console
 
 import legcal
@@ -34,7 +34,7 @@ from legcal.machine.leg import Cylinder
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import slider_columns
 from legcal.machine.model_builder import create_model
-from legcal.machine.parameters import ARM_KINDS, kind_of_parameter
+from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
 from legcal.planning import planner
 from legcal.planning.exchange import Session, choose
@@ -168,6 +168,7 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
+@pytest.mark.usefixtures("answered_signals")
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
     tmp_path: Path,
@@ -195,6 +196,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
+@pytest.mark.usefixtures("answered_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("place", ["legcal.cli.plan._previews", "legcal.planning.session._poses"])
 def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
@@ -324,7 +326,7 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
 @pytest.mark.system
 def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
     """They are seen where the simulation shows them, and their lines become as well known."""
-    machine = create_model(read_family("delta", arm_radius=8.0), tmp_path).machine
+    machine = create_model(with_round_arms("delta"), tmp_path).machine
     setting = replace(FEW, shift=0.0, turn=0.0)
     plan = legcal.plan(machine, images=15, seed=1, noise=WHITE, setting=setting)
     write_session(plan, tmp_path / "session")
@@ -346,7 +348,7 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
     stated = dict(
         zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
     )
-    names = [name for name in plan.names if kind_of_parameter(name) in ARM_KINDS]
+    names = [name for name in plan.names if ParameterId.parse(name).kind in ARMS]
     sigma = dict(zip(plan.names, plan.sigma.tolist(), strict=True))
     ratios = [stated[name] / sigma[name] for name in names]
     assert len(ratios) == 12

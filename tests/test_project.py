@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path, PurePath
 
 import pytest
+from evidence import page_text
 from format_schemas import FOLDER, NAMES, schema_text
 from hexapod_example import Run
 
@@ -152,3 +153,8 @@ def _plain(requirement: str) -> str:
     """Return a requirement with its bounds in one order."""
     name, *bounds = re.split(r"(?<![<>=!~])(?=[<>=!~])|,", requirement.replace(" ", ""))
     return " ".join([name, *sorted(bound for bound in bounds if bound)])
+
+
+def test_the_page_of_evidence_has_the_recorded_figures() -> None:
+    page = (ROOT / "docs/evidence.md").read_text(encoding="utf-8")
+    assert page_text(page) == page, "python benchmarks/evidence.py writes its tables"

@@ -4,6 +4,8 @@ import contextlib
 import dataclasses
 import io
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -109,14 +111,16 @@ def test_a_machine_is_drawn_with_numbered_joints_and_hostile_names(tmp_path: Pat
     machine = legcal.load_mechanism("3-rps")
     legs = [dataclasses.replace(leg, name=f"$\\frac{{{leg.name}") for leg in machine.legs]
     hostile = dataclasses.replace(machine, name="$x^$", legs=tuple(legs))
-    figure = hostile.plot()
+    figure = legcal.plot_machine(hostile)
     figure.savefig(tmp_path / "machine.png", dpi=20)
     above, side = figure.axes
     for panel in (above, side):
         assert {"A1", "A2", "A3", "B1", "B2", "B3"} <= {text.get_text() for text in panel.texts}
     discs = np.asarray(above.collections[0].get_offsets(), dtype=np.float64)
     np.testing.assert_allclose(discs, 1e3 * machine.A_base[:, :2])
-    assert len(legcal.load_mechanism("3-rpr").plot().axes) == 1  # a plane is seen from above
+    assert (
+        len(legcal.plot_machine(legcal.load_mechanism("3-rpr")).axes) == 1
+    )  # a plane is seen from above
     assert pyplot.get_fignums() == []
 
 
@@ -132,11 +136,17 @@ def test_the_examples_of_the_page_on_python_print_what_it_says(
 ) -> None:
     page = (ROOT / "docs" / "python.md").read_text()
     (tmp_path / "calibrated").symlink_to(example_run.output)
+    for machine in ("east", "west"):
+        simulated(tmp_path / "machines" / machine, "3-rpr", level=Level.OUTLINES, poses=6)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL)
     assert len(examples) == page.count("```python")
     for code, expected in examples:
+        if "__main__" in code:  # a program, whose processes import it
+            (tmp_path / "program.py").write_text(code)
+            assert subprocess.check_output([sys.executable, "program.py"], text=True) == expected
+            continue
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(code, names)

@@ -224,8 +224,8 @@ def photographs(folder: Path, n: int) -> None:
         ("{}", "rad", (), 0.0057),
         ("{}", "deg", (), 0.0057),
         ("{} [deg]", "deg", ("--encoder-sigma", "0.2deg"), 0.2),
-        ("{}_us", "us", ("--servo", "1500,11.1"), 0.5),
-        ("{}", "us", ("--servo", "1500,11.1", "--encoder-sigma", "3us"), 3.0 / 11.1),
+        ("{}_us", "us", (), 0.5),
+        ("{}", "us", ("--encoder-sigma", "3us"), 3.0 / 11.1),
     ],
 )
 def test_init_takes_angles_and_pulses(
@@ -238,7 +238,10 @@ def test_init_takes_angles_and_pulses(
 ) -> None:
     photographs(tmp_path, 4)
     given = {"rad": ANGLES, "deg": np.degrees(ANGLES), "us": pulses(ANGLES)}[scale]
-    assert init(tmp_path, given, headings, words, monkeypatch) == 0
+    model = "servo-hexapod"
+    if scale == "us":
+        model = str(create_model(read_table(servo_table(tmp_path)), tmp_path).yaml_path)
+    assert init(tmp_path, given, headings, words, monkeypatch, model) == 0
     rows = read_rows(tmp_path / "dataset/measurements.csv")
     found = [[float(row[name]) for name in SERVOS] for row in rows]
     np.testing.assert_allclose(found, ANGLES, atol=1e-4)
@@ -253,6 +256,7 @@ def init(
     headings: str,
     words: tuple[str, ...],
     monkeypatch: pytest.MonkeyPatch,
+    model: str = "servo-hexapod",
 ) -> int:
     """Return what legcal init says of a table of readings."""
     table = [",".join(headings.format(name) for name in SERVOS)]
@@ -260,24 +264,21 @@ def init(
     (folder / "own.csv").write_text("\n".join(table) + "\n")
     return run(
         monkeypatch, "init", folder / "photos", "--readings", folder / "own.csv", "--model",
-        "servo-hexapod", "-o", folder / "dataset", *words,
+        model, "-o", folder / "dataset", *words,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("headings", "given", "words", "named"),
     [
-        ("{}_us", pulses(ANGLES), (), ("pulses of servos", "--servo 1500,11.1")),
-        ("{}", pulses(ANGLES), (), ("1182.01", "-45 to 45 deg", "--servo CENTRE")),
+        ("{}_us", pulses(ANGLES), (), ("pulses of servos", "'servo1'", "legcal.motors")),
+        ("{}", pulses(ANGLES), (), ("1182.01", "-45 to 45 deg", "legcal.motors")),
         ("{} [mm]", ANGLES, (), ("found mm of 'servo1', which turns",)),
         ("{}", ANGLES, ("--unit", "mm"), ("no motor that slides",)),
         ("{}", ANGLES, ("--lengths",), ("--lengths", "leave out")),
-        ("{}", ANGLES, ("--servo", "servo9=1500,11"), ("'servo9'", "servo1")),
-        ("{}", ANGLES, ("--servo", "1500"), ("'1500'", "1500,11.1")),
-        ("{}", ANGLES, ("--servo", "1500,0"), ("us_per_deg 0",)),
         ("{}", ANGLES, ("--encoder-sigma", "2um"), ("'2um'", "deg")),
         ("{} [rad]", np.degrees(ANGLES), (), ("look like readings in deg",)),
-        ("{} [deg]", BOTH_WAYS, (), ("% in rad", "--unit to rad")),
+        ("{} [deg]", BOTH_WAYS, (), ("% in rad", "state rad in the headings")),
     ],
 )
 def test_what_init_cannot_make_of_angles(

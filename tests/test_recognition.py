@@ -111,7 +111,7 @@ def test_hypotheses_move_with_the_frame_of_the_machine_and_put_two_legs_on_pairs
     (picture,), _ = _scene(4, 5, 1)
     moved = _moved_machine(picture, MOTION)
     one, two = pose_hypotheses(picture, 5), pose_hypotheses(moved, 5)
-    scores = [_matched(p, s, 0.05).score for p, s in ((picture, one), (moved, two))]
+    scores = [_matched(p, s, 0.125).score for p, s in ((picture, one), (moved, two))]
     assert np.mean((scores[0] > 0.1).sum(axis=1) >= 2) > 0.5
     assert abs(len(one) - len(two)) <= 0.02 * len(one)
     assert len(np.unique(one.R.round(9), axis=0)) > 0.7 * len(one)  # two turns of each
@@ -152,18 +152,18 @@ def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatc
 @pytest.mark.parametrize("seed", range(2))
 def test_the_true_pose_matches_and_a_scaled_or_shifted_one_does_not(seed: int) -> None:
     pictures, T = _scene(seed)
-    matches = [_matched(picture, _pose(T), 2e-3) for picture in pictures]
+    matches = [_matched(picture, _pose(T), 0.005) for picture in pictures]
     score = np.concatenate([m.score[0][m.visible[0] > 0.9] for m in matches])
     assert np.median(score) > 0.9
     assert np.mean(score > 0.5) > 0.8  # pairs of edges of crossing legs may be taken as well
     away = _pose(T)
     away = replace(away, t=away.t + np.array([0.05, 0.0, 0.0]))
-    assert all(_matched(p, away, 2e-3).score.mean() < 0.2 for p in pictures)
+    assert all(_matched(p, away, 0.005).score.mean() < 0.2 for p in pictures)
     for picture, m in zip(pictures, matches, strict=True):  # a third farther and thinner
         wide = replace(
             picture, targets=replace(picture.targets, radius=1.33 * picture.targets.radius)
         )
-        assert _matched(wide, _pose(T), 2e-3).score.sum() < 0.4 * m.score.sum()
+        assert _matched(wide, _pose(T), 0.005).score.sum() < 0.4 * m.score.sum()
 
 
 def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
@@ -173,7 +173,7 @@ def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
     })  # fmt: skip
     n = len(picture.targets)
     doubled.ends[n:] += 1.5e-3  # as good a pose, but for these segments
-    m = _matched(replace(picture, targets=doubled), _pose(T), 0.01)
+    m = _matched(replace(picture, targets=doubled), _pose(T), 0.025)
     both = (m.score[0, :n] > 0.5) & (m.score[0, n:] > 0.1) & (m.pair[0, :n] == m.pair[0, n:])
     assert both.sum() > 5
     better = np.maximum(m.score[0, :n], m.score[0, n:])[both]
@@ -186,25 +186,25 @@ def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
     (picture, *_), T = _scene(1)
     poses = CameraPoses.joined([_pose(T)] * 300)
     poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
-    together = _matched(picture, poses, 0.01)
+    together = _matched(picture, poses, 0.025)
     for i in (0, 127, 128, 299):
-        alone = _matched(picture, poses.take(np.array([i])), 0.01)
+        alone = _matched(picture, poses.take(np.array([i])), 0.025)
         np.testing.assert_allclose(alone.score[0], together.score[i], atol=1e-6)
-    moved = _matched(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.01)
+    moved = _matched(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.025)
     np.testing.assert_allclose(moved.score[0], together.score[0], atol=1e-4)
     C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, -0.5, 0.3]))
     joined = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
-    other = _matched(joined, _pose(T * C), 0.01)
+    other = _matched(joined, _pose(T * C), 0.025)
     np.testing.assert_allclose(other.score[0], together.score[0], atol=1e-4)
     for angle in (np.pi, 1.2):  # behind the camera, beside the picture
         away = T * RigidTransform.from_rotation(Rotation.from_euler("y", angle))
-        assert not _matched(picture, _pose(away), 0.01).visible.any()
+        assert not _matched(picture, _pose(away), 0.025).visible.any()
     empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
-    nothing = _matched(empty, _pose(T), 0.01)
+    nothing = _matched(empty, _pose(T), 0.025)
     assert not nothing.score.any()
     assert nothing.visible.any()
     none = Pictures.of([empty])
-    still = gauss_newton_step(none, _pose(T), match_pairs(none, _pose(T), 0.01), 0.01, 0.006)
+    still = gauss_newton_step(none, _pose(T), match_pairs(none, _pose(T), 0.025), 0.025, 0.015)
     np.testing.assert_allclose(still.t, _pose(T).t)
 
 
@@ -217,9 +217,9 @@ def test_pictures_together_say_what_each_of_them_says() -> None:
     poses = CameraPoses.joined([_pose(T)] * n)
     poses = replace(poses, t=poses.t + np.linspace(-0.02, 0.02, n)[:, None] * [1.0, 0.5, 0.0])
     every = Pictures.of(pictures)
-    together = match_pairs(every, poses, 0.02)
+    together = match_pairs(every, poses, 0.05)
     for k, picture in enumerate(pictures):
-        alone, m = _matched(picture, poses, 0.02), len(picture.targets)
+        alone, m = _matched(picture, poses, 0.05), len(picture.targets)
         for one, all_of_them in zip(alone, together, strict=True):
             np.testing.assert_allclose(all_of_them[k, :, :m], one, atol=1e-6)
             assert not all_of_them[k, :, m:].any()
@@ -228,9 +228,9 @@ def test_pictures_together_say_what_each_of_them_says() -> None:
     picture = pictures[3]
     empty = replace(picture, pairs=picture.pairs.take(np.arange(0)))
     single, double = Pictures.of([picture]), Pictures.of([empty, picture])
-    for joint_error in (0.0, 6e-3):
+    for joint_error in (0.0, 0.015):
         by_one, by_two = (
-            gauss_newton_step(some, poses, match_pairs(some, poses, 0.02), 0.02, joint_error)
+            gauss_newton_step(some, poses, match_pairs(some, poses, 0.05), 0.05, joint_error)
             for some in (single, double)
         )
         np.testing.assert_allclose(by_one.t, by_two.t, atol=1e-12)
@@ -248,14 +248,14 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
     rng = np.random.default_rng(0)
     poses = replace(poses, shift=rng.uniform(-5e-3, 5e-3, poses.shift.shape))
     own = Pictures.of([picture])
-    found = match_pairs(own, poses, 0.02)
+    found = match_pairs(own, poses, 0.05)
     matched = found.score[0, 0] > 0.3
     assert matched.sum() > 5
-    J, J_leg, _, weight = (x[0] for x in segment_equations(own, poses, found, 0.01))
+    J, J_leg, _, weight = (x[0] for x in segment_equations(own, poses, found, 0.025))
     assert np.all(weight[0, matched] > 0.0)
 
     def residual(at: CameraPoses) -> Array:
-        return np.asarray(segment_equations(own, at, found, 0.01)[2][0, 0])
+        return np.asarray(segment_equations(own, at, found, 0.025)[2][0, 0])
 
     # Fixed while a segment moves are its place along the pair, which matters by the product of two
     # small residuals, and how obliquely its plane is seen, which matters a little for the width.
@@ -263,7 +263,9 @@ def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None
     scale = np.abs(J[0, matched]).max()
     for k in range(6):
         xi = step * np.eye(6)[k][None]
-        ahead, back = (residual(_moved(poses, s * xi, poses.shift, centre)) for s in (1.0, -1.0))
+        ahead, back = (
+            residual(_moved(poses, s * xi, poses.shift, centre, 0.02)) for s in (1.0, -1.0)
+        )
         error = np.abs(((ahead - back) / (2.0 * step))[matched] - J[0, matched, :, k])
         assert error[:, :2].max() < 0.03 * scale
         assert np.median(error[:, 2]) < 0.3
@@ -284,7 +286,7 @@ def test_steps_lead_back_to_the_true_pose(seed: int) -> None:
         rng.uniform(-0.01, 0.01, 3), Rotation.from_rotvec(rng.uniform(-0.02, 0.02, 3))
     )
     poses = _pose(T * off)
-    for tolerance in (0.03, 0.02, 0.01, 0.006, 0.004):
+    for tolerance in (0.075, 0.05, 0.025, 0.015, 0.01):
         matches = match_pairs(Pictures.of(pictures), poses, tolerance)
         poses = gauss_newton_step(Pictures.of(pictures), poses, matches, tolerance)
     away, angle = lp.apart(T, poses.T_base_camera())
@@ -301,9 +303,9 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
     A[2] = A[2] + 8e-3 * x
     picture = lp.picture((made.A, B), (A, B), T, rng)
     poses = _pose(T)
-    for tolerance in (0.02, 0.01, 0.005, 0.003):
+    for tolerance in (0.05, 0.025, 0.0125, 0.0075):
         matches = match_pairs(Pictures.of([picture]), poses, tolerance)
-        poses = gauss_newton_step(Pictures.of([picture]), poses, matches, tolerance, 0.02)
+        poses = gauss_newton_step(Pictures.of([picture]), poses, matches, tolerance, 0.05)
     sideways = np.cross(B[2] - A[2], T.rotation.apply([0.0, 0.0, 1.0]))
     sideways /= np.linalg.norm(sideways)
     assert abs(poses.shift[0, 2, 0] @ sideways) > 0.5 * abs(8e-3 * x @ sideways)
@@ -311,7 +313,7 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
     away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
     (picture, *_), T = _scene(0)
     own = Pictures.of([picture])
-    matches = match_pairs(own, _pose(T), 2e-3)
+    matches = match_pairs(own, _pose(T), 0.005)
     good = matches.score[0, 0] > 0.9
     away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
     assert np.median(distances(own, _pose(T), matches)[0, 0, good]) < 2e-4
@@ -399,7 +401,7 @@ def _of_parallelograms(
         lines = np.concatenate([seen[rng.random(len(seen)) > 0.1], arms, lp.clutter(6, rng)])
         lines = lines + 0.3 * lp.PIXEL * rng.normal(size=lines.shape)
         pairs = find_candidate_pairs(lp.segments(lines))
-        found.append(Picture(pairs, lp.pieces(A[k], B[k], [rod]), lp.CORNERS))
+        found.append(Picture(pairs, lp.pieces(A[k], B[k], [rod]), lp.CORNERS, lp.SIZE))
     return found, camera, true_A, true_B
 
 
@@ -489,7 +491,7 @@ def test_a_rough_pose_is_improved_and_that_of_another_place_is_not_clear() -> No
     assert placed.hinted
     assert placed.is_convincing
     assert _is_right(placed, T)
-    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 6e-3)  # from its edge pairs
+    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 0.015)  # from its edge pairs
     assert lp.apart(T, placed.pose())[1] < 0.5 * lp.apart(T, T * off)[1]
     other = RigidTransform.from_rotation(Rotation.from_euler("z", 1.9)) * T
     assert not place_near(pictures, other, 6).is_clear
@@ -581,7 +583,8 @@ def _search(kind: type[Search], made: lp.MachineSpec, B: Array) -> Search:
     )  # fmt: skip
     A = np.broadcast_to(made.A, B.shape)
     wanted = np.ones((1, n_legs), dtype=np.bool_)
-    return kind(_no_image, measurements, A, B, [lp.CYLINDERS] * n_legs, wanted, ["leg"] * n_legs)
+    names = ["leg"] * n_legs
+    return kind(_no_image, measurements, A, B, [lp.CYLINDERS] * n_legs, wanted, names, lp.SIZE)
 
 
 def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.MonkeyPatch) -> None:

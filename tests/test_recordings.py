@@ -181,6 +181,16 @@ def test_poses_that_were_held_become_rows(
     assert np.abs(np.array(dark) - (8.0 + 7.0 * np.arange(10))).max() <= 2.0
 
 
+def test_the_topic_of_one_camera_is_named_behind_the_bag(
+    motion: Motion, tmp_path: Path, import_: Callable[..., tuple[int, Path]]
+) -> None:
+    code, folder = import_(f"{_bag(motion, tmp_path, second='/second')}:/camera")
+    assert code == 0
+    measurements = load_dataset(folder).measurements
+    assert [view.name for view in measurements.views] == ["c1_camera"]
+    assert measurements.n_rows == motion.rests
+
+
 def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
     motion: Motion,
     tmp_path: Path,
@@ -192,14 +202,14 @@ def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
     times = np.arange(0.0, motion.times[-1], 0.02)
     begin, end = motion.times[6], motion.times[7]  # of a rest without readings
     table = _table(motion, tmp_path / "q.csv", times[(times < begin - 0.1) | (times > end + 0.1)])
-    code, folder = import_(_folder(motion, tmp_path), "--readings", table, "--json", "--dry-run")
+    code, folder = import_(_folder(motion, tmp_path), "--readings", table, "--json")
     found = json.loads(capsys.readouterr().out)["views"]["c1"]
     assert code == 0
     assert abs(found["offset_s"] - AHEAD) < 0.05
     assert abs(found["offset_s"] - AHEAD) < 4.0 * found["offset_sigma_s"] + 1.0 / RATE
     assert [still["why_not"] for still in found["stills"]].count("no reading") == 1
     assert found["used"] == motion.rests - 1
-    assert not folder.exists()
+    assert load_dataset(folder).measurements.n_rows == motion.rests - 1
 
 
 def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
@@ -242,15 +252,8 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
                       "readings that change alike all the time"),
     "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
                      "needed the readings of the same time"),
-    "no such topic": (lambda m, t: (_bag(m, t), "--image-topic", "/other"),
-                      "found no topic '/other'"),
-    "a topic of a video": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t),
-                                         "--image-topic", "/a"), "found a topic and no bag"),
-    "two topics": (lambda m, t: (_bag(m, t, second="/second"),), "name it with --image-topic"),
-    "rests too short": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--still", "60"),
-                        "needed rests of 60 s"),
-    "no rest": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--still", "0"),
-                "correct --still"),
+    "no such topic": (lambda m, t: (f"{_bag(m, t)}:/other",), "found no topic '/other'"),
+    "two topics": (lambda m, t: (_bag(m, t, second="/second"),), "c1:/camera"),
     "no overlap": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "1e6"),
                    "needed times that overlap"),
     "no camera file": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t),

@@ -19,6 +19,7 @@ from hexapod_example import HEXAPOD, Run
 
 import legcal
 from legcal.calibration.detection import Detection, _page, write_detection
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.vision.camera import Camera
 from legcal.vision.distortion import DistortionModel
 
@@ -360,7 +361,7 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     changed = [i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b]
     assert changed == [dropped, moved]
     # What is still true of a rejected outline stays; of a moved one nothing that was measured does.
-    verdict = {"verdict": "rejected", "reason": "rejected by hand", "source": "edited"}
+    verdict = {"verdict": "rejected", "reason": "by_hand", "source": "edited"}
     assert after[dropped] == before[dropped] | verdict
     assert _ends(after[moved]) - _ends(before[moved]) == pytest.approx(
         [2.0, 1.0, 0.0, 0.0], abs=0.1
@@ -377,7 +378,7 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     calibration = legcal.calibrate(corrected)
     used = calibration.solution.outlines
     assert [i for i, source in enumerate(used.source) if source == "edited"] == changed
-    assert (used.used[dropped], used.reason[dropped]) == (False, "rejected by hand")
+    assert (used.used[dropped], used.reason[dropped]) == (False, Rejection(Reason.BY_HAND))
     k = calibration.residuals.index.tolist().index(moved)
     line = np.array([float(after[moved][name]) for name in "abc"])
     camera = calibration.dataset.measurements.views[0].camera
@@ -409,7 +410,7 @@ def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
         found.outlines,
         h=h,
         used=~np.isnan(h[:, 0]),
-        reason=tuple("no edges" if np.isnan(a) else "" for a in h[:, 0]),
+        reason=tuple(Rejection(Reason.NO_EDGE) if np.isnan(a) else USED for a in h[:, 0]),
     )
     dataset = replace(found.dataset, measurements=replace(measured, views=views))
     changed = replace(found, dataset=dataset, outlines=outlines)

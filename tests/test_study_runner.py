@@ -81,7 +81,7 @@ def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
 ) -> None:
     run_study(Draws(), 5, output=tmp_path)
     before = _lines(tmp_path)
-    with pytest.raises(OutOfResources, match="one of 2 processes was ended from outside"):
+    with pytest.raises(OutOfResources, match="one of the processes was ended from outside"):
         run_study(Deadly(), 20, workers=2, output=tmp_path)
     assert _lines(tmp_path) == before
 

@@ -34,6 +34,7 @@ from legcal.data.outlines import (
     reject_unused_legs,
     write_observations,
 )
+from legcal.data.reasons import Reason, Rejection, read_rejection
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, IntArray
 
@@ -140,7 +141,7 @@ def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
         (
             no_outlines(),
             "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
-            "contrast,length,residual,gamma,by_gamma",
+            "contrast,length,residual,gamma,by_gamma,detail",
         ),
         (axis_table(), "view,image,leg,psi,theta,x,z,sigma_psi,sigma_theta,sigma_x,sigma_z"),
     ],
@@ -171,9 +172,11 @@ def test_tables_without_optional_columns_and_rows_without_the_other_edge_are_rea
 ) -> None:
     outlines = outlines_of(3)
     path = written(tmp_path, outlines)
-    rewritten(path, lambda lines: [cells[: -len(OPTIONAL)] for cells in lines])
+    rewritten(path, lambda lines: [cells[: -len(OPTIONAL) - 1] for cells in lines])
     unknown = np.full(len(outlines), np.nan)
-    assert_same(read(path), replace(outlines, **dict.fromkeys(OPTIONAL, unknown)))  # type: ignore[arg-type]
+    codes = tuple(Rejection(why.reason) for why in outlines.reason)
+    plain = replace(outlines, reason=codes, **dict.fromkeys(OPTIONAL, unknown))  # type: ignore[arg-type]
+    assert_same(read(path), plain)
     rewritten(path, lambda lines: lines[:2] + lines[3:])
     assert len(read(path)) == len(outlines) - 1
 
@@ -234,7 +237,8 @@ def test_an_edited_row_is_read_without_what_detection_said_of_it(tmp_path: Path)
     outlines = outlines_of(6, rejected=0.0)
     cells = {"source": "edited", "verdict": "rejected", "reason": "mine"}
     found = read(edited(written(tmp_path, outlines), 3, **cells))
-    assert (found.source[2], bool(found.used[2]), found.reason[2]) == ("edited", False, "mine")
+    assert (found.source[2], bool(found.used[2])) == ("edited", False)
+    assert found.reason[2] == Rejection(Reason.OTHER, "mine")
     np.testing.assert_array_equal(found.h, outlines.h)
     for name in OPTIONAL:
         assert np.isnan(getattr(found, name)[2])
@@ -265,8 +269,31 @@ def test_legs_that_a_view_leaves_out_are_rejected() -> None:
     left_out = (MEASUREMENTS.view[outlines.row] == 1) & (outlines.leg != 1)
     np.testing.assert_array_equal(found.used, ~left_out)
     assert {found.reason[i] for i in np.flatnonzero(left_out)} == {
-        "view left does not use this leg"
+        Rejection(Reason.UNUSED_LEG, "left")
     }
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "detail"),
+    [
+        ("hidden by leg3", Reason.HIDDEN, "leg3"),
+        ("width inconsistent with the radius, 12.1 px for 14.0 px", Reason.WIDTH,
+         "12.1 px for 14.0 px"),
+        ("its other outline: edge hardly visible, found on 12 % of it", Reason.PARTNER, "faint"),
+        ("disagrees with the fit by 5.4 px, lies on edge 1 of leg2.rod", Reason.DISAGREES,
+         "5.4 px, lies on edge 1 of leg2.rod"),
+        ("disagrees with the other legs of its view", Reason.VIEW_DISAGREES, ""),
+        ("a cable", Reason.OTHER, "a cable"),
+    ],
+)  # fmt: skip
+def test_sentences_of_earlier_versions_are_read_as_reasons(
+    tmp_path: Path, text: str, code: Reason, detail: str
+) -> None:
+    path = edited(written(tmp_path, outlines_of(14)), 1, verdict="rejected", reason=text, detail="")
+    found = read(path).reason[0]
+    assert found == Rejection(code, detail)
+    assert str(found) == text.partition(", found")[0]
+    assert read_rejection(found.reason, found.detail) == found
 
 
 # --- refused

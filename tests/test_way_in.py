@@ -107,8 +107,7 @@ def test_the_template_is_a_table_and_replaces_nothing(
     assert "mine.csv already there" in capsys.readouterr().err
     assert (tmp_path / "mine.csv").read_text() == "mine"
     assert run(monkeypatch, *words, "--force") == 0
-    assert run(monkeypatch, *words, "--force", "--unit", "mm") == 2
-    assert run(monkeypatch, *words, "--force", "--tilt", "0") == 2
+    assert run(monkeypatch, *words, "--force", tmp_path / "mine.csv") == 2
 
 
 def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
@@ -121,13 +120,18 @@ def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
         said = capsys.readouterr().err
         assert said.count("legcal: ") == said.count("\n") == 1
         assert "look like coordinates of the base" in said
-        assert "--platform-in base" in said
-    assert new(monkeypatch, tmp_path, text, *words, "--platform-in", "base") == 0
+        assert "platform_in: base" in said
+
+    def stating(side: str) -> str:
+        head, *rows = text.splitlines()
+        return "\n".join([f"{head},platform_in", *(f"{row},{side}" for row in rows)])
+
+    assert new(monkeypatch, tmp_path, stating("base"), *words) == 0
     machine = made(tmp_path)
     np.testing.assert_allclose(machine.home.translation, [0, 0, 0.3955], atol=1e-12)
     np.testing.assert_allclose(machine.B_platform[0], [0.1061, 0.1061, 0], atol=1e-12)
     assert "coordinates of the base at home" in " ".join(capsys.readouterr().out.split())
-    assert new(monkeypatch, tmp_path, text, *words, "--platform-in", "platform", "--force") == 0
+    assert new(monkeypatch, tmp_path, stating("platform"), *words, "--force") == 0
     np.testing.assert_allclose(made(tmp_path).B_platform[0], [0.1061, 0.1061, 0.3955], atol=1e-12)
 
 
@@ -151,7 +155,10 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
      ("'leg1', 'leg2', 'leg3', 'leg4', 'leg5', 'leg6'", "min_length")),
     (wide("bx,by,bz,px,py,pz"), OPTIONS, ("--unit mm",)),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[2:]), ("type", "--type UPS")),
-    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--travel", "0", "9"), ("travel",)),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--travel", "0", "9"),
+     ("--travel", "travel_low", "--min-length")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--base-radius", "9"),
+     ("--base-radius", "--family only")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),
      ("'leg1', 'leg2'", "close at home", "380 to 500 mm")),
     (wide("bx,by,bz,px,py,pz [cm]"), OPTIONS, ("cm", "m or mm")),
@@ -249,8 +256,7 @@ def test_hostile_names_do_nothing_in_a_terminal(
         ("evaluate", model, model),
         ("inspect", folder / "none"),
         ("new", "--template", "-o", folder, "--name", "mine"),
-        ("new", "--family", "3-RPR", "--unit", "mm", "--base-radius", "300", "--platform-radius",
-         "150", "-o", folder),
+        ("new", "--family", "delta", "-o", folder),
     ):  # fmt: skip
         code = run(monkeypatch, *words)
         said = capsys.readouterr()

@@ -21,18 +21,17 @@ from simulated import simulated
 from legcal import calibrate, detect, load_dataset
 from legcal.calibration.detection import Detection
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.pipeline import rough_placement
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import BoolArray
 from legcal.machine.loader import load_mechanism
 from legcal.perception import photographs
 from legcal.perception.diagnostics import (
-    NOTHING_LIKE,
     ImageExplanation,
     OutlineCount,
     _best,
@@ -149,12 +148,17 @@ def test_an_image_that_is_no_good_is_named_and_left_out(
 
 def test_left_out_images_keep_what_they_should_not_show() -> None:
     table = outlines_of(1, rows=(0, 1), rejected=0.0)
-    reasons = ("outside the image", "hidden by leg2", "low contrast, 2.1 grey levels", "")
+    reasons = (
+        Rejection(Reason.OUTSIDE),
+        Rejection(Reason.HIDDEN, "leg2"),
+        Rejection(Reason.CONTRAST, "2.1"),
+        USED,
+    )
     reason = (*reasons, *table.reason[4:])
     table = replace(table, reason=reason, used=np.array([not why for why in reason]))
-    out = reject_images(table, {0: "the image is black"})
+    out = reject_images(table, {0: Rejection(Reason.BLACK)})
     assert not out.used[out.row == 0].any()
-    assert out.reason[:4] == (*reasons[:2], *2 * ["the image is black"])
+    assert out.reason[:4] == (*reasons[:2], *2 * [Rejection(Reason.BLACK)])
     assert np.array_equal(out.used[out.row == 1], table.used[table.row == 1])
 
 
@@ -261,12 +265,12 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     reason, note, _ = image_verdict(
         session.measurements, alone, ImageExplanation(0.0), usual, found
     )
-    assert reason == NOTHING_LIKE
+    assert reason.reason is Reason.OTHER_SCENE
     assert "found 1 of 12 outlines where its reading has the legs" in note
     reason, note, _ = image_verdict(
         session.measurements, alone, ImageExplanation(usual[1]), usual, found
     )
-    assert reason == ""
+    assert not reason
     assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 
 
@@ -398,9 +402,10 @@ def test_radii_of_parts_are_doubted_whose_outlines_are_not_found_where_they_can_
     own = outlines.leg == 2
     (name,) = {outlines.part[k] for k in np.flatnonzero(own)}
     doubted = [(2, legs[2].radius_of_part[name])]
-    for why, parts in (("edge hardly visible", doubted), ("too short, 17 px in the image", [])):
-        reason = np.where(own, why, outlines.reason).tolist()
-        lost = replace(outlines, used=outlines.used & ~own, reason=tuple(reason))
+    for why, parts in ((Reason.FAINT, doubted), (Reason.SHORT, [])):
+        rejected = [Rejection(why)] * len(outlines)
+        lost = replace(outlines, used=np.ones_like(own)).reject(own, rejected)
+        lost = replace(lost, used=outlines.used & ~own)
         assert _parts_not_found(legs, lost) == parts
 
 
@@ -436,9 +441,9 @@ def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few(
     alone, one = {row: row for row in exposures}, dict.fromkeys(exposures, 0)
     soft = {row: int(row >= 4) for row in exposures}  # another camera, of which there are two
     found = image_defects(exposures, alone, soft)
-    assert found == {3: "the image is blurred by 4.0 px, the others of its camera by 0.9"}
+    assert found == {3: Rejection(Reason.BLURRED, "4.0 px, the others of its camera by 0.9")}
     found = image_defects(exposures, one, soft)
-    assert [(row, "of its view" in why) for row, why in found.items()] == [
+    assert [(row, "of its view" in why.detail) for row, why in found.items()] == [
         (row, True) for row in (3, 4, 5)
     ]
     soft = {row: int(row >= 3) for row in exposures}
@@ -467,7 +472,9 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
 def _with_rejected(outlines: Outlines, rejected: BoolArray) -> Outlines:
     out = rejected & outlines.used
     reasons = zip(out.tolist(), outlines.reason, strict=True)
-    reason = tuple(f"{DISAGREES} by 5.0 px" if is_out else why for is_out, why in reasons)
+    reason = tuple(
+        Rejection(Reason.DISAGREES, "5.0 px") if is_out else why for is_out, why in reasons
+    )
     return replace(outlines, used=outlines.used & ~out, reason=reason)
 
 
@@ -574,7 +581,7 @@ def test_an_image_in_which_nothing_like_the_legs_was_found_counts_if_a_fit_finds
     def missed(*searched: Any) -> Any:
         placement, reasons = find_wrong_images(*searched)
         said = {0: "was left out: found nothing; look at it.", **placement.barely}
-        return replace(placement, barely=said), {0: NOTHING_LIKE, **reasons}
+        return replace(placement, barely=said), {0: Rejection(Reason.OTHER_SCENE), **reasons}
 
     monkeypatch.setattr(photographs, "find_wrong_images", missed)
     found = calibrate(made.write(), use_cache=False)

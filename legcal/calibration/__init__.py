@@ -1,4 +1,4 @@
-"""The jobs, each a client of the rooms below: calibrate, check, detect, identify, locate, noise.
+"""The jobs, each a client of the rooms below: calibrate, check, detect, identify, locate.
 
 A :class:`legcal.data.dataset.Dataset` goes in. ``calibrate`` (``pipeline``) checks that it can be
 identified (``identify``), puts it into canonical order (``ordered_dataset``), recognises and
@@ -8,6 +8,6 @@ result (``result_folder``): out comes a :class:`Calibration`, and its document :
 which ``check`` (``verification``, ``change_detection``) reads back. ``detect``
 (``outline_detection``), ``doctor`` (``examination``) and ``check`` enter through the same phases.
 Beside them stand
-``measure_noise`` (section 4.2, Table 1), ``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``.
+``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``.
 What ``--json`` prints is a model for each job.
 """

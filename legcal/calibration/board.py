@@ -23,16 +23,17 @@ from legcal.data.axes import LegAxes
 from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
 from legcal.data.measurements import Measurements
+from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
 from legcal.perception.board_corners import detect_corners, require_board
 from legcal.perception.board_poses import board_poses_in_images, camera_poses_by_board
-from legcal.perception.diagnostics import FAR_OFF
 from legcal.vision.board import FixedBoard
 
 Poses = Sequence[RigidTransform | None]  # one a view
-_MAX_DISTANCE, _MAX_ANGLE = FAR_OFF
+# Between two places of a board by rough poses: part of the mean leg length, angle
+_MAX_DISTANCE, _MAX_ANGLE = 0.15, np.deg2rad(6.0)
 _FEWEST = 4  # images of a board on the platform that place a camera
 
 
@@ -46,6 +47,7 @@ class BoardViews:
     T_board_camera: tuple[RigidTransform | None, ...]
     T_camera_board: Mapping[int, RigidTransform]  # of the board on the platform, by image row
     view_of_row: tuple[str, ...]
+    size: float  # mean leg length of the machine [m]
 
     def at(self, rows: IntArray) -> BoardCorners:
         """Return the boards in some of the images."""
@@ -68,7 +70,7 @@ class BoardViews:
             ],
             dtype=np.bool_,
         )  # fmt: skip
-        return corners.reject(wrong & corners.used, "disagrees with the fit")
+        return corners.reject(wrong & corners.used, Reason.DISAGREES)
 
     def poses_by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
         """Return T_x_board of the base's by each camera that shows it, x any frame."""
@@ -83,7 +85,7 @@ class BoardViews:
 
         Outliers are left out: one wrong camera pose must not turn all others.
         """
-        return _agreed(list(self.poses_by_view(T_x_camera).values()))
+        return _agreed(list(self.poses_by_view(T_x_camera).values()), self.size)
 
     def pose_on_platform(
         self, data: OrderedDataset, T_x_camera: Poses, T_x_platform: Sequence[RigidTransform]
@@ -99,7 +101,8 @@ class BoardViews:
                 T_x_platform[pose].inv() * camera * self.T_camera_board[row]
                 for row, view, pose in place
                 if row in self.T_camera_board and (camera := T_x_camera[view]) is not None
-            ]
+            ],
+            self.size,
         )
 
     def cameras(
@@ -142,7 +145,8 @@ class BoardViews:
                 [
                     T_base_platform[pose[row]] * T_platform_board * self._in_frame(row, view).inv()
                     for row in rows
-                ]
+                ],
+                self.size,
             )
             for v, rows in frames.items()
         }
@@ -172,11 +176,11 @@ def _hand_eye(
     return transforms(search(pairs, _FEWEST).frames[0])[1]
 
 
-def _agreed(found: Sequence[RigidTransform]) -> RigidTransform | None:
+def _agreed(found: Sequence[RigidTransform], size: float) -> RigidTransform | None:
     """Return the middle of those poses that most agree on; None of none."""
     if not found:
         return None
-    agreeing = [[other for other in found if _agree(one, other, reach=2.0)] for one in found]
+    agreeing = [[other for other in found if _agree(one, other, size, reach=2.0)] for one in found]
     together = RigidTransform.concatenate(max(agreeing, key=len))
     middle = np.median(together.translation, axis=0)
     return RigidTransform.from_components(middle, together.rotation.mean())
@@ -232,7 +236,8 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
         tables.append(replace(own, corner=own.corner + fixed.first))
     corners = join_corners(tables).sort()
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())
-    return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names)
+    size = dataset.machine.size
+    return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names, size)
 
 
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
@@ -248,14 +253,15 @@ def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTra
     if given is None or by_cameras is None:
         return by_cameras if given is None else given
     # Wrong poses beside a right one are named when the images have placed their cameras.
-    if not any(_agree(given, place) for place in board.poses_by_view(hints).values()):
+    places = board.poses_by_view(hints).values()
+    if not any(_agree(given, place, board.size) for place in places):
         far, turned = pose_distance(given, by_cameras)
         raise DatasetError(
             f"{dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
             f"could not be used together: found the board {1e3 * far:.0f} mm and "
             f"{np.degrees(turned):.1f} deg from where these cameras see it, needed "
-            f"{1e3 * _MAX_DISTANCE:.0f} mm and {np.degrees(_MAX_ANGLE):.0f} deg; correct the pose "
-            "of the board, those of the cameras, or the dimensions of the board."
+            f"{1e3 * _MAX_DISTANCE * board.size:.0f} mm and {np.degrees(_MAX_ANGLE):.0f} deg; "
+            "correct the pose of the board, those of the cameras, or the dimensions of the board."
         )
     return given
 
@@ -290,7 +296,7 @@ def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
         if given is None or found is None:
             continue
         place = dataset.machine.T_link_frame(fixed.link) * found
-        if not _agree(given, place):
+        if not _agree(given, place, dataset.machine.size):
             far, turned = pose_distance(given, place)
             key, which = f"T_{fixed.link}_board", "" if fixed.link == "base" else " on the platform"
             notes.append(
@@ -332,7 +338,7 @@ def in_one_camera(
     )
 
 
-def _agree(one: RigidTransform, other: RigidTransform, reach: float = 1.0) -> bool:
+def _agree(one: RigidTransform, other: RigidTransform, size: float, reach: float = 1.0) -> bool:
     """Say whether two places of the board are as near as hints are good."""
     far, turned = pose_distance(one, other)
-    return far <= reach * _MAX_DISTANCE and turned <= reach * _MAX_ANGLE
+    return far <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE

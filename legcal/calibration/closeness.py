@@ -42,9 +42,9 @@ def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) ->
     found = platform.workspace
     ratio = found.mean_displacement / dX
     sentence = (
-        f"Planned was {1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg over the workspace with "
-        f"{planned} images; {n_images} images came to {1e3 * found.mean_displacement:.3f} mm / "
-        f"{np.degrees(found.mean_rotation):.4f} deg, {ratio:.2f} times the plan."
+        f"Predicted error over the workspace: {1e3 * found.mean_displacement:.3f} mm / "
+        f"{np.degrees(found.mean_rotation):.4f} deg with {n_images} images, {ratio:.2f} times the "
+        f"plan ({1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg with {planned} images)."
     )
     if ratio > AS_PLANNED:
         sentence += (

@@ -28,6 +28,7 @@ from legcal.data.corners import Corners, write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
 from legcal.data.measurements import row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited, write_observations
+from legcal.data.reasons import Reason, Rejection, reason_in_words
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes, read_json
@@ -47,9 +48,7 @@ from legcal.pages.document import (
     number,
 )
 from legcal.pages.html import page_html
-from legcal.perception.detection import NOT_PLACED
-from legcal.perception.diagnostics import images_left_out
-from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.diagnostics import images_left_out, is_out_of_sight
 from legcal.perception.overlays import (
     Mark,
     PartMarks,
@@ -57,7 +56,6 @@ from legcal.perception.overlays import (
     marks_of_corners,
     marks_of_image,
     marks_of_pairs,
-    short_reason,
 )
 from legcal.perception.placement import PlacedArm, predict_legs_and_arms
 from legcal.progress import Report
@@ -151,10 +149,12 @@ class Detection:
         return [leg for leg in every if view.uses(legs[leg.leg].name)]
 
     @cached_property
-    def left_out(self) -> dict[int, str]:
+    def left_out(self) -> dict[int, Rejection]:
         """Why no outline of images is used that should show some, by row."""
         of_views = [row for row in self.rows.tolist() if self.view_of(row) in self.unplaced]
-        return images_left_out(self.outlines) | dict.fromkeys(of_views, NOT_PLACED)
+        return images_left_out(self.outlines) | dict.fromkeys(
+            of_views, Rejection(Reason.NOT_PLACED)
+        )
 
     @cached_property
     def overlay_files(self) -> dict[int, str]:
@@ -214,13 +214,6 @@ def _unique_names(names: Iterable[str]) -> list[str]:
     return found
 
 
-def _counted_reason(reason: str) -> str:
-    """Return a reason without its figures and names, as it is counted."""
-    if reason.startswith(HIDDEN):
-        return "hidden by another leg"
-    return short_reason(reason) or "no reason given"
-
-
 class ViewFigures(Document):
     """What was found in the images of a view."""
 
@@ -233,7 +226,7 @@ class ViewFigures(Document):
     contrast: float | None  # median of the used outlines, as the next ones [grey levels]
     length: float | None  # [px]
     residual: float | None  # [px]
-    rejected: dict[str, int]  # by reason, the most first
+    rejected: dict[str, int]  # by the code of the reason, the most first
     problem: str | None  # why its camera could not be placed
 
 
@@ -263,15 +256,14 @@ def _view_figures(detection: Detection) -> dict[str, ViewFigures]:
         name = measurements.views[v].name
         here = measurements.view[detection.outlines.row] == v
         outlines = detection.outlines.choose(here)
-        used, reasons = outlines.used, outlines.reason
+        used = outlines.used
         rods = along_legs(outlines, detection.dataset.machine.legs)
-        hidden = [why == OUTSIDE or why.startswith(HIDDEN) for why in rods.reason]
         rejected = Counter(
-            _counted_reason(why) for why, ok in zip(reasons, used, strict=True) if not ok
+            str(why.reason) for why, ok in zip(outlines.reason, used, strict=True) if not ok
         )
         found[name] = ViewFigures(
             images=int(np.count_nonzero(measurements.view[detection.rows] == v)),
-            legs_visible=_count_legs(rods, ~np.array(hidden, dtype=np.bool_) | rods.used),
+            legs_visible=_count_legs(rods, ~is_out_of_sight(rods) | rods.used),
             legs_found=_count_legs(rods, rods.used),
             outlines=len(outlines),
             used=int(np.count_nonzero(used)),
@@ -337,7 +329,7 @@ def _worst(detection: Detection) -> set[int]:
 
 def _cells(name: str, view: Mapping[str, Any], to: str) -> list[Cell]:
     """Return the figures of a view as cells of the table."""
-    rejected = ", ".join(f"{n} {why}" for why, n in view["rejected"].items())
+    rejected = ", ".join(f"{n} {reason_in_words(why)}" for why, n in view["rejected"].items())
     return [
         Link(name, f"#{to}"),
         *(
@@ -358,9 +350,10 @@ def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str,
     used = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
     rejected: dict[str, list[str]] = {}
     for i in here:
-        if not outlines.used[i] and outlines.reason[i] != OUTSIDE:
+        why = outlines.reason[i]
+        if not outlines.used[i] and why.reason is not Reason.OUTSIDE:
             name = legs[outlines.leg[i]]
-            of_reason = rejected.setdefault(_counted_reason(outlines.reason[i]), [])
+            of_reason = rejected.setdefault(why.summary, [])
             if name not in of_reason:
                 of_reason.append(name)
     reasons = "; ".join(f"{', '.join(legs)}: {why}" for why, legs in rejected.items())

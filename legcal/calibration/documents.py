@@ -22,6 +22,7 @@ from pydantic import (
 
 from legcal.data.image_causes import by_cause
 from legcal.data.measurements import Measurements, row_names
+from legcal.data.reasons import Rejection
 from legcal.errors import DatasetError
 from legcal.files.motions import Pose
 from legcal.files.schema import (
@@ -37,6 +38,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.inspection import ActuatorBlock
+from legcal.machine.parameter_id import ParameterId
 from legcal.vision.board import Link
 
 AxesByLeg = dict[str, Triple]  # unit vectors
@@ -71,7 +73,8 @@ class ParameterRow(SparseDocument):
     @property
     def is_shown(self) -> bool:
         """Whether tables have it: they leave out gains of motors that are fixed at 1."""
-        return not (self.name.endswith(".gain") and self.status == "fixed" and self.value == 1.0)
+        is_gain = ParameterId.parse(self.name).kind == "gain"
+        return not (is_gain and self.status == "fixed" and self.value == 1.0)
 
 
 class Kinematic(Document):
@@ -271,13 +274,13 @@ class LeftOut(Document):
     images: list[NamedImage]
 
 
-def left_out_blocks(measurements: Measurements, why: Mapping[int, str]) -> list[LeftOut]:
+def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) -> list[LeftOut]:
     """Return images that were left out, by row, a block a cause."""
     names = row_names(measurements)
     views = [measurements.views[v].name for v in measurements.view.tolist()]
     return [
         LeftOut(why=what, images=[NamedImage(view=views[r], image=names[r]) for r in rows])
-        for what, rows in by_cause(dict(sorted(why.items())))
+        for what, rows in by_cause({row: str(cause) for row, cause in sorted(why.items())})
     ]
 
 
@@ -288,7 +291,7 @@ class Observations(Document):
     used: int
     total: int
     images: int
-    rejected: dict[str, int]  # outlines, by the reason
+    rejected: dict[str, int]  # outlines, by the code of the reason
     left_out: list[LeftOut] = Field(
         default_factory=list
     )  # images that should show legs, none of whose outlines is used

@@ -134,7 +134,6 @@ def evaluate(
     platform errors are empty then.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    machine.require_rigid_platform()
     truth = reference if isinstance(reference, Machine) else load_mechanism(reference)
     truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []

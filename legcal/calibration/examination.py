@@ -34,7 +34,8 @@ from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_datase
 from legcal.data.holdout import dataset_at
 from legcal.data.image_causes import by_cause, images_in_words
 from legcal.data.measurements import few, few_views, reading_columns, row_names
-from legcal.data.photograph_notes import GOOD_QUALITY, compressed, notes_on_photographs
+from legcal.data.photograph_notes import compression_notes, notes_on_photographs
+from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.files.schema import Document
 from legcal.geometry.types import Array
@@ -443,7 +444,9 @@ def _look_at_photographs(
     found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
     if blurs:
         found.checks["photographs"] += f", blurred by {_median(blurs):.1f} px"
-    for what in left_out_notes(m, defects, dict.fromkeys(defects, TAKE_AGAIN)):
+    for what in left_out_notes(
+        m, {r: str(why) for r, why in defects.items()}, dict.fromkeys(defects, TAKE_AGAIN)
+    ):
         found.add("photographs", "warning", what)
     for same in (own for own in pixels.values() if len(own) > 1):
         several = len({int(m.pose[row]) for row in same}) > 1
@@ -460,14 +463,8 @@ def _look_at_photographs(
             same,
         )
     _look_at_views(found, {row: one for row, one in exposures.items() if row not in defects})
-    lossy = compressed(m, dataset.facts)
-    if lossy:
-        found.add(
-            "photographs",
-            "note",
-            f"Lossy compression moves outlines: found {lossy}; store photographs without loss "
-            f"(PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more.",
-        )
+    for what in compression_notes(m, dataset.facts):
+        found.add("photographs", "note", what)
     return exposures
 
 
@@ -559,7 +556,7 @@ def _look_at_legs(found: _Found, data: OrderedDataset, choices: Choices) -> Dete
             found.add("legs", "note", what)
     for name, one in figures.items():
         if name not in seen.unplaced and one["legs_found"] < FEW_LEGS * one["legs_visible"]:
-            why = next(iter(one["rejected"]), "no reason given")
+            why = reason_in_words(next(iter(one["rejected"]), Reason.OTHER))
             found.add(
                 "legs",
                 "warning",

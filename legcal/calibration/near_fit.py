@@ -1,7 +1,8 @@
 """Photographs measured again close to a fit, and fitted again.
 
-What is measured there does not depend on where the search began. Where the outlines show the gamma
-of a camera that is not given, all is done again with that.
+What is measured there depends little on where the search for the fit began: fits that agree give
+the same outlines, others give edges that light leaves open at one or another place. Where the
+outlines show the gamma of a camera that is not given, all is done again with that.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.calibration.board import BoardViews
-from legcal.calibration.compression import compression_effect
 from legcal.calibration.estimate import Estimate, fit_outlines
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.gammas import GammaTrials, loses_outlines
@@ -21,12 +21,13 @@ from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few
 from legcal.data.outlines import Outlines, no_outlines, through_cameras
-from legcal.data.photograph_notes import compression_note
+from legcal.data.photograph_notes import compression_notes
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.motions import components
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
-from legcal.perception.diagnostics import NOTHING_LIKE, is_visible, reject_images
+from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -70,12 +71,14 @@ def measure_again(
         trials = trials.tried(gammas, there.solution)
         if trials.best == len(trials.solutions) - 1:
             best = there
-    last, refused, gammas = first, trials.found(), {}
+    last, refused = first, trials.found()
     if refused:
         found = search.fitted(best, refused)
         if not loses_outlines(first.outlines, found.outlines):
-            last, refused, gammas = found, {}, refused
-    notes = _compression_note(data, last, *search.at(last, gammas))
+            last, refused = found, {}
+    measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
+    facts = {image: found for image, found in data.dataset.facts.items() if image in measured}
+    notes = compression_notes(data.measurements, facts)
     return replace(last, image_notes=(*trials.notes(refused), *notes))
 
 
@@ -118,7 +121,7 @@ class _SearchNearFit:
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
         still = hardly_shown(outlines, self.seen.unlike)
-        outlines = reject_images(outlines, dict.fromkeys(still, NOTHING_LIKE))
+        outlines = reject_images(outlines, dict.fromkeys(still, Rejection(Reason.OTHER_SCENE)))
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)
@@ -183,18 +186,3 @@ def not_found_again(first: Estimate, again: Estimate) -> list[str]:
     cameras = first.solution.camera_doubts.notes if few_found else ()
     notes = image_notes(first.fitted.measurements, {row: before[row] for row in gone})
     return [*cameras, *notes]
-
-
-def _compression_note(
-    data: OrderedDataset, estimate: Estimate, photographs: Photographs, placement: Placement
-) -> list[str]:
-    """Return a note where outlines were measured in photographs compressed with much loss."""
-    solution, measured = estimate.solution, photographs.detect.tolist()
-    names = {data.measurements.image[row] for row in measured}
-    facts = {image: found for image, found in data.dataset.facts.items() if image in names}
-    effect = compression_effect(
-        photographs, placement, estimate.outlines, facts, solution.quality.noise, data.progress
-    )
-    words = "" if effect is None else str(effect)
-    rms, scale = solution.quality.rms_px or 0.0, solution.quality.noise.scale
-    return compression_note(data.measurements, facts, rms, scale, words)

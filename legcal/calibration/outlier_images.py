@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements, few
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import Factor, Frames, Problem, Residuals, Variables, all_free
@@ -37,12 +37,13 @@ POSE_IN_DOUBT = (
 )
 CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
 MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
-MIN_NOISE = 5e-5  # of an outline at its leg [m]
+# Lengths are parts of the mean leg length.
+MIN_NOISE = 1.25e-4  # of an outline at its leg
 LOSS = PseudoHuber(4.0)  # of outlines, in least noises
 MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of the pose: [rad], and any displacement
-# Of readings, as far as they move a joint [m]: noise beside the legs of a fit, what is named at
+# Of readings, as far as they move a joint: noise beside the legs of a fit, what is named at
 # least, and the tolerance for the reading of another image
-READING_NOISE, MIN_READING_ERROR, SAME_READING = 6e-5, 3e-4, 1e-3
+READING_NOISE, MIN_READING_ERROR, SAME_READING = 1.5e-4, 7.5e-4, 2.5e-3
 SIGNIFICANT_SIGMAS = 5.0
 BEYOND_TRAVEL = 0.05  # of the travel: what joint limits of a model leave out
 
@@ -67,7 +68,7 @@ def outlier_images(
 ) -> dict[int, str]:
     """Return what is said of every outlier image that was fitted, by row, without its name."""
     o = solution.outlines
-    rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
+    rejected = o.rejected_for(Reason.DISAGREES)
     notes = {}
     for row in np.unique(o.row[rejected]).tolist():
         judged = np.flatnonzero((o.row == row) & (rejected | o.used))
@@ -168,6 +169,7 @@ class _Image:
             return None
         noise = np.maximum(self._by(READING_NOISE), self.measurements.sigma_of(self.machine.legs))
         white = 1.0 / noise[held]
+        least_noise = MIN_NOISE * self.machine.size
 
         def differences(state: _State) -> Residuals:
             q, J = self.readings_at(state.pose)
@@ -183,7 +185,7 @@ class _Image:
                 (of_outlines,),
                 n,
                 1,
-                whitening=1.0 / MIN_NOISE,
+                whitening=1.0 / least_noise,
                 robust=True,
             )
         ]
@@ -196,7 +198,8 @@ class _Image:
         except DidNotConverge:
             return None
         normal = normal_equations(problem, found.state, found.linear, LOSS).U
-        if np.linalg.cond(normal) > 1e12:
+        unit = np.repeat([1.0, 1.0 / self.machine.size], 3)  # lengths in leg lengths
+        if np.linalg.cond(normal / np.outer(unit, unit)) > 1e12:
             return None
         scale = max(1.0, 1.48 * float(np.median(np.abs(found.linear["outlines"].r))))
         q, J = self.readings_at(found.state.pose)
@@ -205,7 +208,7 @@ class _Image:
             if leg.actuator is not None:  # far from the given reading its slope is another one
                 q[j] = reading_of_rod(leg, ends[j])[0]
         variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
-        return _Shown(q, np.sqrt(variance), scale * MIN_NOISE, found.cost / scale**2)
+        return _Shown(q, np.sqrt(variance), scale * least_noise, found.cost / scale**2)
 
     def wrong_reading(self, chosen: IntArray) -> str:
         """Return which reading is wrong if outlines suit all others, and no others but these."""
@@ -290,8 +293,9 @@ class _Image:
         )
 
     def _by(self, distance: float) -> Array:
-        """Return the readings (n_legs,) [m or rad] that move a joint so far [m]."""
-        return np.array([leg.reading_of(distance) for leg in self.machine.legs])
+        """Return the readings (n_legs,) [m or rad] that move a joint so far, of the leg length."""
+        size = self.machine.size
+        return np.array([leg.reading_of(distance * size) for leg in self.machine.legs])
 
     @property
     def _least(self) -> Array:

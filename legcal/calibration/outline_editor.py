@@ -13,6 +13,7 @@ import numpy as np
 from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
 from legcal.data.measurements import row_names
 from legcal.data.outlines import Outlines, format_observations
+from legcal.data.reasons import WORDS_BY_CODE
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.pages.document import OutlineEditor
@@ -63,7 +64,7 @@ def outline_editor(
         for view in measurements.views
     ]
     table = format_observations(outlines, measurements, machine.leg_names)
-    found = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND)
+    found = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, WORDS_BY_CODE)
     size = len(found.packed) + _OF_IMAGE * len(images)
     return found if size <= MAX_BYTES else None
 

@@ -5,9 +5,10 @@
    Measure: the outlines of the legs are measured near where that has them (section 3.1).
 3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. Joint fit of all parameters, started from the nominal model and from the steps.
-5. Measure again: all photographs are searched close to that fit and measured with all care, so
-   that nothing depends on where the search began, and 3 and 4 are repeated. Where outlines show
-   the gamma of a camera that is not given, this is done again with others, up to four times.
+5. Measure again: all photographs are searched close to that fit and measured with all care, and 3
+   and 4 are repeated. What outlines are given, the fit of them does not depend on where it began.
+   Where outlines show the gamma of a camera that is not given, this is done again with others, up
+   to four times.
 6. Judge what the platform gains, and write the result.
 
 Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
@@ -49,6 +50,7 @@ from legcal.data.overrides import Override, overrides_of_call
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
+from legcal.machine.parameter_id import ParameterId
 from legcal.paper.criteria import Criteria, Transformation
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
@@ -175,7 +177,6 @@ def calibrate(
         *found.solution.notes,
         *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
-        *pool.notes,
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -299,7 +300,7 @@ def _estimate(
 
 
 def _unused_share(estimate: Estimate) -> float:
-    """Return which part of the outlines that should be measured was not used."""
+    """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 
@@ -403,7 +404,7 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     twists = {
         name: Prior(parameter.nominal, TWIST_SIGMA)
         for name, parameter in known.by_name.items()
-        if name.endswith(".twist")
+        if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)
         and name not in choices.fixed
     }
@@ -455,7 +456,8 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
         return []
     views = dataset.measurements.views
     names, cameras = [view.name for view in views], [view.camera for view in views]
-    chosen = {name.rsplit(".", 1)[0] for name in (*choices.free, *choices.priors, *choices.fixed)}
+    stated = (*choices.free, *choices.priors, *choices.fixed)
+    chosen = {ParameterId.parse(name).owner for name in stated}
     known = {*chosen, *stated_covariances(names, cameras)}
     owner_of = dict(zip(names, shared_cameras(names, cameras), strict=True))
     exact = {name: owner for name, owner in owner_of.items() if owner not in known}

@@ -273,8 +273,8 @@ def _observations(calibration: Calibration) -> Observations:
         return Observations(kind="axes", used=n, total=n, images=n_images, rejected={})
     outlines = calibration.solution.outlines
     reasons = Counter(
-        reason.split(",")[0].split(" by ")[0]
-        for reason, used in zip(outlines.reason, outlines.used, strict=True)
+        str(why.reason)
+        for why, used in zip(outlines.reason, outlines.used, strict=True)
         if not used
     )
     return Observations(

@@ -40,11 +40,10 @@ from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.parameter_id import ARMS, AXES, ParameterId
 from legcal.machine.parameters import (
-    ARM_KINDS,
     calibrated_axis,
     geometries,
-    kind_of_parameter,
     nominal_axes,
     parametrization_of,
     turns_between,
@@ -341,13 +340,15 @@ def _check_same_model(
     """Refuse a document whose parameters are not those of the model beside it."""
     legs, known = geometries(machine), parametrization_of(machine, twists=True)
     numbers = dict(zip(known.names, vector_of(known, legs, nominal_legs).tolist(), strict=True))
+    turned = (*AXES, "arm_axis")  # by angles from nominal axes
     other = [
         name
         for name, number in numbers.items()
-        if "_axis." not in name and not abs(values.get(name, number) - number) <= ROUNDING
+        if ParameterId.parse(name).kind not in turned
+        and not abs(values.get(name, number) - number) <= ROUNDING
     ]
-    later = ("twist", *ARM_KINDS)  # what results of earlier versions do not have
-    other += [n for n in numbers if n not in values and kind_of_parameter(n) not in later]
+    later = ("twist", *ARMS)  # what results of earlier versions do not have
+    other += [n for n in numbers if n not in values and ParameterId.parse(n).kind not in later]
     for side, axes in nominal_axes(machine.leg_names, legs).items():
         for leg, axis in axes.items():
             nominal = document.nominal_axes.get(side, {}).get(leg)

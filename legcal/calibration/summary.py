@@ -22,8 +22,10 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
+from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.machine.parameter_id import ParameterId
 from legcal.vision.board import LINKS, Link
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ class ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
         rows, digits = [], []
         for row in result.parameters:
-            if not row.is_shown or (not joints and row.name.endswith(_COORDINATES)):
+            if not row.is_shown or (not joints and ParameterId.parse(row.name).is_joint_coordinate):
                 continue
             scale, unit, n = UNITS[row.unit]
             value, nominal = scale * row.value, scale * row.nominal
@@ -183,7 +185,6 @@ class ParameterTable:
 
 _CALIBRATED = ("nominal", "calibrated", "change", "sigma")
 NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values())}
-_COORDINATES = tuple(f".{side}.{axis}" for side in LINKS for axis in "xyz")
 
 
 def _cell(column: str, x: Any, digits: int) -> str:
@@ -235,6 +236,16 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
         *_direction_lines(result),
         *([] if result.platform is None else _platform_lines(result.platform, verbose=verbose)),
         *([] if result.holdout is None else _holdout_lines(result.holdout)),
+    ]
+
+
+def brief_sentences(result: Result) -> list[str]:
+    """Return what the first screen says beside the verdict and the platform error."""
+    return [
+        *_direction_lines(result, 1),
+        *_observation_lines(result),
+        *([] if result.holdout is None else _holdout_lines(result.holdout)),
+        *(f"Note: {note}" for note in result.notes),
     ]
 
 
@@ -321,7 +332,7 @@ def _observation_lines(result: Result) -> list[str]:
             "their table gives."
         ]
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
-    rejected = ", ".join(f"{count} {reason}" for reason, count in most)
+    rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
     if seen.total == 0:  # boards are the whole measurement
         lines = ["Outlines: none, no leg was measured."]
@@ -409,11 +420,14 @@ def residuals_in_words(found: ReadingResiduals) -> str:
     )
 
 
-def _direction_lines(result: Result) -> list[str]:
+def _direction_lines(result: Result, n_worst: int | None = None) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
-    worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in result.weakest]
-    where = "in R_b and R_e" if any(one.links is None for one in result.weakest) else "in the links"
-    least = f"Least certain combinations (1 sigma, {where}): {'; '.join(worst)}."
+    weakest = result.weakest[:n_worst]
+    worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in weakest]
+    where = "in R_b and R_e" if any(one.links is None for one in weakest) else "in the links"
+    least = (
+        f"Least certain combination{'s' * (len(worst) > 1)} (1 sigma, {where}): {'; '.join(worst)}."
+    )
     lines = [least] if worst else []
     if result.held:
         lines.append(

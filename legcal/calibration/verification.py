@@ -37,11 +37,10 @@ from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import (
-    ARM_KINDS,
     Parametrization,
     geometries,
-    kind_of_parameter,
     parametrization_of,
     vector_of,
 )
@@ -274,7 +273,7 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     found = {owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)}
     # Lines of arms that the earlier images did not show were left at nominal, and not known.
-    fixed = [name for name in earlier.fixed if kind_of_parameter(name) not in ARM_KINDS]
+    fixed = [name for name in earlier.fixed if ParameterId.parse(name).kind not in ARMS]
     return Choices(
         fixed=frozenset(fixed),
         priors=priors,

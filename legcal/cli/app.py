@@ -5,7 +5,6 @@ Heavy imports happen inside the commands, so that ``legcal --help`` answers at o
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 import traceback
@@ -25,26 +24,24 @@ from legcal.cli.commands import (
     identify,
     inspect,
     locate,
-    noise,
 )
 from legcal.cli.example import example
 from legcal.cli.export import export
-from legcal.cli.gone import refuse_gone
 from legcal.cli.import_ import import_
 from legcal.cli.init import init
 from legcal.cli.new import new
-from legcal.cli.options import INTERRUPTED, print_failure
+from legcal.cli.options import print_failure
 from legcal.cli.plan import plan
+from legcal.cli.retired import refuse_retired
 from legcal.cli.schema import schema
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
 from legcal.cli.view import view
 from legcal.errors import LegcalError, UsageError, printable
-from legcal.signals import raise_if_stopped
+from legcal.signals import INTERRUPTED, raise_if_stopped
 from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
-_ALLOCATIONS = 50_000  # between searches for dead cycles: a tenth of the time of a calibration
 NO_COMMAND = "Nothing was done: found no command, needed one of those above."
 
 app = typer.Typer(
@@ -86,7 +83,6 @@ for command in (
     export,
     new,
     init,
-    noise,
     plan,
     simulate,
     example,
@@ -131,12 +127,11 @@ def run(*, as_json: bool) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Plugins for models of files are of no use here, and are looked for in all that is installed.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.set_threshold(_ALLOCATIONS)
     warnings.showwarning = _print_warning
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
-        refuse_gone(sys.argv[1:])
+        refuse_retired(sys.argv[1:])
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,40 +16,27 @@ from legcal.cli.options import (
     WorkersOption,
     command_line,
     image_workers,
-    loading,
     show,
     write_page,
 )
 from legcal.errors import UsageError
 from legcal.paper.criteria import Criteria, Transformation
-from legcal.processors import processors
 
 if TYPE_CHECKING:
-    from legcal.calibration.result import Calibration
     from legcal.data.dataset import Dataset
     from legcal.machine.model import Machine
 
 _TESTS = "Tests of a result"
-_FLEETS = "Fleets: several datasets, or --list"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
 
 def calibrate(
     datasets: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="DATASET...",
-            help="The folder that holds dataset.yaml; several are a fleet of machines.",
-        ),
-    ] = None,
+        list[Path], typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="The result folder to write; of a fleet, the folder of its result folders.",
-        ),
+        typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
     ] = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
@@ -74,11 +59,14 @@ def calibrate(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
-    prior: Annotated[
+    settings: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=VALUE+-SIGMA",
-            help="What is known already: leg1.length=0.4200+-0.0001, or 420+-0.1mm.",
+            "--set",
+            metavar="NAME[=VALUE[±SIGMA]]",
+            help="NAME holds a parameter at its nominal value, NAME=VALUE at that one, "
+            "NAME=VALUE±SIGMA (or +-) says how well it is known (leg1.length=420±0.1mm), NAME=free "
+            "estimates it without a prior (c1.f?, *.radius.*).",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -89,23 +77,6 @@ def calibrate(
             help="A distance of two joints that was measured by hand: "
             "leg1.base:leg3.base=400+-0.05mm, or both ends of a rod. Motors that turn carry no "
             "length: one fixes the scale.",
-            rich_help_panel=_PARAMETERS,
-        ),
-    ] = None,
-    fix: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[=VALUE]",
-            help="Fix at the nominal value, or at a given one.",
-            rich_help_panel=_PARAMETERS,
-        ),
-    ] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Estimate what is fixed otherwise (camera), and what has a prior (radii, twists, "
-            "calibrated cameras) without one.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -147,71 +118,26 @@ def calibrate(
             "The calibration does not see it.",
         ),
     ] = None,
-    machines: Annotated[
-        Path | None,
-        typer.Option(
-            "--list",
-            metavar="FILE.csv",
-            help="Machines, a row each: dataset, and name and earlier (a result folder) or not.",
-            rich_help_panel=_FLEETS,
-        ),
-    ] = None,
-    earlier: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT",
-            help="Folder of an earlier fleet: drift is counted from its results, by name.",
-            rich_help_panel=_FLEETS,
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Take results that stand in OUT, of the same datasets and options, and newer than "
-            "the files of their dataset.",
-            rich_help_panel=_FLEETS,
-        ),
-    ] = False,
     workers: WorkersOption = None,
-    significance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="P",
-            help="With --check: probability of a false alarm; 0.01 by default.",
-            rich_help_panel=_TESTS,
-        ),
-    ] = None,
 ) -> None:
-    """Compute the calibrated model from images and encoder readings, or check an earlier one.
-
-    Several datasets, or --list, are a fleet: a result folder for each machine, and a summary.
-    """
-    datasets = datasets or []
-    is_fleet = machines is not None or len(datasets) > 1
-    if not is_fleet and (resume or earlier is not None):
+    """Compute the calibrated model from images and encoder readings, or check an earlier one."""
+    if len(datasets) > 1:
         raise UsageError(
-            f"The command could not be run: found {'--resume' if resume else '--earlier'} with one "
-            "dataset, needed a fleet; name its machines with --list, or leave it out."
+            f"The command could not be run: found {len(datasets)} datasets, needed one dataset; "
+            "run legcal calibrate for each of them, or a loop in Python (docs/python.md, Many "
+            "machines)."
         )
-    if not is_fleet and not datasets:
-        raise UsageError(
-            "The command could not be run: found no DATASET, needed the folder that holds "
-            "dataset.yaml, or several, or a list of them (--list); name one."
-        )
+    dataset = datasets[0]
     if check is not None:
         others = {
-            "--prior": prior,
+            "--set": settings or None,
             "--length": length,
-            "--fix": fix,
-            "--free": free,
             "--holdout": holdout,
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
             "--transformation": transformation,
             "--overlays": overlays or None,
             "--truth": truth,
-            "several datasets": is_fleet or None,
         }
         named = [name for name, value in others.items() if value is not None]
         if named:
@@ -221,13 +147,8 @@ def calibrate(
             )
         page = None if output is None or not with_report else _page_of_check(output)
         on = image_workers(cluster, workers)
-        _check(datasets[0], check, significance, page, on, quiet=quiet, as_json=as_json)
+        _check(dataset, check, page, on, quiet=quiet, as_json=as_json)
         return
-    if significance is not None:
-        raise UsageError(
-            "The significance could not be used: found --significance without --check, needed the "
-            "result to test; name it or leave the significance out."
-        )
     if output is None:
         raise UsageError(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
@@ -238,65 +159,33 @@ def calibrate(
             "The truth could not be used: found --truth beside --no-report, needed the page, which "
             "alone compares the result with it; leave one of them out."
         )
-    with loading():
-        from legcal.calibration import pipeline
-        from legcal.calibration.fleet import FleetMachine, FleetOptions, calibrate_fleet, read_fleet
-        from legcal.calibration.result_folder import REPORT_NAME
-        from legcal.pages.html import PAGE
-        from legcal.report import calibration
-        from legcal.report.fleet import fleet_table
-        from legcal.report.page.writing import write_report
+    from legcal.calibration import pipeline
+    from legcal.calibration.result_folder import REPORT_NAME
+    from legcal.data.overrides import overrides_of_settings
+    from legcal.pages.html import PAGE
+    from legcal.report import calibration
+    from legcal.report.page.writing import write_report
 
-        run, summary = pipeline.calibrate, calibration.summary
     arguments: dict[str, Any] = {
         "criteria": criteria,
         "transformation": transformation,
         "use_cache": not fresh,
-        "priors": [*(prior or ()), *_lengths(length or ())],
-        "fixed": fix or (),
-        "free": free or (),
         "holdout": holdout,
         "overlays": overlays,
     }
-    if is_fleet:
-        if truth is not None:
-            raise UsageError(
-                "The command could not be run: found --truth beside several datasets, needed one, "
-                "whose machine it is; leave it out."
-            )
-        fleet = [] if machines is None else read_fleet(machines)
-        fleet += [FleetMachine.of(path) for path in datasets]
-        if earlier is not None:
-            if not earlier.is_dir():
-                raise UsageError(
-                    f"{earlier}: drift could not be counted: found no such folder, needed that of "
-                    "an earlier fleet; correct --earlier, or leave it out."
-                )
-            fleet = [replace(one, earlier=one.earlier or earlier / one.name) for one in fleet]
-        page_of_machine = partial(_page_of_machine, command_line()) if with_report else None
-        outcome = calibrate_fleet(
-            fleet,
-            output,
-            options=FleetOptions(arguments, page_of_machine),
-            workers=cluster or workers or processors(),
-            resume=resume,
-            progress=not quiet,
-        )
-        show(as_json, outcome.document, lambda: fleet_table(outcome, output))
-        if set(outcome.counts) != {"trustworthy"}:
-            raise typer.Exit(1)
-        return
+    arguments |= overrides_of_settings(settings or ())
+    arguments["priors"] += _lengths(length or ())
     page = output / REPORT_NAME
     if with_report and page.exists():
         PAGE.check_place(page)
-    given: Path | Dataset = datasets[0]
+    given: Path | Dataset = dataset
     true = None
     if truth is not None:
-        given, true = _with_truth(datasets[0], truth)
+        given, true = _with_truth(dataset, truth)
     page_of = PageOfResult(
         lambda found, folder: write_report(found, output, command_line(), truth=true, into=folder)
     )
-    found = run(
+    found = pipeline.calibrate(
         given,
         output=output,
         progress=not quiet,
@@ -308,19 +197,10 @@ def calibrate(
     show(
         as_json,
         lambda: found.result.document(),
-        lambda: summary(found, output, verbose=verbose),
+        lambda: calibration.summary(found, output, verbose=verbose),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)
-
-
-def _page_of_machine(command: str, found: Calibration, output: Path, folder: Path) -> None:
-    """Make the page of a machine of a fleet, in any process."""
-    from legcal.report.page.writing import write_report
-
-    page = PageOfResult(lambda result, into: write_report(result, output, command, into=into))
-    page(found, folder)
-    page.say()
 
 
 def _with_truth(folder: Path, truth: str) -> tuple[Dataset, Machine]:
@@ -378,7 +258,6 @@ def _lengths(stated: Sequence[str]) -> list[str]:
 def _check(
     dataset: Path,
     result: Path,
-    significance: float | None,
     page: Path | None,
     workers: int | str,
     *,
@@ -386,14 +265,13 @@ def _check(
     as_json: bool,
 ) -> None:
     """Test an earlier result with new images."""
-    from legcal.calibration.verification import SIGNIFICANCE, check
+    from legcal.calibration.verification import check
     from legcal.report.calibration import check_summary
     from legcal.report.page.verdicts import check_verdict
 
     found = check(
         dataset,
         result,
-        significance=SIGNIFICANCE if significance is None else significance,
         progress=not quiet,
         workers=workers,
     )

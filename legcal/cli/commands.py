@@ -184,7 +184,7 @@ def identify(
         bool,
         typer.Option(
             "--hand-held",
-            help="Every image of a view is taken from a place of its own; with --board and --view.",
+            help="Hand-held camera: a new pose for every image of a view; with --board and --view.",
         ),
     ] = False,
     page: PageOption = None,
@@ -353,23 +353,3 @@ def _point(text: str) -> list[float]:
             "platform; write them like 0,0,0.05 or 0mm,0mm,50mm."
         )
     return [value.value for value in values]
-
-
-def noise(
-    dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="A dataset with several images of each pose.")
-    ],
-    page: PageOption = None,
-    cluster: ClusterOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
-    from legcal.calibration.measurement_noise.comparison import measure_noise
-    from legcal.report.noise import noise_table
-
-    check_page(page)
-    found = measure_noise(dataset, progress=not quiet, workers=image_workers(cluster))
-    title = f"Measurement noise of {found.dataset.machine.name}"
-    write_page(page, title, noise_table(found))
-    show(as_json, found.document, lambda: noise_table(found))

@@ -16,7 +16,8 @@ def import_(
         typer.Argument(
             metavar="RECORDING...",
             help="A video, a ROS bag (.bag, .mcap, folder) or a folder of images with times for "
-            "each camera position; views are named after them.",
+            "each camera position; views are named after them. Of a bag with several cameras the "
+            "topic of one: BAG:/left/image_raw.",
         ),
     ],
     model: Annotated[
@@ -40,9 +41,6 @@ def import_(
             "for each in their order; bags may hold joint states instead.",
         ),
     ] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of the readings: m, cm, mm, um; else as for init.")
-    ] = None,
     lengths: Annotated[
         bool, typer.Option("--lengths", help="The table holds whole lengths of legs.")
     ] = False,
@@ -53,22 +51,6 @@ def import_(
             help="The clock of the camera less that of the readings; by default found from motion.",
         ),
     ] = None,
-    still: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS", help="How long the machine rests at least where a frame is used."
-        ),
-    ] = 0.3,
-    image_topic: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="The images of a bag that holds several.")
-    ] = None,
-    joint_topic: Annotated[
-        str | None,
-        typer.Option(metavar="TOPIC", help="The joint states of a bag that holds several."),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be used and write nothing.")
-    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -85,21 +67,15 @@ def import_(
             output,
             readings=readings or (),
             cameras=camera,
-            unit=unit,
             lengths=lengths,
             offset=offset,
-            still=still,
-            image_topic=image_topic,
-            joint_topic=joint_topic,
             progress=progress,
         )
     if not as_json:
         print_table(import_table(found))
-    written = []
-    if not dry_run:
-        with shown_progress(not quiet) as progress:
-            written = import_recordings(found, force=force, progress=progress)
+    with shown_progress(not quiet) as progress:
+        written = import_recordings(found, force=force, progress=progress)
     if as_json:
         print_json(found.document(written))
-    elif written:
+    else:
         print_table(written_lines(output, written, found.machine))

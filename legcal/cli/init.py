@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -48,39 +48,9 @@ def init(
             "default as the headings say, else the one in which they lie in the travel."
         ),
     ] = None,
-    servo: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[JOINT=]CENTRE,US_PER_DEG",
-            help="Pulses of hobby servos: 1500,11.1 for all, or of one (repeat it); negative us "
-            "for one degree where longer pulses turn it backwards. By default as the model says.",
-        ),
-    ] = None,
     lengths: Annotated[
         bool, typer.Option("--lengths", help="The table holds whole lengths of legs.")
     ] = False,
-    views: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,NAME,...",
-            help="Use only these views (folders of FOLDER).",
-        ),
-    ] = None,
-    view_pattern: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATTERN",
-            help="Which part of the file names is the view, where all photographs are in one "
-            "folder: '{view}_*' for left_012.jpg, '*-{view}' for 012-left.jpg.",
-        ),
-    ] = None,
-    match: Annotated[
-        Literal["name", "time", "order"] | None,
-        typer.Option(
-            help="How photographs and rows are matched; by default by names, else by times, else "
-            "in order."
-        ),
-    ] = None,
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
@@ -88,34 +58,21 @@ def init(
             "pulses of servos 0.5deg."
         ),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the matching and write nothing.")
-    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
-    from legcal.data.new_dataset import plan_new_dataset, write_new_dataset
+    from legcal.data.new_dataset import SheetOptions, plan_new_dataset, write_new_dataset
     from legcal.report.new_dataset import matching_table, written_lines
 
-    found = plan_new_dataset(
-        folder,
-        readings,
-        model,
-        output,
-        cameras=camera or (),
-        unit=unit,
-        lengths=lengths,
-        views=[] if views is None else views.split(","),
-        view_pattern=view_pattern,
-        by=match,
-        encoder_sigma=encoder_sigma,
-        servos=servo or (),
+    options = SheetOptions(
+        cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
     )
+    found = plan_new_dataset(folder, readings, model, output, options)
     if not as_json:
         print_table(matching_table(found))
-    written = [] if dry_run else write_new_dataset(found, force=force)
+    written = write_new_dataset(found, force=force)
     if as_json:
         print_json(found.document(written))
-    elif written:
+    else:
         print_table(written_lines(output, written, found.machine))

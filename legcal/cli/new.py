@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +27,7 @@ def new(
     template: Annotated[
         bool,
         typer.Option(
-            "--template", help="Write a commented table to start from, as YAML and CSV in mm."
+            "--template", help="Write a commented table to start from, of --family or a hexapod."
         ),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
@@ -47,16 +46,19 @@ def new(
 
     given = Dimensions(**options)
     if template:
-        if table is not None or replace(given, name=None).stated():
+        if table is not None:
             raise UsageError(
-                "The template could not be written: found other options beside --template, needed "
-                "--output and --name only; leave them out, and write your numbers in the table."
+                f"The template could not be written: found the table {table} beside --template, "
+                "needed one of them; leave out the other."
             )
-        yaml, csv = write_template(output, given.name, force=force)
-        lines = f"written: {yaml} {csv}", f"Next: legcal new {shlex.quote(str(yaml))} -o ."
+        written = write_template(output, given, force=force)
+        lines = (
+            f"written: {' '.join(map(str, written))}",
+            f"Next: legcal new {shlex.quote(str(written[0]))} -o .",
+        )
         show(
             as_json,
-            lambda: {"paths": {"yaml": str(yaml), "csv": str(csv)}},
+            lambda: {"paths": {path.suffix[1:]: str(path) for path in written}},
             lambda: report([Text(line, overflow="ignore") for line in lines]),
         )
         return
@@ -65,11 +67,11 @@ def new(
     description = machine_document(created.machine)
     description["diagnostics"] = [*model.notes, *description["diagnostics"]]
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
-    written = f"written: {paths['yaml']} {paths['urdf']}"
+    said = f"written: {paths['yaml']} {paths['urdf']}"
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report(inspect_table(description), Text(written, overflow="ignore")),
+        lambda: report(inspect_table(description), Text(said, overflow="ignore")),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import inspect
 import json
 import os
@@ -20,7 +19,6 @@ import typer
 from legcal.errors import LegcalError, OutOfResources, UsageError, printable
 from legcal.processors import processors
 
-INTERRUPTED = 130  # exit code of a command that a signal stopped
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
 REPORT = "report.html"  # the page in the folder of a result
 MAX_WORKERS = 256  # more are a mistake: all of them are started
@@ -170,18 +168,17 @@ def command_line() -> str:
 
 def image_workers(cluster: str | None, workers: int | None = None) -> int | str:
     """Return the cluster or the number of processes that search images, few: each takes memory."""
-    return cluster or workers or min(processors(), MAX_IMAGE_WORKERS)
+    return chosen_workers(cluster, workers, min(processors(), MAX_IMAGE_WORKERS))
 
 
-@contextmanager
-def loading() -> Iterator[None]:
-    """Load libraries without searches for dead cycles: none of what they make is dead."""
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
+def chosen_workers(cluster: str | None, workers: int | None, by_default: int) -> int | str:
+    """Return the cluster or the number of processes; refuse both, as a cluster has its own."""
+    if cluster and workers:
+        raise UsageError(
+            "The command could not be run: found --workers beside a cluster (--cluster or "
+            "LEGCAL_CLUSTER), which has workers of its own; leave one of them out."
+        )
+    return cluster or workers or by_default
 
 
 def show(

@@ -73,8 +73,8 @@ def plan(
     noise: Annotated[
         Path | None,
         typer.Option(
-            metavar="RESULT|FILE",
-            help="Errors of outlines: an earlier result, or what legcal noise --json printed.",
+            metavar="RESULT",
+            help="Errors of outlines as an earlier result has them.",
         ),
     ] = None,
     bounds: Annotated[
@@ -120,7 +120,7 @@ def plan(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier plan there.")] = False,
@@ -134,14 +134,14 @@ def plan(
     from legcal.planning.places import USUAL, parse_bounds
     from legcal.planning.session import check_session, write_session
     from legcal.report.plan import plan_files, plan_table
-    from legcal.signals import first_signal_waits, is_waiting
+    from legcal.signals import held_back_signals, is_waiting
 
     def length(text: str | None, option: str) -> float | None:
         return None if text is None else parse_quantity(text, LENGTH, option)
 
     check_session(output, force=force)
     error = length(model_error, "--model-error") or 0.0
-    with first_signal_waits():  # Ctrl-C ends the search: the best so far is written
+    with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
         found = request.plan(
             model,
             images=images,

@@ -107,7 +107,7 @@ def simulate(
     from legcal.simulation.dataset import summary_document
     from legcal.simulation.request import requested
 
-    nominal = load_mechanism(model).require_rigid_platform()
+    nominal = load_mechanism(model)
     settings = requested(
         nominal,
         level=level.value,

@@ -9,9 +9,8 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import loading, print_table
+from legcal.cli.options import print_table
 from legcal.errors import printable
-from legcal.signals import forget_stop
 
 
 def view(
@@ -37,14 +36,13 @@ def view(
     ] = True,
 ) -> None:
     """Show a machine in the browser, moved by sliders: readings, pose, photographs, uncertainty."""
-    with loading():
-        from rich.text import Text
+    from rich.text import Text
 
-        from legcal.viewer.address import Address, check_address
-        from legcal.viewer.source import open_source
-        from legcal.viewer.window import Window, require_viser
+    from legcal.viewer.address import Address, check_address
+    from legcal.viewer.source import open_source
+    from legcal.viewer.window import Window, require_viser
 
-        require_viser()
+    require_viser()
     address = Address(host, port)
     check_address(address)
     window = Window(open_source(source, dataset), address)
@@ -58,7 +56,6 @@ def view(
         window.run()
     except KeyboardInterrupt:  # the way to end it
         window.close()
-        forget_stop()
 
 
 def _has_screen() -> bool:

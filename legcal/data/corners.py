@@ -16,7 +16,8 @@ import numpy as np
 from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
-from legcal.data.outlines import SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
+from legcal.data.outlines import DETAIL_COLUMN, SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
+from legcal.data.reasons import USED, Rejection, read_rejection
 from legcal.errors import DatasetError
 from legcal.files.folder import write_atomically
 from legcal.files.schema import describe
@@ -25,7 +26,13 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.board import FixedBoard
 
 NUMBERS = ("u", "v", "sigma")
-COLUMNS = ("view", "image", "corner", *NUMBERS, *(column.name for column in VERDICT_COLUMNS))
+COLUMNS = (
+    "view",
+    "image",
+    "corner",
+    *NUMBERS,
+    *(column.name for column in (*VERDICT_COLUMNS, DETAIL_COLUMN)),
+)
 SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says nothing
 
 
@@ -38,7 +45,7 @@ class Corners(ImageTable):
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
     used: BoolArray
-    reason: tuple[str, ...]  # why a corner was rejected; "" for used ones
+    reason: tuple[Rejection, ...]  # why a corner was rejected; false for used ones
     source: tuple[str, ...]  # detected or edited
 
     def row_keys(self) -> list[tuple[int, int]]:
@@ -50,7 +57,7 @@ def found_corners(row: IntArray, corner: IntArray, px: Array, sigma_px: Array) -
     """Return corners that were detected, all of them used."""
     n = len(row)
     used = np.ones(n, dtype=np.bool_)
-    return Corners(row, corner, px, sigma_px, used, ("",) * n, ("detected",) * n)
+    return Corners(row, corner, px, sigma_px, used, (USED,) * n, ("detected",) * n)
 
 
 def join_corners(tables: Sequence[Corners]) -> Corners:
@@ -77,8 +84,9 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
             *corners.px[i].tolist(),
             float(corners.sigma_px[i]),
             VERDICTS[0 if corners.used[i] else 1],
-            corners.reason[i],
+            corners.reason[i].reason,
             corners.source[i],
+            corners.reason[i].detail,
         ]
         for i, row in enumerate(corners.row.tolist())
     )
@@ -113,6 +121,7 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
                 remedy=UNLESS_REJECTED,
             ),
             *VERDICT_COLUMNS,
+            DETAIL_COLUMN,
         ],
         needed="the corners of the board in the images; add them, or delete the file to have "
         "images searched",
@@ -152,7 +161,7 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
         numbers[:, :2],
         numbers[:, 2],
         used,
-        table.text("reason"),
+        tuple(map(read_rejection, table.text("reason"), table.text("detail"))),
         source,
     )
     wins = [key in edited or (*key[:2], SOURCES[1]) not in edited for key in keys]

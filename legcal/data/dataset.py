@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import platform
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from legcal.brief import brief
-from legcal.cluster import made_of_file
 from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
@@ -45,7 +47,6 @@ from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_facts import ImageFacts
 from legcal.vision.image_file import Grey, decode_image, inspect_image
-from legcal.workers import KeptArrays
 
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
@@ -88,10 +89,9 @@ class Dataset:
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
         """Return what reads the images of these rows, in this order, in any process."""
         return ImageReader(
-            tuple(self.image_path(row) for row in rows),
+            tuple(None if path is None else path.absolute() for path in map(self.image_path, rows)),
             tuple(self._camera(row) for row in rows),
             tuple(self._where(row) for row in rows),
-            KeptArrays(len(rows), MAX_KEPT),
         )
 
     def inspect_image(self, row: int) -> tuple[ImageFacts, str | None]:
@@ -112,12 +112,11 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class ImageReader:
-    """Reads images by their number; decodes each once while there is room to keep it."""
+    """Reads images by their number, also in another process, or on a machine that shares them."""
 
-    paths: tuple[Path | None, ...]  # the files; None where a row has no image
+    paths: tuple[Path | None, ...]  # the files, absolute; None where a row has no image
     cameras: tuple[Camera, ...]  # the camera of each image
     places: tuple[str, ...]  # where each image is named, for messages
-    kept: KeptArrays  # those that were read before, in any process
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
@@ -127,13 +126,32 @@ class ImageReader:
                 f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
                 f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
             )
-        levels = self.kept.get(k)
-        if levels is None:
-            camera, place = self.cameras[k], self.places[k]
-            size = (camera.width, camera.height)
-            levels = made_of_file(path, size, lambda: decode_image(path, camera, place))
-            self.kept.keep(k, levels)
-        return np.asarray(levels, dtype=np.float32)
+        return _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
+
+
+_Decoded = NDArray[np.uint8] | Grey
+_kept = OrderedDict[tuple[str | int, ...], _Decoded]()  # by file; the last used at the end
+
+
+def _decoded(path: Path, camera: Camera, place: str) -> _Decoded:
+    """Decode an image; in each process once while there is room, until the file changes."""
+    try:
+        file = os.stat(path)
+    except OSError as error:
+        raise DatasetError(
+            f"{place}: its image could not be read: found '{error.strerror}' for {path} on "
+            f"{platform.node()}, needed the file there; put it back, or, where the workers of a "
+            "cluster are other machines, the dataset into a folder that they share."
+        ) from error
+    key = (str(path), file.st_size, file.st_mtime_ns, camera.width, camera.height)
+    if key in _kept:
+        _kept.move_to_end(key)
+        return _kept[key]
+    levels = decode_image(path, camera, place)
+    _kept[key] = levels
+    while sum(each.nbytes for each in _kept.values()) > MAX_KEPT:
+        _kept.popitem(last=False)
+    return levels
 
 
 def _encoder_sigmas(
@@ -240,7 +258,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
-    machine = load_mechanism(_mechanism_path(folder, entry.mechanism)).require_rigid_platform()
+    machine = load_mechanism(_mechanism_path(folder, entry.mechanism))
     problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
     if problems:
         raise DatasetError(problems)

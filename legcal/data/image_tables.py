@@ -14,6 +14,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from legcal.data.measurements import Measurements
+from legcal.data.reasons import Reason, Rejection, have_reason
 from legcal.geometry.types import BoolArray, IntArray
 
 
@@ -27,7 +28,7 @@ class ImageTable:
         return len(self.row)
 
     def row_keys(self) -> list[tuple[Any, ...]]:
-        """Return what makes each row one and the same, by which tables are sorted."""
+        """Return the identity of each row, the key by which tables are sorted."""
         raise NotImplementedError
 
     def choose(self, chosen: BoolArray | IntArray) -> Self:
@@ -64,14 +65,14 @@ class ImageTable:
         place = place[self.row]
         return replace(self.choose(place >= 0), row=place[place >= 0])
 
-    def reject(self, wrong: BoolArray, why: str | Sequence[str]) -> Self:
+    def reject(self, wrong: BoolArray, why: Reason | Sequence[Rejection]) -> Self:
         """Return a table of observations with some of those that were used rejected.
 
         For one reason, or each for its own.
         """
         table = self._fields()
         out = table["used"] & wrong
-        reasons = (why,) * len(self) if isinstance(why, str) else why
+        reasons = (Rejection(why),) * len(self) if isinstance(why, Reason) else why
         changed: dict[str, Any] = {
             "used": table["used"] & ~out,
             "reason": tuple(
@@ -80,6 +81,10 @@ class ImageTable:
             ),
         }
         return replace(self, **changed)
+
+    def rejected_for(self, *reasons: Reason) -> BoolArray:
+        """Return which observations are rejected for one of some reasons, (n,)."""
+        return have_reason(self._fields()["reason"], *reasons)
 
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

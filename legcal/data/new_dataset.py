@@ -9,9 +9,10 @@ system has no links.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -38,12 +39,10 @@ from legcal.files.published import with_schema
 from legcal.files.quantity import LENGTH, parse_quantity
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
 from legcal.files.table import format_table
-from legcal.machine.actuator import Pulses
 from legcal.machine.files import DATASET_YAML, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import inspect_image
 
@@ -176,20 +175,38 @@ class NewDataset:
         return (PurePosixPath("images") / photograph.name).as_posix()
 
 
+@dataclass(frozen=True, kw_only=True)
+class SheetOptions:
+    """What the owner of photographs and a table states beside them.
+
+    Attributes
+    ----------
+    cameras : sequence of str
+        Camera files: one for all views, or ``VIEW=FILE`` for each; by default those beside the
+        photographs.
+    unit : str, optional
+        Of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg or us (pulses of hobby
+        servos that the model describes); by default that of the headings, else found from the
+        travel.
+    lengths : bool
+        Whether the table holds whole lengths of legs in place of readings.
+    encoder_sigma : float, str or mapping, optional
+        One standard deviation of a reading [m], as text with its unit, or by joint [m or rad]; by
+        default the last digit of the table, and half a degree for pulses of servos.
+    """
+
+    cameras: Sequence[str] = ()
+    unit: str | None = None
+    lengths: bool = False
+    encoder_sigma: float | str | Mapping[str, float] | None = None
+
+
 def plan_new_dataset(
     folder: str | Path,
     readings: str | Path,
     model: str | Path,
     destination: str | Path,
-    *,
-    cameras: Sequence[str] = (),
-    unit: str | None = None,
-    lengths: bool = False,
-    views: Sequence[str] = (),
-    view_pattern: str | None = None,
-    by: str | None = None,
-    encoder_sigma: float | str | Mapping[str, float] | None = None,
-    servos: Sequence[str] = (),
+    options: SheetOptions = SheetOptions(),
 ) -> NewDataset:
     """Return a dataset of photographs and readings, checked and not written yet.
 
@@ -203,24 +220,8 @@ def plan_new_dataset(
         The nominal model, as for :func:`legcal.load_mechanism`.
     destination : path
         The folder of the dataset.
-    cameras : sequence of str
-        Camera files: one for all views, or ``VIEW=FILE`` for each.
-    unit : str, optional
-        Of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg or us (pulses of hobby
-        servos); by default that of the headings, else found from the travel.
-    lengths : bool
-        Whether the table holds whole lengths of legs in place of readings.
-    views : sequence of str
-        Folders (or views by the pattern) to use, all by default.
-    view_pattern : str, optional
-        Which part of the file names is the view, if it is not the folder: ``{view}_*``.
-    by : str, optional
-        How to match photographs: ``name``, ``time`` or ``order``.
-    encoder_sigma : float, str or mapping, optional
-        One standard deviation of a reading [m], as text with its unit, or by joint [m or rad]; by
-        default the last digit of the table, and half a degree for pulses of servos.
-    servos : sequence of str
-        ``[JOINT=]CENTRE,US_PER_DEG``: pulses of servos of which the model does not know them.
+    options : SheetOptions
+        What else is known.
 
     Raises
     ------
@@ -228,56 +229,24 @@ def plan_new_dataset(
         With one sentence for each thing that is wrong.
     """
     folder, path, destination = Path(folder), Path(readings), Path(destination)
-    machine = load_mechanism(model).require_rigid_platform()
+    machine = load_mechanism(model)
     _check_place(folder, destination)
-    photographs = find_photographs(folder, [view.strip("/") for view in views], view_pattern)
-    by_names, pattern = photographs, None
-    if view_pattern is None:
-        by_names, pattern = with_likely_views(photographs)
+    photographs = find_photographs(folder)
+    by_names, pattern = with_likely_views(photographs)
     sheet = ReadingsSheet(path, machine, "photograph", columns_by_content(by_names))
-    if {view.casefold() for view in sheet.text("view") if view} <= {
-        one.folder.casefold() for one in by_names
-    }:
+    named = {view.casefold() for view in sheet.text("view") if view}
+    if named <= {one.folder.casefold() for one in by_names}:
         photographs = by_names
     else:
         pattern = None  # the table names other views
-    found = sheet.readings(unit, lengths=lengths, servos=read_servos(servos, sheet.motors))
-    rows = tuple(
-        Row(where, *texts)
-        for where, *texts in zip(
-            sheet.where, *(sheet.text(name) for name in ("image", "view", "time")), strict=True
-        )
-    )
-    matching = match(rows, photographs, str(path), by=by)
+    found = sheet.readings(options.unit, lengths=options.lengths)
+    texts = (sheet.text(name) for name in ("image", "view", "time"))
+    rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
+    matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
-    bad = sorted({view for view in view_of if not is_name(view)})
-    if bad:
-        raise DatasetError(
-            f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
-            f"cannot show, needed {NAME_NEEDED}; rename it."
-        )
-    of_views, problems = _cameras(folder, list(dict.fromkeys(view_of)), matching, view_of, cameras)
-    if problems:
-        raise DatasetError(problems)
-    read = {camera: read_camera(camera) for camera in dict.fromkeys(of_views.values())}
-    _check_photographs(matching, [read[of_views[view]] for view in view_of])
-    sigma, note = _sigmas(encoder_sigma, sheet.motors, found)
-    notes = [*sheet.notes, *matching.notes, *note]
-    if pattern is not None and "view" not in sheet:
-        notes.append(
-            f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
-            f"photographs, '{pattern}': if that is not where the camera stood, add a column view, "
-            "or give --view-pattern."
-        )
-    if set(view_of) == {ONE_VIEW} and not any(row.view for row in rows):
-        likely = likely_pattern([photograph for _, photograph in matching.pairs])
-        remedy = "put those of each place in a folder, add a column view, or give --view-pattern"
-        if likely is not None:
-            remedy = f"as the names of the files look, give --view-pattern '{likely}'"
-        notes.append(
-            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places, "
-            f"{remedy}."
-        )
+    cameras = _cameras(folder, matching, view_of, options.cameras)
+    sigma, sigma_notes = _sigmas(options.encoder_sigma, sheet.motors, found)
+    views_stated = any(row.view for row in rows)
     return NewDataset(
         machine=machine,
         model=_model_name(model, machine, destination),
@@ -285,16 +254,38 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=sheet.taken,
-        are_lengths=lengths,
+        are_lengths=options.lengths,
         rows=rows,
         poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,
         views=view_of,
         readings=found,
-        cameras=of_views,
+        cameras=cameras,
         encoder_sigma=sigma,
-        notes=tuple(notes),
+        notes=(
+            *sheet.notes,
+            *matching.notes,
+            *sigma_notes,
+            *([] if views_stated else _view_notes(pattern, matching, view_of)),
+        ),
     )
+
+
+def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str]) -> Iterator[str]:
+    """Yield how views were told apart that no column names, or how they may be."""
+    if pattern is not None:
+        yield (
+            f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
+            f"photographs, '{pattern}': if that is not where the camera stood, add a column view, "
+            "or put the photographs of each place in a folder."
+        )
+    elif set(view_of) == {ONE_VIEW}:
+        likely = likely_pattern([photograph for _, photograph in matching.pairs])
+        looks = f" as the names of the files look ('{likely}')," if likely else ""
+        yield (
+            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places,"
+            f"{looks} put those of each place in a folder, or add a column view."
+        )
 
 
 def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
@@ -363,41 +354,6 @@ def _check_place(folder: Path, destination: Path) -> None:
             f"{destination}: the dataset could not be written: found a place in the folder of the "
             "photographs, which is not changed, needed one beside it; give another folder with -o."
         )
-
-
-def read_servos(texts: Sequence[str], motors: Sequence[Leg]) -> dict[str, Pulses]:
-    """Return the pulses of servos by joint, from ``[JOINT=]CENTRE,US_PER_DEG``.
-
-    Raises
-    ------
-    UsageError
-        If a text is no such thing, or names no motor that turns.
-    """
-    turning = [str(leg.prismatic) for leg in motors if leg.reads_angle]
-    found = dict[str, Pulses]()
-    for text in sorted(texts, key=lambda text: "=" in text):  # those of one joint win
-        name, _, numbers = text.rpartition("=")
-        where = f"--servo {text} could not be used"
-        if (name and name not in turning) or not turning:
-            raise UsageError(
-                f"{where}: found no motor {f'{describe(name)} ' * bool(name)}that turns, needed "
-                f"{f'one of {few(turning)}' if turning else 'one'}; correct it."
-            )
-        try:
-            centre, per_degree = (float(part) for part in numbers.split(","))
-        except ValueError:
-            raise UsageError(
-                f"{where}: found {describe(numbers)}, needed the pulse at joint value 0 [us] and "
-                "the us for one degree (negative for the other sense), such as 1500,11.1; correct "
-                "it."
-            ) from None
-        try:
-            pulses = Pulses.stated(centre, per_degree)
-        except ValueError as error:
-            raise UsageError(f"{where}: {error}") from None
-        if pulses is not None:
-            found |= dict.fromkeys([name] if name else turning, pulses)
-    return found
 
 
 def _sigmas(
@@ -477,13 +433,19 @@ def _view(row: Row, photograph: Photograph) -> str:
 
 
 def _cameras(
-    folder: Path,
-    views: Sequence[str],
-    matching: Matching,
-    view_of: Sequence[str],
-    given: Sequence[str],
-) -> tuple[dict[str, Path], list[str]]:
-    """Return the camera file of each view: as given, else beside its photographs or above them."""
+    folder: Path, matching: Matching, view_of: Sequence[str], given: Sequence[str]
+) -> dict[str, Path]:
+    """Return the camera file of each view: as given, else beside its photographs or above them.
+
+    Photographs that do not fit it are refused.
+    """
+    views = list(dict.fromkeys(view_of))
+    bad = sorted(view for view in views if not is_name(view))
+    if bad:
+        raise DatasetError(
+            f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
+            f"cannot show, needed {NAME_NEEDED}; rename it."
+        )
     for_all = [text for text in given if "=" not in text or os.path.isfile(text)]
     named = [text.split("=", 1) for text in given if text not in for_all]
     of_one, problems = dict[str, str](), list[str]()
@@ -524,18 +486,17 @@ def _cameras(
             "the file of its calibration; make it with: legcal camera BOARDS --board "
             "chessboard:9x6:25mm -o camera_info.yaml, and give --camera camera_info.yaml."
         )
-    return found, problems
-
-
-def _check_photographs(matching: Matching, cameras: Sequence[Camera]) -> None:
-    """Refuse photographs that cannot be read or have another size than their camera."""
-    problems = [
-        problem
-        for (_, photograph), camera in zip(matching.pairs, cameras, strict=True)
-        if (problem := inspect_image(photograph.path, camera)[1]) is not None
-    ]
     if problems:
         raise DatasetError(problems)
+    read = {path: read_camera(path) for path in dict.fromkeys(found.values())}
+    unusable = [
+        problem
+        for (_, photograph), view in zip(matching.pairs, view_of, strict=True)
+        if (problem := inspect_image(photograph.path, read[found[view]])[1]) is not None
+    ]
+    if unusable:
+        raise DatasetError(unusable)
+    return found
 
 
 def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:

@@ -24,6 +24,7 @@ from legcal.data.measurements import (
     refuse_unknown_legs,
     refuse_unknown_rows,
 )
+from legcal.data.reasons import Reason, Rejection, read_rejection
 from legcal.files.folder import write_atomically
 from legcal.files.schema import closest, describe
 from legcal.files.table import Column, Table, format_table, read_table
@@ -51,6 +52,7 @@ VERDICT_COLUMNS = (
     Column("reason", "text"),
     Column("source", "text", choices=SOURCES, remedy="correct it"),
 )
+DETAIL_COLUMN = Column("detail", "text", required=False)  # of the reason
 UNLESS_REJECTED = "correct it or set the verdict to rejected with an empty cell"
 _LEAVE = "correct it or leave it empty"
 OUTLINE_COLUMNS = (
@@ -66,6 +68,7 @@ OUTLINE_COLUMNS = (
     Column("gamma", least=math.ulp(0.0), needed="a number above 0", blank=True, required=False,
            group="gamma", remedy=_LEAVE),
     Column("by_gamma", blank=True, required=False, group="gamma", remedy=_LEAVE),
+    DETAIL_COLUMN,
 )  # fmt: skip
 
 
@@ -89,7 +92,7 @@ class Outlines(ImageTable):
     ends: Array  # (n, 2, 2) of the used piece [px], the first nearer to the base joint
     covariance: Array  # (n, 2, 2) of the offsets of the line, normal to itself, there [px^2]
     used: BoolArray  # (n,)
-    reason: tuple[str, ...]  # why an outline was rejected; "" for used ones
+    reason: tuple[Rejection, ...]  # why an outline was rejected; false for used ones
     source: tuple[str, ...]  # detected or edited
     contrast: Array = field(default_factory=_unknown)  # median step to the leg [grey levels]
     length: Array = field(default_factory=_unknown)  # seen on the line, without gaps [px]
@@ -202,7 +205,7 @@ def reject_unused_legs(
     names = [leg_names[leg] for leg in outlines.leg.tolist()]
     used = [view.uses(name) for view, name in zip(views, names, strict=True)]
     out = ~np.array(used, dtype=np.bool_)
-    return outlines.reject(out, [f"view {view.name} does not use this leg" for view in views])
+    return outlines.reject(out, [Rejection(Reason.UNUSED_LEG, view.name) for view in views])
 
 
 def write_observations(
@@ -237,9 +240,10 @@ def format_observations(
             int(outlines.edge[i]),
             *numbers[i],
             VERDICTS[0 if outlines.used[i] else 1],
-            outlines.reason[i],
+            outlines.reason[i].reason,
             outlines.source[i],
             *measured[i],
+            outlines.reason[i].detail,
         ]
         for i, row in enumerate(outlines.row.tolist())
     )
@@ -305,7 +309,7 @@ def read_observations(
         numbers[:, 3:7].reshape(-1, 2, 2),
         numbers[:, [7, 8, 8, 9]].reshape(-1, 2, 2),
         used,
-        table.text("reason"),
+        tuple(map(read_rejection, table.text("reason"), table.text("detail"))),
         table.text("source"),
         *measured,  # what detection found, which an edited row no longer is
     )

@@ -56,6 +56,24 @@ def overrides_of_call(
     return tuple(found)
 
 
+def overrides_of_settings(texts: Iterable[str]) -> dict[str, list[str]]:
+    """Return the settings of the option ``--set`` as the arguments priors, fixed and free.
+
+    ``NAME`` and ``NAME=VALUE`` fix a parameter, ``NAME=VALUE±SIGMA`` is a prior, and ``NAME=free``
+    estimates the parameter without one.
+    """
+    found: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        if name and value.strip().casefold() == "free":
+            found["free"].append(name)
+        elif name and any(sign in value for sign in ("±", "+-", "+/-")):
+            found["priors"].append(text)
+        else:
+            found["fixed"].append(text)
+    return found
+
+
 def read_override(
     action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
 ) -> Override:

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import DatasetError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
 from legcal.vision.heic import HEIC_SUFFIXES
@@ -72,26 +72,18 @@ class ViewPattern:
     """Which part of a file name is the view: ``{view}_*`` of ``left_012.jpg``."""
 
     def __init__(self, pattern: str) -> None:
-        self.pattern = pattern
-        if pattern.count("{view}") != 1 or "/" in pattern:
-            raise UsageError(
-                f"The pattern of the views could not be used: found {describe(pattern)}, needed a "
-                "file name with {view} once and * for what changes, such as '{view}_*'; correct "
-                "--view-pattern."
-            )
-        before, after = (".*?".join(map(re.escape, part.split("*"))) for part in
-                         pattern.split("{view}"))  # fmt: skip
+        before, after = (
+            ".*?".join(map(re.escape, part.split("*"))) for part in pattern.split("{view}")
+        )
         self._form = re.compile(f"(?P<before>{before})(?P<view>.+?)(?P<after>{after})", re.DOTALL)
 
     def of(self, photograph: Photograph) -> Photograph | None:
         """Return a photograph with its view, or None if its name has another form."""
-        path = PurePosixPath(photograph.name)
-        for name in (path.stem, path.name):
-            found = self._form.fullmatch(name)
-            if found is not None:
-                label = (found["before"] + found["after"]).removesuffix(path.suffix)
-                return replace(photograph, view=found["view"], label=label.strip(_SEPARATORS))
-        return None
+        found = self._form.fullmatch(PurePosixPath(photograph.name).stem)
+        if found is None:
+            return None
+        label = found["before"] + found["after"]
+        return replace(photograph, view=found["view"], label=label.strip(_SEPARATORS))
 
 
 def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
@@ -147,16 +139,8 @@ def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
     return min(likely)[-1] if likely else None
 
 
-def find_photographs(
-    folder: Path, chosen: Sequence[str] = (), pattern: str | None = None
-) -> list[Photograph]:
-    """Return the images in a folder and in the folders in it, in the order of their names.
-
-    ``chosen`` are the only folders (views, where a *pattern* of names gives these) to look at, all
-    if empty.
-    """
-    form = None if pattern is None else ViewPattern(pattern)
-    others: list[str] = []
+def find_photographs(folder: Path) -> list[Photograph]:
+    """Return the images in a folder and in the folders in it, in the order of their names."""
     if not os.path.isdir(folder):
         found = "a file" if os.path.exists(folder) else "no such folder"
         raise DatasetError(
@@ -169,17 +153,9 @@ def find_photographs(
     for above, inside, files in os.walk(folder):
         inside[:] = sorted(name for name in inside if not name.startswith("."))
         here = Path(above).relative_to(folder)
-        for name in files:
+        for name in (name for name in files if not name.startswith(".")):
             suffix = Path(name).suffix.lower()
             file = Photograph(Path(above) / name, (here / name).as_posix())
-            if form is not None and suffix in suffixes and not name.startswith("."):
-                named = form.of(file)
-                if named is None:
-                    others.append(file.name)
-                    continue
-                file = named
-            if name.startswith(".") or (chosen and file.folder not in chosen):
-                continue
             if suffix in suffixes:
                 photographs.append(file)
             elif suffix in FOREIGN_SUFFIXES:
@@ -189,27 +165,12 @@ def find_photographs(
                 f"{folder}: the photographs could not be used: found more than {MAX_PHOTOGRAPHS}, "
                 "needed fewer; give the folder of one calibration."
             )
-    if others:
-        raise DatasetError(
-            f"{folder}: the views of the photographs could not be found: found "
-            f"{few([describe(name) for name in sorted(others)])}, needed names of the form "
-            f"{describe(pattern)}; correct --view-pattern, or move them to another folder."
-        )
-    empty = [name for name in chosen if name not in {one.folder for one in photographs}]
-    if photographs and empty:
-        words = few([describe(name) for name in empty])
-        raise DatasetError(
-            f"{folder}: the photographs could not be found: found none in {words}, needed some in "
-            "each of them; check --views."
-        )
     if not photographs:
         found, remedy = "none", "check the path"
         if foreign:
             found = f"{len(foreign)} of another format ({few(foreign)})"
             are_heic = any(name.lower().endswith(HEIC_SUFFIXES) for name in foreign)
             remedy = CONVERT_HEIC if are_heic else CONVERT
-        elif chosen:
-            found, remedy = f"none in {few(chosen)}", "check --views"
         raise DatasetError(
             f"{folder}: the photographs could not be found: found {found}, needed PNG, JPEG or "
             f"TIFF files there or in folders in it; {remedy}."
@@ -225,10 +186,8 @@ def in_order(name: str) -> tuple[object, ...]:
     return (len(parts), *keys, name)
 
 
-def match(
-    rows: Sequence[Row], photographs: Sequence[Photograph], table: str, *, by: str | None = None
-) -> Matching:
-    """Return which photograph belongs to which row: by name, by time, else in order.
+def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+    """Return which photograph belongs to which row: by name, else by time, else in order.
 
     Parameters
     ----------
@@ -237,23 +196,18 @@ def match(
         In the order of their names.
     table : str
         The table, for messages.
-    by : str, optional
-        ``name``, ``order`` or ``time``; by default what the table has.
 
     Raises
     ------
     DatasetError
         If rows have no photograph, or more than one in a view.
     """
-    has = {"name": any(row.image for row in rows), "time": any(row.time for row in rows)}
-    how = by or next((kind for kind in ("name", "time") if has[kind]), "order")
-    if how != "order" and not has[how]:
-        column = {"name": "image", "time": "time"}[how]
-        raise DatasetError(
-            f"{table}: the photographs could not be matched by {how}: found no column '{column}', "
-            f"needed one; add it, or give --match order."
-        )
-    found = {"name": _by_name, "time": _by_time, "order": _in_order}[how](rows, photographs, table)
+    if any(row.image for row in rows):
+        found = _by_name(rows, photographs, table)
+    elif any(row.time for row in rows):
+        found = _by_time(rows, photographs, table)
+    else:
+        found = _in_order(rows, photographs, table)
     used = {photograph.name for _, photograph in found.pairs}
     bad = sorted(name for name in used if not is_name(name))
     if bad:
@@ -353,7 +307,8 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
         problems = [
             f"{table}: the photographs could not be matched by name: found none that is named like "
             f"{describe(rows[named[0]].image)}, needed the names of files such as "
-            f"{describe(photographs[0].name)}; correct the column image, or give --match order."
+            f"{describe(photographs[0].name)}; correct the column image, or remove it to match "
+            "rows and photographs in order."
         ]
     raise DatasetError(problems)
 
@@ -480,8 +435,8 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
         raise DatasetError(
             f"{table}: the photographs could not be matched by time: found {len(dated)} "
             f"photographs with a time in their EXIF data for {len(rows)} rows, needed as many or "
-            "more; copy the files from the camera as they are, add a column image, or give "
-            "--match order."
+            "more; copy the files from the camera as they are, add a column image, or remove the "
+            "column time to match rows and photographs in order."
         )
     day = taken[dated[0].name].date()
     times = [_moment(row.time, day) for row in rows]

@@ -47,7 +47,6 @@ def notes_on_photographs(
     for path, views in views_of.items():
         images = {v: _images(measurements, v, facts) for v in views}
         notes += _against_camera(measurements, path, images)
-        notes += [PhotographNote(what, False) for what in _in_modes(measurements, images)]
         for v in views:
             notes += [PhotographNote(what, False) for what in _of_view(measurements, v, images[v])]
     return notes
@@ -66,7 +65,7 @@ def _against_camera(
     measurements: Measurements, path: Path, images: Mapping[int, list[tuple[str, ImageFacts]]]
 ) -> Iterator[PhotographNote]:
     """Yield what contradicts a camera file, and the photographs of its views each other."""
-    named = [one for of_view in images.values() for one in of_view if not one[1].is_screenshot]
+    named = [one for of_view in images.values() for one in of_view]
     camera = measurements.views[next(iter(images))].camera
     view_of = {name: v for v, of_view in images.items() for name, _ in of_view}
     for found in differences(named, (camera.width, camera.height), camera.photographs):
@@ -91,24 +90,6 @@ def _against_camera(
         yield PhotographNote(start + rest, len(found.images) > 1 or bool(found.needed))
 
 
-def _in_modes(
-    measurements: Measurements, images: Mapping[int, list[tuple[str, ImageFacts]]]
-) -> Iterator[str]:
-    """Yield which photographs were taken in a mode that does not show what the lens saw."""
-    modes: dict[str, dict[str, int]] = {}
-    for v, of_view in images.items():
-        for image, facts in of_view:
-            if facts.mode:
-                modes.setdefault(facts.mode, {})[image] = v
-    for mode, view_of in modes.items():
-        views = few_views([measurements.views[v].name for v in dict.fromkeys(view_of.values())])
-        yield (
-            f"Outlines in {few(list(view_of))} of {views} may not lie where the lens put them: "
-            f"found {mode}, as their files say, needed photographs in the plain mode of the "
-            "camera; take them again, or leave them out."
-        )
-
-
 def _in_words(found: Difference) -> str:
     """Return the images of a difference, and how they are."""
     return " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
@@ -119,20 +100,14 @@ def _of_view(
 ) -> Iterator[str]:
     """Yield what is odd about single photographs of a view."""
     name = measurements.views[view].name
-    shown = [image for image, facts in images if facts.is_screenshot]
-    nameless = [image for image, facts in images if not facts.device and image not in shown]
+    nameless = [image for image, facts in images if not facts.device]
     devices = [facts.device for _, facts in images if facts.device]
-    remedy = "needed the files that the camera wrote; copy them from the camera."
-    if shown:
-        yield (
-            f"Images {few(shown)} of view {name} may be cropped or rescaled: found screenshots, as "
-            f"their files say, {remedy}"
-        )
     if nameless and len(devices) >= _MOST * len(nameless):
         yield (
             f"Images {few(nameless)} of view {name} may be cropped or rescaled: found no camera "
             f"named in them, '{devices[0]}' in {len(devices)} others, as after editing, a "
-            f"screenshot or a messenger, {remedy}"
+            "screenshot or a messenger, needed the files that the camera wrote; copy them from the "
+            "camera."
         )
     turns: dict[int, list[str]] = {}
     for image, facts in images:
@@ -149,14 +124,8 @@ def _of_view(
         )
 
 
-def compression_note(
-    measurements: Measurements,
-    facts: Mapping[str, ImageFacts],
-    rms_px: float,
-    scale: float,
-    effect: str = "",
-) -> list[str]:
-    """Return a note on photographs that were compressed with much loss.
+def compression_notes(measurements: Measurements, facts: Mapping[str, ImageFacts]) -> list[str]:
+    """Return a note on photographs that were compressed with much loss, none if there are none.
 
     Parameters
     ----------
@@ -164,40 +133,17 @@ def compression_note(
         Their rows.
     facts : mapping
         What the files of images say, by the names of the images.
-    rms_px : float
-        How far outlines are from the fit, root mean square [px].
-    scale : float
-        Noise of outlines over what the noise of the pixels around them explains.
-    effect : str
-        How much larger standard deviations are for it, in words; "" if that is not known.
     """
-    found = compressed(measurements, facts)
-    if not found:
+    qualities: dict[str, int] = {}  # the least of each view
+    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
+        quality = facts[image].jpeg_quality if image in facts else None
+        if quality is not None and quality < GOOD_QUALITY:
+            view = measurements.views[v].name
+            qualities[view] = min(quality, qualities.get(view, quality))
+    if not qualities:
         return []
     return [
-        f"Lossy compression moves outlines: found {found}, and outlines that are "
-        f"{rms_px:.2f} px off (rms), with standard deviations {scale:.2f} times those that the "
-        f"noise of their pixels explains{effect and f' and {effect}'}; the stated uncertainty "
-        "includes it; store "
-        f"photographs without loss (PNG, TIFF) or as JPEGs of quality {GOOD_QUALITY} or more."
+        f"Lossy compression moves outlines: found JPEGs of quality {min(qualities.values())} or so "
+        f"in photographs of {few_views(list(qualities))}, needed {GOOD_QUALITY} or more, PNG or "
+        "TIFF; the stated uncertainty includes it."
     ]
-
-
-def compressed(measurements: Measurements, facts: Mapping[str, ImageFacts]) -> str:
-    """Return in words which photographs were compressed with much loss, "" if none were."""
-    by_quality: dict[int, set[int]] = {}
-    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
-        found = facts.get(image)
-        if found is not None and (found.jpeg_quality or GOOD_QUALITY) < GOOD_QUALITY:
-            by_quality.setdefault(found.jpeg_quality or 0, set()).add(v)
-    if not by_quality:
-        return ""
-    names = [view.name for view in measurements.views]
-    of_views: dict[tuple[int, ...], list[int]] = {}
-    for quality, views in sorted(by_quality.items()):
-        of_views.setdefault(tuple(sorted(views)), []).append(quality)
-    return ", ".join(
-        f"photographs of {few_views([names[v] for v in views])} that are JPEGs of quality "
-        f"{qualities[0] if len(qualities) == 1 else f'{qualities[0]} to {qualities[-1]}'} or so"
-        for views, qualities in of_views.items()
-    )

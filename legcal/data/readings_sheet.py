@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -32,7 +31,6 @@ from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, is_number, read_table, split_heading
 from legcal.geometry.types import Array
-from legcal.machine.actuator import Pulses
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 
@@ -115,13 +113,7 @@ class ReadingsSheet:
         """The place of each row in the file, for messages."""
         return self._table.where
 
-    def readings(
-        self,
-        unit: str | None = None,
-        *,
-        lengths: bool = False,
-        servos: Mapping[str, Pulses] = MappingProxyType({}),
-    ) -> SheetReadings:
+    def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:
         """Return the readings in m and rad, lengths by their decimal digits.
 
         Parameters
@@ -131,8 +123,6 @@ class ReadingsSheet:
             else the one in which readings lie in the travel.
         lengths : bool
             Whether the columns are whole lengths of legs.
-        servos : mapping
-            Pulses by joint, of servos of which the model does not know them.
 
         Raises
         ------
@@ -140,7 +130,7 @@ class ReadingsSheet:
             If the unit cannot be decided or surely is another one, or with a sentence for each
             reading outside its travel.
         """
-        units, unit_from = self._units(unit, lengths, servos)
+        units, unit_from = self._units(unit, lengths)
         texts = [self._table.text(joint) for joint in self._joints]
         values = np.array(
             [_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]
@@ -167,8 +157,8 @@ class ReadingsSheet:
             for doubt in doubted_units(numbers, q, self.motors, units):
                 if doubt.is_sure:
                     self._table.refuse_file(
-                        f"{doubt.in_words(self.path)}; correct the headings or --unit to "
-                        f"{doubt.other}, or convert them to it if they are in {doubt.stated}."
+                        f"{doubt.in_words(self.path)}; state {doubt.other} in the headings, "
+                        f"or convert them to it if they are in {doubt.stated}."
                     )
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
@@ -178,9 +168,7 @@ class ReadingsSheet:
         ]
         return SheetReadings(q, np.array(last), units, unit_from)
 
-    def _units(
-        self, given: str | None, lengths: bool, servos: Mapping[str, Pulses]
-    ) -> tuple[tuple[ReadingUnit, ...], str]:
+    def _units(self, given: str | None, lengths: bool) -> tuple[tuple[ReadingUnit, ...], str]:
         """Return the unit of the readings of each motor, and where they were found."""
         self._refuse_options(given, lengths)
         found, where = dict[int, ReadingUnit](), list[str]()
@@ -197,7 +185,6 @@ class ReadingsSheet:
                 self._table.numbers(joints),
                 sorted(stated),
                 lengths,
-                servos,
             )
             own = given if given is not None and (given in LENGTH) is not turning else None
             unit, how = of_kind.unit(own)
@@ -353,19 +340,17 @@ class _MotorsOfKind:
     values: Array  # (n_rows, n_legs) as written
     stated: list[str]  # the units that their headings state
     lengths: bool  # whether the values are taken for whole lengths of legs
-    servos: Mapping[str, Pulses]
 
     @property
     def turning(self) -> bool:
         """Whether they turn."""
         return self.legs[0].reads_angle
 
-    @cached_property
+    @property
     def has_pulses(self) -> bool:
         """Whether the pulses of all of them are known."""
         return all(
-            joint in self.servos or (leg.actuator is not None and leg.actuator.pulses is not None)
-            for leg, joint in zip(self.legs, self.joints, strict=True)
+            leg.actuator is not None and leg.actuator.pulses is not None for leg in self.legs
         )
 
     @property
@@ -377,10 +362,7 @@ class _MotorsOfKind:
 
     def units(self, name: str) -> list[ReadingUnit]:
         """Return the unit of each of them by its name."""
-        return [
-            unit_named(name, leg, self.servos.get(joint))
-            for leg, joint in zip(self.legs, self.joints, strict=True)
-        ]
+        return [unit_named(name, leg) for leg in self.legs]
 
     def fits(self, unit: str, lengths: bool, *, moving: bool = True) -> bool:
         """Say whether most values lie in the travel, and where *moving* use a part of it."""
@@ -416,7 +398,7 @@ class _MotorsOfKind:
             raise DatasetError(
                 f"{self.path}: the unit could not be decided: found "
                 f"{' and '.join(dict.fromkeys([*([given] if given else []), *self.stated]))}, "
-                "needed the same for all readings; correct the headings or --unit."
+                "needed the same for all readings; correct the headings."
             )
         known = self.stated[0] if self.stated else given
         if known is not None and known not in self.possible and known != PULSES:
@@ -428,9 +410,8 @@ class _MotorsOfKind:
         if known == PULSES and not self.has_pulses:
             raise DatasetError(
                 f"{self.path}: the readings could not be used: found pulses of servos of which "
-                "neither centre nor us for one degree is known, needed both; give --servo "
-                "1500,11.1 for all (JOINT=1500,-11.1 for one that turns the other way), or "
-                "centre_us and us_per_deg in legcal.motors of the model, with your numbers."
+                "neither centre nor us for one degree is known, needed both; write centre_us and "
+                f"us_per_deg of '{self.joints[0]}' and the others into legcal.motors of the model."
             )
         return known
 
@@ -451,7 +432,7 @@ class _MotorsOfKind:
                 if other is not self.lengths:
                     remedies.append("leave out --lengths" if self.lengths else "add --lengths")
                 if unit not in tried:
-                    remedies.append(f"give the unit {unit}")
+                    remedies.append(f"state the unit {unit} in the headings")
                 raise DatasetError(
                     f"{self._start}, which look like {'lengths of legs' if other else 'readings'} "
                     f"in {unit}; {' and '.join(remedies)}."
@@ -462,7 +443,7 @@ def _needed(leg: Leg, *, has_pulses: bool) -> str:
     """Return what readings of a leg lie in, in words."""
     if leg.reads_angle:
         low, high = (math.degrees(x) for x in leg.travel)
-        servo = "" if has_pulses else ", or pulses of servos with --servo CENTRE,US_PER_DEG"
+        servo = "" if has_pulses else ", or pulses of servos that legcal.motors of it describes"
         return (
             f"readings in the travel of the model ({low:g} to {high:g} deg for motor "
             f"'{leg.prismatic}'){servo}"

@@ -88,7 +88,7 @@ def load_subject(given: str | Path) -> Subject:
 
         result = load_result(path)
         return Subject(result.machine, str(given), _nominal(result), result)
-    return Subject(load_mechanism(given).require_rigid_platform(), str(given))
+    return Subject(load_mechanism(given), str(given))
 
 
 def _nominal(result: EarlierResult) -> Machine:

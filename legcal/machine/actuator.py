@@ -8,9 +8,6 @@ A rod of constant length hangs at A, which moves with the reading q of the motor
 a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods may hang on one motor
 (the arm of a Delta carries two): each has the same :class:`Actuator`, known by its joint. An arm
 that is a cylinder (:class:`Arm`) is seen itself: its line turns with A and need not meet it.
-
-A joint inside a platform of several bodies moves B of the rods on one of them in the same way, in
-the frame of the platform. It has no motor, and its coordinate no reading.
 """
 
 from __future__ import annotations
@@ -197,9 +194,6 @@ class Actuator:
     gain: float = 1.0  # true motion over reading
     pulses: Pulses | None = None  # of a hobby servo
     arm: Arm | None = None  # where cameras see it as a cylinder
-    # Of a joint inside a platform, whether the pose of the platform says where it stands. That of
-    # the guide of an I4 does not: it moves together with motors
-    follows: bool = True
 
     @cached_property
     def line(self) -> Line:
@@ -252,12 +246,6 @@ class Actuator:
         sin = cross(self.axis, A - self.point)
         cos = cross(sin, self.axis)
         return A - cos, cos, sin, zero
-
-    def by_reading(self, A: Array) -> Array:
-        """Return how joint centres that are at A (k, 3) move with the reading, (k, 3)."""
-        if not self.turns:
-            return np.broadcast_to(self.gain * self.axis, A.shape)
-        return np.asarray(self.gain * cross(self.axis, A - self.point))
 
     def motion(self, A: Array, q: Array) -> JointMotion:
         """Return the same with its derivatives."""

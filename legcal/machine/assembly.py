@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.lines import cross
 from legcal.geometry.motions import frame_on_points, motion_of
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
@@ -25,9 +25,9 @@ from legcal.machine.description import (
     wrong_lengths,
     wrong_sizes,
 )
-from legcal.machine.equations import pose_equations
-from legcal.machine.leg import EquationKind, Leg, LegColumns, LegKind
-from legcal.machine.rods import actuator_index, actuators_of, reading_of_rod
+from legcal.machine.equations import posture_constraints
+from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
 from legcal.machine.solver import poses_after, solve
 
 TRIALS = 40
@@ -236,15 +236,20 @@ def home_of_description(described: Description) -> Home:
 class _ClosingEquations:
     """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
 
-    Residuals are parts of the machine's size.
+    Unknown are the pose and the readings of motors that carry joints, which stand still where home
+    is at mid-travel. Residuals are parts of the machine's size.
     """
 
     def __init__(self, described: Description, *, mid_travel: bool) -> None:
         self.planar = all_revolute(described)
         self.stated = described.home_readings
-        legs = [_fixed_leg(entry, self.planar, mid_travel, self.stated) for entry in described.legs]
+        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
         self.legs = tuple(leg for leg in legs if leg.n_constraints)
         self.actuators = actuators_of(self.legs)
+        self.still: Array | None = None
+        if mid_travel:
+            middles = [self.stated.get(a.joint, 0.5 * sum(a.travel)) for a in self.actuators]
+            self.still = np.array(middles)
         self.A = np.array([leg.A for leg in legs])
         self.B = np.array([leg.B for leg in legs])
         lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
@@ -253,93 +258,57 @@ class _ClosingEquations:
         turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
         self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
 
-    def __call__(self, poses: Array, readings: Array | None = None) -> tuple[Array, Array]:
-        """Return residuals (k, m) at poses (k, 3, 4) and derivatives (k, m, 6).
-
-        *readings* (n_actuators,) are those of motors that carry joints, if there are any.
-        """
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Return residuals (k, m) and derivatives (k, m, 6 + n) at poses and n readings."""
+        poses, q = points[:, :12].reshape(-1, 3, 4), points[:, 12:]
         if not self.legs:
-            return np.zeros((len(poses), 0)), np.zeros((len(poses), 0, 6))
-        legs = self.legs if readings is None else self._at(readings)
+            return np.zeros((len(q), 0)), np.zeros((len(q), 0, 6))
+        R, t = poses[:, :, :3], poses[:, :, 3]
         with np.errstate(invalid="ignore"):  # a leg without length has no direction
-            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
-        values, by_pose = [found.values / self.size], [found.by_pose / self.size]
+            found = posture_constraints(self.legs, R, t, q)
+        values = [found.values / self.size]
+        slopes = [np.concatenate([found.by_pose, found.by_q], axis=2) / self.size]
+        if self.still is not None:
+            slopes[0][:, :, 6:] = 0.0
         for leg in self.legs if self.planar else ():
             if leg.base_axis is not None and leg.platform_axis is not None:
-                turned = poses[:, :, :3] @ leg.platform_axis
+                turned = R @ leg.platform_axis
                 values.append(cross(leg.base_axis, turned))
                 slope = -cross_matrices(leg.base_axis) @ cross_matrices(turned)
-                by_pose.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
-        return np.concatenate(values, axis=1), np.concatenate(by_pose, axis=1)
+                slopes.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
+        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
 
-    def readings_near(self, T: RigidTransform) -> Array:
-        """Return the readings of the actuators at which the first rod of each reaches a pose."""
+    def readings_at(self, T: RigidTransform) -> Array:
+        """Return the readings (n,) at a pose: those that are still, or reach it by first rods."""
+        if self.still is not None:
+            return self.still
         first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
         found = [_candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators]
         return np.array([both[0] for both in found])
 
-    def _at(self, readings: Array) -> tuple[Leg, ...]:
-        """Return the legs as they stand at readings."""
-        index = actuator_index(self.legs)
-        return tuple(
-            leg if a < 0 else _standing(leg, float(readings[a]))
-            for leg, a in zip(self.legs, index, strict=True)
-        )
+    def _point(self, T: RigidTransform) -> Array:
+        """Return a pose with its readings, (1, 12 + n)."""
+        return np.concatenate([T.as_matrix()[:3].ravel(), self.readings_at(T)])[None]
 
     def residual(self, T: RigidTransform) -> float:
         """Return the largest residual at a pose."""
-        values, _ = self(T.as_matrix()[None, :3], self.readings_near(T))
-        return float(np.abs(values).max(initial=0.0))
+        return float(np.abs(self(self._point(T))[0]).max(initial=0.0))
 
     def nearest(self, T: RigidTransform) -> RigidTransform:
         """Return the nearest pose that closes, as far as steps get nearer to one."""
-        found = solve(
-            self._with_readings,
-            _after,
-            np.concatenate([T.as_matrix()[:3].ravel(), self.readings_near(T)])[None],
-            tolerance=1e-16,
-            unit=self.unit,
-            steps=30,
-        )
+        found = solve(self, _after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30)
         pose = found.points[0, :12].reshape(3, 4)
         return motion_of(pose[:, :3], pose[:, 3])
 
-    def _with_readings(self, points: Array) -> tuple[Array, Array]:
-        """Return residuals (k, m) at poses beside readings (k, 12 + n), and their derivatives."""
-        if not self.actuators:
-            return self(points.reshape(-1, 3, 4))
-        found = [self._at_one(point) for point in points]
-        return np.array([f[0] for f in found]), np.array([f[1] for f in found])
-
-    def _at_one(self, point: Array) -> tuple[Array, Array]:
-        """Return residuals (m,) at one pose beside readings, and derivatives (m, 6 + n)."""
-        pose, readings = point[:12].reshape(1, 3, 4), point[12:]
-        values, by_pose = self(pose, readings)
-        by_q = np.zeros((values.shape[1], len(readings)))
-        legs = self._at(readings)
-        rows = pose_equations(legs, pose[:, :, :3], pose[:, :, 3])
-        index = actuator_index(self.legs)
-        for row, j in enumerate(rows.leg.tolist()):
-            actuator = self.legs[j].actuator
-            if actuator is None:
-                continue
-            local, a = rows.by_local[0, row], index[j]
-            motion = actuator.motion(self.legs[j].A, readings[a : a + 1])
-            by_q[row, a] = local[LegColumns.A] @ motion.by_q[0]
-            axis = legs[j].base_axis
-            if actuator.turns and axis is not None:
-                by_q[row, a] += local[LegColumns.BASE_AXIS] @ normal_basis(axis) @ actuator.axis
-        return values[0], np.concatenate([by_pose[0], by_q / self.size], axis=1)
-
     def describe(self, T: RigidTransform) -> list[str]:
         """Return the residuals at a pose in words."""
-        matrix = T.as_matrix()[None]
-        legs = self._at(self.readings_near(T))
-        found = pose_equations(legs, matrix[:, :3, :3], matrix[:, :3, 3], by_local=False)
+        matrix, q = T.as_matrix()[None], self.readings_at(T)[None]
+        found = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
+        (A,) = joints_at(self.legs, q)
         words, lengths = list[str](), dict[str, list[str]]()  # of legs that are off alike
         for j, kind, value in zip(found.leg, found.kinds, found.values[0], strict=True):
-            leg = legs[j]
-            length = float(np.linalg.norm(T.apply(leg.B) - leg.A))
+            leg = self.legs[j]
+            length = float(np.linalg.norm(T.apply(leg.B) - A[j]))
             if kind is EquationKind.LENGTH:
                 if abs(value) > CLOSED * self.size:
                     off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
@@ -356,13 +325,13 @@ class _ClosingEquations:
         return words or ["axes of a planar mechanism that are not parallel"]
 
 
-def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool, stated: Mapping[str, float]) -> Leg:
+def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
     """Return a leg of the length that home needs, passive where any will do."""
     length = entry.offset if entry.kind is LegKind.CONSTANT else None
     if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
         length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
     z = np.array([0.0, 0.0, 1.0]) if planar else None
-    leg = Leg(
+    return Leg(
         entry.type.base,
         entry.type.platform,
         LegKind.PASSIVE if length is None else LegKind.CONSTANT,
@@ -374,23 +343,6 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool, stated: Mapping[
         travel=(0.0, 0.0) if entry.actuator is None else entry.actuator.travel,
         name=entry.name,
         actuator=entry.actuator,
-    )
-    if mid_travel and entry.actuator is not None:
-        middle = 0.5 * sum(entry.actuator.travel)
-        return _standing(leg, stated.get(entry.actuator.joint, middle))
-    return leg
-
-
-def _standing(leg: Leg, q: float) -> Leg:
-    """Return a rod with its joint at A fixed where its motor holds it at a reading."""
-    if leg.actuator is None:
-        return leg
-    axis, readings = leg.base_axis, np.array([q])
-    return replace(
-        leg,
-        A=leg.actuator.at(leg.A, readings)[0],
-        base_axis=None if axis is None else leg.actuator.rotations(readings)[0] @ axis,
-        actuator=None,
     )
 
 
@@ -491,6 +443,7 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
     n_trials = TRIALS if turning else 8
+    still = np.zeros(0) if closure.still is None else closure.still
     starts = np.zeros((n_trials, 3, 4))
     for trial in range(n_trials):
         shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
@@ -498,14 +451,15 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
         turn = rng.normal(0.0, 0.3, 3) if turning else np.zeros(3)
         starts[trial, :, :3] = Rotation.from_rotvec(turn).as_matrix()
 
-    def equations(poses: Array) -> tuple[Array, Array]:
-        values, by_pose = closure(poses)
-        by_pose[:, :, :3] *= turning
-        return values, by_pose
+    def equations(points: Array) -> tuple[Array, Array]:
+        values, slopes = closure(points)
+        slopes[:, :, :3] *= turning
+        return values, slopes
 
-    found = solve(equations, poses_after, starts, tolerance=1e-15, unit=closure.unit, damped=True)
+    points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
+    found = solve(equations, _after, points, tolerance=1e-15, unit=closure.unit, damped=True)
     best: tuple[float, RigidTransform] | None = None
-    for pose in found.points[found.worst <= CLOSED]:
+    for pose in found.points[found.worst <= CLOSED, :12].reshape(-1, 3, 4):
         T = motion_of(pose[:, :3], pose[:, 3])
         below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
         rank = 10.0 * below + float(T.rotation.magnitude())

@@ -187,26 +187,6 @@ class ClosedChain:
         """Return where the value of a joint stands in a configuration."""
         return self._joints[joint][0]
 
-    def value(self, configuration: Array, joint: str) -> float:
-        """Return the value of a joint of one freedom at a configuration [m or rad]."""
-        start = self.q_index(joint)
-        if not self._is_unbounded(joint):
-            return float(configuration[start])
-        return float(np.arctan2(configuration[start + 1], configuration[start]))
-
-    def with_value(self, configuration: Array, joint: str, value: float) -> Array:
-        """Return a configuration with another value of a joint of one freedom."""
-        start, changed = self.q_index(joint), configuration.copy()
-        if self._is_unbounded(joint):
-            changed[start : start + 2] = np.cos(value), np.sin(value)
-        else:
-            changed[start] = value
-        return changed
-
-    def _is_unbounded(self, joint: str) -> bool:
-        """Say whether a joint turns without end, so that configurations have cosine and sine."""
-        return bool(self._model.joints[self._model.getJointId(joint)].nq == 2)
-
     def v_index(self, joint: str) -> int:
         """Return where the rate of a joint stands in a tangent vector."""
         return self._joints[joint][1]

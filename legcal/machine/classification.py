@@ -6,7 +6,7 @@ each; revolutes along the leg only turn it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,15 +21,29 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
-CONCURRENT = 10e-6  # [m]
+CONCURRENT = 1.5e-5  # of the span of the joints on base or platform: so near, axes meet
 PERPENDICULAR = 1e-3  # [rad]
 
 
+def joint_tolerance(joints: Iterable[Sequence[Array] | Array]) -> float:
+    """Return how far axes that meet may be apart [m], by the joints on base and on platform.
+
+    One joint on each, which is refused later, counts as a machine of a metre.
+    """
+    spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in joints if len(points)]
+    return CONCURRENT * (max(spans, default=0.0) or 1.0)
+
+
 def classify_leg(
-    steps: Sequence[Step], platform_origin: Array, path: Path, motors: Sequence[str] = ()
+    steps: Sequence[Step],
+    platform_origin: Array,
+    path: Path,
+    within: float,
+    motors: Sequence[str] = (),
 ) -> LegChain:
     """Return a leg from its joints; the origin of the platform link is one in the platform's body.
 
+    Axes that meet may be *within* [m] (:func:`joint_tolerance`) of each other.
     Where the first of its joints is one of the *motors* and the others make a rod with a joint at
     each end, the rod hangs on what this motor moves.
 
@@ -52,9 +66,9 @@ def classify_leg(
     try:
         if hangs:
             _check_rod_alone(steps, motors, leg)
-            slider, (n_lower, ends) = None, _rod(axes[1:], leg, on=axes[0].name)
+            slider, (n_lower, ends) = None, _rod(axes[1:], leg, within, axes[0].name)
             chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, slider, *ends, steps[0])
-            _check_moves(chain, axes[0])
+            _check_moves(chain, axes[0], within)
             return chain
         if len(sliders) > 1 or 0 in sliders:
             found = (
@@ -71,9 +85,10 @@ def classify_leg(
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
             n_lower, slider = sliders[0], steps[sliders[0]]
-            ends = _telescope(axes, n_lower, -1.0 if slider.near else 1.0, origin, leg)
+            towards = -1.0 if slider.near else 1.0
+            ends = _telescope(axes, n_lower, towards, origin, leg, within)
         else:
-            slider, (n_lower, ends) = None, _rod(axes, leg)
+            slider, (n_lower, ends) = None, _rod(axes, leg, within)
     except OutOfClass as error:
         raise OutOfClass([f"{path}: {problem}" for problem in error.problems]) from error
     return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
@@ -109,7 +124,7 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
         )
 
 
-def _check_moves(chain: LegChain, axis: Axis) -> None:
+def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
     """Check that an actuator that turns moves the joint at A.
 
     Raises
@@ -118,7 +133,7 @@ def _check_moves(chain: LegChain, axis: Axis) -> None:
         If A is on its axis.
     """
     turns = chain.steps[0].connection.type == "revolute"
-    if turns and axis.distance(chain.A) < CONCURRENT:
+    if turns and axis.distance(chain.A) < within:
         raise OutOfClass(
             f"the leg of motor '{axis.name}' is outside the method: found the joint at A on the "
             "axis of the motor, which turns the rod and does not move its joint, needed an arm "
@@ -127,63 +142,24 @@ def _check_moves(chain: LegChain, axis: Axis) -> None:
         )
 
 
-def check_carried(chain: LegChain, carrier: Step, path: Path) -> None:
-    """Check that a leg which ends on a body that the platform carries is a rod of the class.
-
-    Raises
-    ------
-    OutOfClass
-        If it hangs on no motor, or does not turn freely about B.
-    """
-    if chain.actuator is not None and chain.platform.type is JointType.SPHERICAL:
-        return
-    found = (
-        f"a joint {chain.platform.type.value or 'that is fixed'} at its end"
-        if chain.actuator is not None
-        else "no motor on the base that moves its joint at A"
-    )
-    name = next((s.connection.joint for s in chain.steps if s.connection.joint), "")
-    raise OutOfClass(
-        f"{path}: the leg of joint '{name}' is outside the method: it ends on a body that the "
-        f"platform carries by joint '{carrier.name}', and found {found}, needed a rod on a "
-        "carriage or an arm with a spherical joint there; this machine cannot be calibrated this "
-        "way."
-    )
-
-
 def actuator_of(
-    chain: LegChain, T_base: Array, travel: tuple[float, float], link: str
+    chain: LegChain, T_body_base: Array, travel: tuple[float, float], link: str
 ) -> Actuator | None:
-    """Return what the rod of a chain hangs on, in the base link at T_base in its body."""
-    return (
-        None if chain.actuator is None else _carrier(chain.actuator, chain.A, T_base, travel, link)
-    )
-
-
-def internal_joint_of(
-    chain: LegChain, T_platform: Array, travel: tuple[float, float], link: str
-) -> Actuator | None:
-    """Return what carries B of a chain, in the platform link at T_platform in its body."""
-    if chain.internal is None:
+    """Return what the rod of a chain hangs on, in the base link, at T_body_base in its body."""
+    step = chain.actuator
+    if step is None:
         return None
-    return _carrier(chain.internal, chain.B_platform, T_platform, travel, link)
-
-
-def _carrier(
-    step: Step, centre: Array, T_body_link: Array, travel: tuple[float, float], link: str
-) -> Actuator:
-    """Return a joint of base or platform that carries a joint centre in its body."""
-    inverse = matrix_inverse(T_body_link)
+    inverse = matrix_inverse(T_body_base)
     point, axis = step.line(step.near)
     sign = 1.0 if step.near == 0 else -1.0  # a joint moves its child
-    centre, at = matrix_applied(inverse, centre), matrix_applied(inverse, point)
+    A, at = matrix_applied(inverse, chain.A), matrix_applied(inverse, point)
     direction = sign * (inverse[:3, :3] @ axis)
     turns = step.connection.type == "revolute"
     return Actuator(
         joint=str(step.connection.joint),
         kind=ActuatorKind.REVOLUTE if turns else ActuatorKind.PRISMATIC,
         axis=direction,
-        point=at + ((centre - at) @ direction) * direction if turns else at,
+        point=at + ((A - at) @ direction) * direction if turns else at,
         travel=travel,
         link=link,
     )
@@ -199,7 +175,6 @@ def leg_of(
     spatial: bool,
     home: RigidTransform | None,
     actuator: Actuator | None = None,
-    internal: Actuator | None = None,
 ) -> Leg:
     """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
 
@@ -236,7 +211,6 @@ def leg_of(
         travel=travel,
         chain=chain,
         actuator=actuator,
-        internal=internal,
     )
 
 
@@ -279,7 +253,7 @@ def _twist(
 LegEnds = tuple[Pivot, Pivot, Array, Array, Array, int]  # base, platform, A, B, u, idle spins
 
 
-def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
+def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -> Pivot:
     """Return the joint that consecutive spheres and revolutes make, from their geometry.
 
     Three or more revolutes whose axes meet in one point are an S, two that meet at right angles a
@@ -289,12 +263,13 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     Raises
     ------
     OutOfClass
-        If the axes do not meet within 10 um, or a U is not at right angles.
+        If the axes do not meet *within* so much [m], or a U is not at right angles.
     """
     spheres = [axis for axis in axes if axis.direction is None]
     if spheres:
-        return _about_sphere(spheres[0], [axis for axis in axes if axis is not spheres[0]], leg)
-    lines = _distinct(axes)
+        others = [axis for axis in axes if axis is not spheres[0]]
+        return _about_sphere(spheres[0], others, leg, within)
+    lines = _distinct(axes, within)
     spare = len(axes) - len(lines)
     spins: tuple[Axis, ...] = ()
     if along is not None and 1 <= len(lines) <= 2 and parallel(lines[-1].along, along):
@@ -303,7 +278,7 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     if len(lines) < 2:
         turns = JointType.REVOLUTE if lines else JointType.FIXED
         return Pivot(turns, None, tuple(lines), spins, spare)
-    centre = _meeting(lines, leg)
+    centre = _meeting(lines, leg, within)
     if len(lines) > 2:
         return Pivot(JointType.SPHERICAL, centre, (), (), spare + len(lines) - 3)
     tilt = off_square(lines[0].along, lines[1].along)
@@ -316,51 +291,53 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     return Pivot(JointType.UNIVERSAL, centre, tuple(lines), (), spare)
 
 
-def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
+def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str, within: float) -> Pivot:
     """Return an S joint made of a sphere and revolutes through its centre."""
     for axis in others:
         miss = axis.distance(sphere.point)
-        if miss > CONCURRENT:
+        if miss > within:
             raise OutOfClass(
                 f"leg '{leg}' could not be classified: the axis of '{axis.name}' misses the centre "
                 f"of {sphere.name} by {1e3 * miss:.4g} mm, needed one joint at each end of the leg "
-                "within 0.01 mm; correct their origins."
+                f"within {1e3 * within:.2g} mm; correct their origins."
             )
     return Pivot(JointType.SPHERICAL, sphere.point, (), (), len(others))
 
 
-def _distinct(axes: Sequence[Axis]) -> list[Axis]:
+def _distinct(axes: Sequence[Axis], within: float) -> list[Axis]:
     """Return axes, each only once where neighbours are one line."""
     lines: list[Axis] = []
     for axis in axes:
         same = (
             lines
             and parallel(lines[-1].along, axis.along)
-            and lines[-1].distance(axis.point) <= CONCURRENT
+            and lines[-1].distance(axis.point) <= within
         )
         if not same:
             lines.append(axis)
     return lines
 
 
-def _meeting(lines: Sequence[Axis], leg: str) -> Array:
+def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
     """Return the one point where axes meet [m]."""
     points = []
     for one, two in pairwise(lines):
         near, far = nearest(one, two)
         gap = None if near is None or far is None else float(np.linalg.norm(far - near))
-        if near is None or gap is None or gap > CONCURRENT:
+        if near is None or gap is None or gap > within:
             found = "are parallel" if gap is None else f"miss each other by {1e3 * gap:.4g} mm"
             raise OutOfClass(
                 f"leg '{leg}' could not be classified: the axes of '{one.name}' and '{two.name}' "
-                f"{found}, needed axes that meet within 0.01 mm; correct their origins."
+                f"{found}, needed axes that meet within {1e3 * within:.2g} mm; correct their "
+                "origins."
             )
         points.append(near)
     apart = max(float(np.linalg.norm(point - points[0])) for point in points)
-    if apart > CONCURRENT:
+    if apart > within:
         raise OutOfClass(
             f"leg '{leg}' could not be classified: the axes of {_names(lines)} meet in two points "
-            f"{1e3 * apart:.4g} mm apart, needed one point within 0.01 mm; correct their origins."
+            f"{1e3 * apart:.4g} mm apart, needed one point within {1e3 * within:.2g} mm; correct "
+            "their origins."
         )
     return points[0]
 
@@ -450,7 +427,9 @@ def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
                 )
 
 
-def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, LegEnds]:
+def _rod(
+    axes: Sequence[Axis], leg: str, within: float, on: str | None = None
+) -> tuple[int, LegEnds]:
     """Return how many joints of a leg without slider are at the base, and its ends.
 
     A revolute along the rod passes through both centres, and may belong to either joint: the one
@@ -465,7 +444,7 @@ def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, Le
     problems: dict[int, OutOfClass] = {}
     for n_lower in range(1, len(axes)):
         try:
-            ends = _split_rod(axes, n_lower, leg)
+            ends = _split_rod(axes, n_lower, leg, within)
         except OutOfClass as error:
             problems[n_lower] = error
             continue
@@ -476,7 +455,7 @@ def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, Le
     if found:
         _, n_lower, ends = min(found, key=lambda split: split[:2])
         return n_lower, ends
-    places = _places(axes)
+    places = _places(axes, within)
     if len(places) == 2:
         raise problems[len(places[0])]
     what = (
@@ -499,18 +478,18 @@ def _rod(axes: Sequence[Axis], leg: str, on: str | None = None) -> tuple[int, Le
     )
 
 
-def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> LegEnds:
+def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> LegEnds:
     """Return the ends of a rod whose first joints are at the base."""
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
-    A, B = _on_rod(_pivot(lower, None, leg), _pivot(upper, None, leg))
+    A, B = _on_rod(_pivot(lower, None, leg, within), _pivot(upper, None, leg, within))
     length = float(np.linalg.norm(B - A))
-    if length < CONCURRENT:
+    if length < within:
         raise OutOfClass(
             f"the leg of joint '{leg}' is outside the method: found both its joints in one "
             "point, needed a distance between them; correct their origins."
         )
     u = (B - A) / length
-    base, platform = _pivot(lower, u, leg), _pivot(upper, u, leg)
+    base, platform = _pivot(lower, u, leg, within), _pivot(upper, u, leg, within)
     base, platform, idle_spins = _with_spins(base, platform, leg)
     if platform.type is JointType.FIXED:
         raise OutOfClass(
@@ -538,20 +517,18 @@ def _on_rod(base: Pivot, platform: Pivot) -> tuple[Array, Array]:
     return A, B
 
 
-def _places(axes: Sequence[Axis]) -> list[list[Axis]]:
+def _places(axes: Sequence[Axis], within: float) -> list[list[Axis]]:
     """Split the joints of a leg without slider where their axes stop meeting."""
     places = [[axes[0]]]
     for axis in axes[1:]:
         last = places[-1]
         if axis.direction is None or last[-1].direction is None:
             line, sphere = (axis, last[-1]) if last[-1].direction is None else (last[-1], axis)
-            meets = line.distance(sphere.point) <= CONCURRENT
+            meets = line.distance(sphere.point) <= within
         else:
             near, far = nearest(last[-1], axis)
             meets = (
-                near is not None
-                and far is not None
-                and float(np.linalg.norm(near - far)) <= CONCURRENT
+                near is not None and far is not None and float(np.linalg.norm(near - far)) <= within
             )
         if meets:
             last.append(axis)
@@ -569,7 +546,12 @@ _END = {
 
 
 def _telescope(
-    axes: Sequence[Axis], slider: int, towards: float, platform_origin: Array, leg: str
+    axes: Sequence[Axis],
+    slider: int,
+    towards: float,
+    platform_origin: Array,
+    leg: str,
+    within: float,
 ) -> LegEnds:
     """Return the ends of a leg whose slider, one of its joints, moves *towards* along its axis.
 
@@ -580,11 +562,11 @@ def _telescope(
     Raises
     ------
     OutOfClass
-        If that line misses a joint by more than 10 um, or an axis is not square to it.
+        If that line does not pass *within* so much [m] of a joint, or an axis is not square to it.
     """
     u = towards * axes[slider].along  # a joint moves its child
-    base = _pivot(axes[:slider], u, leg)
-    platform = _pivot(axes[:slider:-1], u, leg)
+    base = _pivot(axes[:slider], u, leg, within)
+    platform = _pivot(axes[:slider:-1], u, leg, within)
     base, platform, idle_spins = _with_spins(base, platform, leg)
     origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
@@ -592,11 +574,11 @@ def _telescope(
     for spin in (*base.spins, *platform.spins):
         if spin.distance(A) > miss:
             miss, what = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
-    if miss > CONCURRENT:
+    if miss > within:
         raise OutOfClass(
             f"the leg of slider '{axes[slider].name}' is outside the method: {what} "
             f"{'axis' if base.centre is None else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
-            "0.01 mm; correct the origins along the leg."
+            f"{1e3 * within:.2g} mm; correct the origins along the leg."
         )
     if platform.type is JointType.FIXED:
         B = A + ((platform_origin - A) @ u) * u

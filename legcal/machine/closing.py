@@ -9,11 +9,11 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.mobility import CLOSED, leg_scale
-from legcal.machine.model import Machine, internal_coordinates, readings_at, slider_columns
+from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve
 
 POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
-AXIS_TOLERANCE = 2e-3  # [m, rad]: what axes may be off; no other posture of a leg is as near
+AXIS_TOLERANCE = 2e-3  # [rad], and of a leg: what axes may be off; no other posture is as near
 RESTARTS = 60
 
 
@@ -38,19 +38,19 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    chain, tolerance = machine.chain, POSE_TOLERANCE if exact else AXIS_TOLERANCE
+    chain, metre = machine.chain, leg_scale(machine, T_base_platform)
+    tolerance = (
+        (POSE_TOLERANCE, POSE_TOLERANCE) if exact else (AXIS_TOLERANCE * metre, AXIS_TOLERANCE)
+    )
     angles = np.zeros(chain.nv, dtype=np.bool_)
     for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous", "prismatic"):
             angles[chain.v_index(joint.name)] = True
     set_first = slider_columns(machine, range(machine.n_legs))[1]
-    set_first += [chain.v_index(joint.joint) for joint in machine.internal_joints]
     angles[set_first] = False
-    # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
-    # weigh too little to be closed, and AXIS_TOLERANCE would be a large part of a leg.
-    metre = min(1.0, leg_scale(machine, T_base_platform))
     configuration = _placed(machine, T_base_platform, start, tolerance)
     rng = np.random.default_rng(20020701)
+    # Gaps count in leg lengths: those of short legs would weigh too little beside angles.
     for _ in range(restarts):
         equations, retract = closure_equations(machine, T_base_platform, metre, angles)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
@@ -74,7 +74,7 @@ def close_at(
     off = _off(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
         problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
-    elif max(off) > tolerance:
+    elif off[0] > tolerance[0] or off[1] > tolerance[1]:
         problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:
         return configuration
@@ -93,7 +93,10 @@ def worst_closure(machine: Machine, residual: Array) -> str:
 
 
 def _placed(
-    machine: Machine, T_base_platform: RigidTransform, start: Array | None, tolerance: float
+    machine: Machine,
+    T_base_platform: RigidTransform,
+    start: Array | None,
+    tolerance: tuple[float, float],
 ) -> Array:
     """Return a configuration with the platform and the sliders set."""
     chain = machine.chain
@@ -107,7 +110,7 @@ def _placed(
             T_base_platform,
         )
         off = _off(machine, T_base_platform, configuration)
-        if max(off) > tolerance:
+        if off[0] > tolerance[0] or off[1] > tolerance[1]:
             raise _not_closed(
                 machine,
                 T_base_platform,
@@ -117,10 +120,6 @@ def _placed(
     q = readings_at(machine, T_base_platform)
     sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
     configuration[slider_columns(machine, sliding)[0]] = q[sliding]
-    if machine.internal_joints:
-        s = internal_coordinates(machine, T_base_platform.as_matrix()[None])[0]
-        for joint, value in zip(machine.internal_joints, s.tolist(), strict=True):
-            configuration = chain.with_value(configuration, joint.joint, value)
     return configuration
 
 
@@ -177,5 +176,5 @@ def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str)
     place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
     return DidNotConverge(
         f"{machine.yaml_path}: the legs could not be closed with the platform at {place} mm: "
-        f"{problem}; check that the legs reach this pose (legcal.home)."
+        f"{problem}; check that the legs reach this pose ({machine.urdf.wording.home})."
     )

@@ -30,7 +30,7 @@ from legcal.machine.model import (
     slider_columns,
 )
 from legcal.machine.redundancy import determining_readings
-from legcal.machine.rods import actuator_index, coordinates_at, first_rods, internal_joints_of
+from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.machine.solved_poses import solve_poses
 from legcal.machine.solver import RANK, poses_after
 
@@ -147,7 +147,7 @@ def _require(machine: Machine, count: int, found: int) -> None:
         raise DidNotConverge(
             f"{machine.yaml_path}: random poses could not be drawn: found {found} of "
             f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
-            "legcal.home and the limits of the sliders."
+            f"{machine.urdf.wording.home} and the limits of the sliders."
         )
 
 
@@ -315,11 +315,10 @@ def random_postures_of_legs(
     travel: Array,
     count: int,
     rng: np.random.Generator,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array]:
     """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
 
-    With them come the readings of actuators and internal coordinates there, (count, n); internal
-    joints too are inside their travel. Poses are those of legs in R_b and R_e that no file
+    Poses are those of legs in R_b and R_e that no file
     describes: many at once, without a chain. *home* is T_Rb_Re near a closed pose of the wanted
     assembly mode, *travel* (n_legs, 2) the shortest and longest length of each leg [m], equal for
     legs of constant length; of rods on actuators the least and largest reading of these [m or rad].
@@ -332,10 +331,11 @@ def random_postures_of_legs(
     start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
     drive = _Drive(legs, frame_legs, start.R, start.t)
     at_home = drive.values(start.R, start.t)[0]
-    slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
+    rounding = NEARLY_CLOSED * float(drive.lengths(start.R, start.t).mean())
+    slack = rounding + 0.05 * (travel[:, 1] - travel[:, 0])
     low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
     high = np.maximum(travel[:, 1], at_home) + slack
-    found = start.R[:0], start.t[:0], drive.moving(start.R, start.t, None)[:0]
+    found = start.R[:0], start.t[:0]
     share, tried, near_singular = 1.0, 0, 0
     for _ in range(ATTEMPTS):
         n = 2 * (count - len(found[1])) + 10
@@ -345,21 +345,14 @@ def random_postures_of_legs(
         first, good = drive.values(R, t), np.ones(n, dtype=np.bool_)
         for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
             R, t = drive.closed(R, t, first + part * (wanted - first), STEPS)
-            good &= drive.is_regular(R, t, first + part * (wanted - first))
+            good &= drive.is_regular(R, t)
         tried, near_singular = tried + n, near_singular + int(np.sum(~good))
         R, t = drive.closed(R, t, wanted, LAST_STEPS)
-        values = drive.values(R, t, wanted)
+        values = drive.values(R, t)
         good &= drive.is_closed(R, t, wanted) & np.all((values >= low) & (values <= high), axis=1)
-        moving = drive.moving(R, t, wanted)
-        good &= drive.is_inside(moving)
-        new = R[good], t[good], moving[good]
-        found = (
-            np.concatenate([found[0], new[0]]),
-            np.concatenate([found[1], new[1]]),
-            np.concatenate([found[2], new[2]]),
-        )
+        found = np.concatenate([found[0], R[good]]), np.concatenate([found[1], t[good]])
         if len(found[1]) >= count:
-            return found[0][:count], found[1][:count], found[2][:count]
+            return found[0][:count], found[1][:count]
         share = max(SHRINKING * share, MIN_SHARE)
     said = f"found {len(found[1])} of {count} random poses inside the travel"
     if 2 * near_singular > tried and drive.hold() < LOOSE:
@@ -385,7 +378,6 @@ class _Drive:
         self.legs, self.frame_legs, self.R, self.t = tuple(legs), frame_legs, R, t
         self.columns = list(freedoms(frame_legs))
         self.on = np.array(actuator_index(legs), dtype=np.intp)
-        self.internal = internal_joints_of(legs)
         each = np.arange(len(legs))
         # The leg whose value each has: of rods on one actuator the first
         self.first = np.array(
@@ -402,7 +394,6 @@ class _Drive:
             for J in (every, constrained)
         )
         count = rank_every - rank_constrained
-        count += sum(not joint.follows for joint in self.internal)  # these have motors too
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
             found = pose_equations(legs, R, t, by_local=False)
@@ -419,49 +410,27 @@ class _Drive:
         lengths = np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2)
         return np.asarray(np.where(self.on < 0, lengths, [leg.q0 for leg in self.legs]))
 
-    def values(self, R: Array, t: Array, wanted: Array | None = None) -> Array:
-        """Return the values of legs, (k, n_legs) [m or rad], where motors have *wanted* ones."""
+    def values(self, R: Array, t: Array) -> Array:
+        """Return the values of legs, (k, n_legs) [m or rad]."""
         values = self.lengths(R, t)
         if self.on.max(initial=-1) >= 0:
             carried = self.on >= 0
-            values[:, carried] = self.moving(R, t, wanted)[:, self.on[carried]]
+            values[:, carried] = readings_of_rods(self.legs, R, t)[:, self.on[carried]]
         return values
-
-    def moving(self, R: Array, t: Array, wanted: Array | None) -> Array:
-        """Return readings of actuators and internal coordinates, (k, n).
-
-        Where the platform has several bodies motors have *wanted* readings, if these are given:
-        poses need not say them.
-        """
-        if wanted is None or not self.internal:
-            return coordinates_at(self.legs, R, t)
-        return coordinates_at(self.legs, R, t, wanted[:, first_rods(self.legs)])
-
-    def is_inside(self, moving: Array) -> BoolArray:
-        """Return where the joints inside the platform are inside their travel, (k,)."""
-        s = moving[:, moving.shape[1] - len(self.internal) :]
-        low, high = np.array([joint.travel for joint in self.internal]).reshape(-1, 2).T
-        return np.asarray(np.all((s >= low) & (s <= high), axis=1))
 
     def lengthening(self, wanted: Array) -> Array:
         """Return s q, or q of actuators, at wanted values (k, n_legs) of driven motors, or NaN."""
         driven = np.isin(self.first, self.driven)
         return np.asarray(np.where(driven, wanted - self.zero, np.nan))
 
-    def equations(self, R: Array, t: Array, wanted: Array | None = None) -> PoseEquations:
-        """Return what poses must satisfy: the constraints, and the lengths of driven motors.
-
-        *wanted* readings matter where poses leave joints inside the platform free.
-        """
-        if self.internal and len(self.driven):
-            at = self.values(R, t) if wanted is None else wanted
-            return equations_at_readings(self.legs, R, t, self.lengthening(at))
+    def equations(self, R: Array, t: Array) -> PoseEquations:
+        """Return what poses must satisfy: the constraints, and the lengths of driven motors."""
         found = pose_equations(self.legs, R, t, by_local=False)
         return found.of(~found.measured | np.isin(found.leg, self.driven))
 
-    def slopes(self, R: Array, t: Array, wanted: Array | None = None) -> Array:
+    def slopes(self, R: Array, t: Array) -> Array:
         """Return their derivatives (k, m, f) by the possible motions."""
-        return self.equations(R, t, wanted).by_pose[:, :, self.columns]
+        return self.equations(R, t).by_pose[:, :, self.columns]
 
     def hold(self) -> float:
         """Return how well motors and joints hold the platform at home: 0 where singular."""
@@ -497,9 +466,9 @@ class _Drive:
         missed = equations_at_readings(self.legs, R, t, self.lengthening(wanted)).values
         return np.asarray(np.abs(missed).max(axis=1, initial=0.0) <= limit)
 
-    def is_regular(self, R: Array, t: Array, wanted: Array) -> BoolArray:
+    def is_regular(self, R: Array, t: Array) -> BoolArray:
         """Return which poses are as far from singular as a share of home is, on the same side."""
-        J, J0 = self.slopes(R, t, wanted), self.slopes(self.R, self.t)
+        J, J0 = self.slopes(R, t), self.slopes(self.R, self.t)
         if J.shape[1] == 0:
             return np.ones(len(t), dtype=np.bool_)
         s, s0 = np.linalg.svd(J, compute_uv=False), np.linalg.svd(J0, compute_uv=False)[0]

@@ -15,11 +15,12 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_produ
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm, Line
 from legcal.machine.bodies import Bodies
+from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.urdf import Urdf, origins_of, parse_robot
 
 PARALLEL = 1e-6
-COAXIAL = 1e-4  # [m], at both ends of a cylinder
+COAXIAL = 10.0  # times the tolerance of joints, at both ends of a cylinder
 
 Half = tuple[Literal["base", "platform"], Array, Array]
 
@@ -33,6 +34,12 @@ class VisualCylinder(NamedTuple):
     length: float
 
 
+def coaxial_tolerance(legs: Sequence[Leg] | Sequence[LegChain]) -> float:
+    """Return how far the ends of a cylinder along a leg may be from its axis [m]."""
+    joints = ([leg.A for leg in legs], [leg.B for leg in legs])
+    return COAXIAL * joint_tolerance(joints)
+
+
 def with_cylinders(
     legs: Sequence[Leg],
     shown: Sequence[VisualCylinder],
@@ -43,8 +50,11 @@ def with_cylinders(
     A cylinder counts on every link that moves rigidly with the base or the platform half of the
     leg, or only turns about the leg's axis.
     """
+    within = coaxial_tolerance(legs)
     return tuple(
-        leg if leg.chain is None else replace(leg, cylinders=_along(leg, leg.chain, shown, bodies))
+        leg
+        if leg.chain is None
+        else replace(leg, cylinders=_along(leg, leg.chain, shown, bodies, within))
         for leg in legs
     )
 
@@ -57,6 +67,7 @@ def with_arms(
     It is the longest cylinder on what a motor turns that is not about the motor's own axis.
     """
     arms: dict[str, Actuator] = {}
+    within = coaxial_tolerance(legs)
     for leg in legs:
         actuator, chain = leg.actuator, leg.chain
         if actuator is None or chain is None or not actuator.turns or actuator.joint in arms:
@@ -64,11 +75,17 @@ def with_arms(
         T = matrix_product(matrix_inverse(T_body_base), matrix_inverse(chain.poses[0]))
         T_base_arm = matrix_product(T, chain.poses[1])
         found = [
-            _arm(cylinder, matrix_applied(T_base_arm, _ends(cylinder, bodies)), actuator, leg.name)
+            _arm(
+                cylinder,
+                matrix_applied(T_base_arm, _ends(cylinder, bodies)),
+                actuator,
+                leg.name,
+                within,
+            )
             for cylinder in shown
             if bodies.body_of[cylinder.link] == chain.bodies[0]
         ]
-        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > COAXIAL]
+        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > within]
         longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
         arms[actuator.joint] = replace(actuator, arm=longest)
     return tuple(
@@ -79,10 +96,10 @@ def with_arms(
     )
 
 
-def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str) -> Arm:
+def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str, within: float) -> Arm:
     """Return a cylinder with ends (2, 3) as an arm, from the axis of its motor outwards."""
     near, far = _from_axis(ends, actuator)
-    first, last = ends if near <= far + COAXIAL else ends[::-1]
+    first, last = ends if near <= far + within else ends[::-1]
     line = Line(0.5 * (first + last), (last - first) / cylinder.length)
     return Arm(line, cylinder.length, cylinder.radius, cylinder.link, leg)
 
@@ -100,7 +117,8 @@ def at_visible_heights(
     A leg without a cylinder over its axis stays where its slider, or its joint at the base, has its
     origin.
     """
-    return [_raised(chain, shown, bodies) for chain in chains]
+    within = coaxial_tolerance(chains)
+    return [_raised(chain, shown, bodies, within) for chain in chains]
 
 
 def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
@@ -120,9 +138,9 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
 
 
 def _along(
-    leg: Leg, chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies
+    leg: Leg, chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies, within: float
 ) -> tuple[Cylinder, ...]:
-    """Return the cylinders along one leg."""
+    """Return the cylinders along one leg, *within* so much [m] of its axis."""
     halves = _halves(leg, chain)
     found = []
     for cylinder in shown:
@@ -131,7 +149,7 @@ def _along(
         side, origin, u = halves[bodies.body_of[cylinder.link]]
         ends = _ends(cylinder, bodies) - origin
         along = ends @ u
-        if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL:
+        if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < within:
             start, end = sorted(float(x) for x in along)
             found.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
     return tuple(found)
@@ -164,7 +182,9 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
     return halves
 
 
-def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) -> LegChain:
+def _raised(
+    chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies, within: float
+) -> LegChain:
     """Return one leg with both centres at the height of its cylinder along the joints' axes."""
     if chain.platform.type is not JointType.REVOLUTE or len(chain.steps) != 2 + (
         chain.slider is not None
@@ -178,7 +198,7 @@ def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) ->
                 offset = matrix_applied(chain.poses[k], _ends(cylinder, bodies)) - centre
                 height = float((offset @ normal).mean())
                 beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
-                if np.linalg.norm(beside, axis=1).max() < COAXIAL:
+                if np.linalg.norm(beside, axis=1).max() < within:
                     found.append((cylinder.length, height))
     if not found:
         return chain

@@ -1,4 +1,4 @@
-"""A machine as a table or a family describes it, and what cannot be in one."""
+"""A machine as a table describes it, and what cannot be in one."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -88,10 +88,10 @@ class LegEntry:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A machine as described by a table or a family."""
+    """A machine as described by a table."""
 
     name: str  # the name of the model and of its files
-    source: str  # where it was described, for messages: a path, or the family
+    source: str  # where it was described, for messages: a path, or --family
     unit: str  # the unit in which it was described, for messages
     legs: tuple[LegEntry, ...]  # the legs in order
     home: "Home | None"  # T_base_platform of a pose in which it closes
@@ -178,8 +178,8 @@ def look_like_base(described: Description) -> list[str]:
         f"{described.source}: platform_joints could not be used: found joints around "
         f"({', '.join(f'{x:g}' for x in middle)}) mm, as far from the base joints as legs are "
         "long, which look like coordinates of the base at home, needed coordinates of the "
-        "platform; say which they are with --platform-in base (or platform_in: base), or with "
-        "--platform-in platform if they are right."
+        "platform; write platform_in: base in the table (in a CSV a column platform_in), or "
+        "platform_in: platform if they are right."
     ]
 
 

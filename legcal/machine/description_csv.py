@@ -60,7 +60,10 @@ _NUMBERS = (
     *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
 COLUMNS = (
-    *(Column(name, "text", required=False) for name in ("leg", "type", "kind", "unit", "hangs_on")),
+    *(
+        Column(name, "text", required=False)
+        for name in ("leg", "type", "kind", "unit", "hangs_on", "platform_in")
+    ),
     *(
         Column(
             name,
@@ -103,6 +106,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "legcal_table": 1,
         "name": path.stem,
         "unit": _unit(table, unit),
+        "platform_in": _shared(table, "platform_in"),
         "types": cells.texts("type") if "type" in table else None,
         "base_joints": cells.points("base"),
         "platform_joints": cells.points("platform"),
@@ -196,20 +200,26 @@ def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict
     return {"actuators": actuators, **{key: stated for key, stated in readings.items() if stated}}
 
 
-def _unit(table: Table, given: str | None) -> str:
-    """Return the unit of the column, or the given one."""
-    stated = sorted(set(filter(None, table.text("unit"))))
+def _shared(table: Table, name: str) -> str | None:
+    """Return what a column says that has the same text in all rows, None for an empty one."""
+    stated = sorted(set(filter(None, table.text(name))))
     if len(stated) > 1:
         raise DatasetError(
-            f"{table.path}: the unit could not be decided: found {' and '.join(stated)}, needed "
-            "the same in all lines; correct the column 'unit'."
+            f"{table.path}: the {name} could not be decided: found {' and '.join(stated)}, needed "
+            f"the same in all lines; correct the column '{name}'."
         )
-    if not stated and given is None:
+    return stated[0] if stated else None
+
+
+def _unit(table: Table, given: str | None) -> str:
+    """Return the unit of the column, or the given one."""
+    stated = _shared(table, "unit") or given
+    if stated is None:
         raise DatasetError(
             f"{table.path}: the lengths could not be read: found no unit, needed m or mm; "
             "add a column 'unit', or give --unit mm."
         )
-    return stated[0] if stated else str(given)
+    return stated
 
 
 def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:

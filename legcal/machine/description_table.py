@@ -338,15 +338,13 @@ class TableFile(FileSchema):
 
 OPTIONS = {
     "type": "--type",
-    "offsets": "--offset",
-    "travel": "--travel",
     "min_length": "--min-length",
     "max_length": "--max-length",
     "radius": "--leg-radius",
     "home": "--height",
-    "platform_in": "--platform-in",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
+_SAME = 1e-6  # of the span of the joints: so near, joints are one
 
 
 def read_description(
@@ -377,25 +375,39 @@ def read_description(
                 found["name"] = name
             if unit is not None:
                 found.setdefault("unit", unit)
-        _refuse_twice(path, found, given)
-        if "version" in found and "legcal_table" not in found:
-            raise ModelError(
-                f"{path}: the table could not be read: found version: {found['version']}, needed "
-                "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
-                "place."
-            )
-        file = validate(TableFile, {**found, **given}, path)
     except DatasetError as error:
         raise ModelError(error.problems) from error
-    if unit is not None and unit != file.unit:
+    _refuse_twice(path, found, given)
+    if "version" in found and "legcal_table" not in found:
         raise ModelError(
-            f"{path}: the unit could not be decided: found --unit {unit} and '{file.unit}' in the "
-            "table, needed one of them; leave out --unit."
+            f"{path}: the table could not be read: found version: {found['version']}, needed "
+            "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
+            "place."
         )
-    problems = _conflicting_entries(file, str(path))
+    if unit is not None and found.get("unit", unit) != unit:
+        raise ModelError(
+            f"{path}: the unit could not be decided: found --unit {unit} and "
+            f"{describe(found['unit'])} in the table, needed one of them; leave out --unit."
+        )
+    return described_machine({**found, **given}, path)
+
+
+def described_machine(table: Mapping[str, Any], source: Path) -> Description:
+    """Return the machine of a table as YAML has it; messages name its source.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each entry that cannot be, or does not fit the others.
+    """
+    try:
+        file = validate(TableFile, table, source)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+    problems = _conflicting_entries(file, str(source))
     if problems:
         raise ModelError(problems)
-    description = _description(file, str(path))
+    description = _description(file, str(source))
     problems = _impossible_legs(description)
     if not problems and file.platform_in is None:
         problems = look_like_base(description)
@@ -821,20 +833,21 @@ def _impossible_legs(described: Description) -> list[str]:
     ]
     # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
+    A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
+    spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
     for j, one in enumerate(legs):
         for two in legs[j + 1 :]:
             gap = max(
                 float(np.linalg.norm(one.A_base - two.A_base)),
                 float(np.linalg.norm(one.B_platform - two.B_platform)),
             )
-            if gap < 1e-6:
+            if gap <= _SAME * max(spans):
                 problems.append(
                     f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
                     "found both between the same two points, needed different joints; correct "
                     "their rows."
                 )
-    if any(float(np.ptp([getattr(leg, s) for leg in legs], axis=0).max()) < 1e-6 for s in
-           ("A_base", "B_platform")):  # fmt: skip
+    if min(spans) <= _SAME * max(spans):
         problems.append(
             f"{described.source}: the joints could not be used: found all of one side in one "
             "point, needed them spread out; correct base_joints or platform_joints."

@@ -8,7 +8,7 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.ties import ties_in_words
 
-_AT_MIDDLE = 1e-6  # [m, rad]
+_AT_MIDDLE = 1e-6  # of the travel
 _MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
@@ -17,14 +17,15 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
     notes = []
     q = readings_at(machine, machine.home)
     if not home_is_given:
-        away = [q[j] - 0.5 * sum(machine.legs[j].travel) for j in machine.motors]
+        travels = {j: machine.legs[j].travel for j in machine.motors}
+        away = [(q[j] - 0.5 * sum(ends)) / np.ptp(ends) for j, ends in travels.items()]
         middle = "with all legs at mid-travel"
         if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
             middle = "with all motors as near mid-travel as they are together"
         xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
         quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
-            f"legcal.home is not given: a pose {middle} was taken, xyz "
+            f"{machine.urdf.wording.no_home}: a pose {middle} was taken, xyz "
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
     outside = legs_outside(machine)
@@ -32,8 +33,8 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         home_reading_in_words(machine.legs[j], float(q[j])) for j in outside
     ):
         notes.append(
-            f"{name} is at {reading} at home, outside its travel of {travel}; check legcal.home or "
-            "the limits."
+            f"{name} is at {reading} at home, outside its travel of {travel}; check the "
+            f"limits, or {machine.urdf.wording.correct_home}."
         )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
@@ -66,8 +67,9 @@ def singularity_note(machine: Machine) -> str | None:
         return None
     return (
         "the mechanism is singular at home: the platform moves there although all motors stand "
-        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); correct "
-        "legcal.home, or the joints if they make similar figures on base and platform."
+        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
+        f"{machine.urdf.wording.correct_home}, or the joints if they make similar figures on base "
+        "and platform."
     )
 
 

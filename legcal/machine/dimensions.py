@@ -7,87 +7,47 @@ Nothing but the standard library is imported here, so that help and completion a
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any
 
 from legcal.option_fields import option
+
+_FAMILY = "Dimensions of --family"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dimensions:
-    """A machine by a family and its dimensions, or what stands beside a table; None if not given.
+    """Numbers beside a table, or a family and its dimensions; None if not given.
 
-    Lengths are in ``unit``, angles in degrees.
+    Lengths are in ``unit``.
     """
 
     family: str | None = field(
-        default=None,
-        metadata=option(
-            "Instead of a table: number and type of legs, 6-UPS; or hexaglide, 3-prs, "
-            "linear-delta, orthoglide, delta or servo-hexapod, whose dimensions have defaults."
-        ),
+        default=None, metadata=option("In place of a table: hexapod or delta.")
     )
     unit: str | None = field(default=None, metadata=option("Unit of all lengths: mm or m."))
     name: str | None = field(default=None, metadata=option("Name of the model and its files."))
-    base_radius: float | None = field(
-        default=None, metadata=option("Radius of the circle of base joints.")
-    )
-    platform_radius: float | None = field(
-        default=None, metadata=option("Radius of the circle of platform joints.")
-    )
-    height: float | None = field(
-        default=None, metadata=option("Height of the platform above the base.")
-    )
-    base_spread: float | None = field(
-        default=None,
-        metadata=option(
-            "Angle between the base joints of a pair (6 legs), in degrees; default 30."
-        ),
-    )
-    platform_spread: float | None = field(
-        default=None,
-        metadata=option("Angle between the platform joints of a pair, in degrees; default 30."),
-    )
-    turn: float | None = field(
-        default=None,
-        metadata=option("Rotation of the platform about z, in degrees; default 0, planar 30."),
-    )
-    offset: float | None = field(default=None, metadata=option("Leg length at reading zero."))
-    travel: tuple[float, float] | None = field(
-        default=None, metadata=option("Lowest and highest reading; degrees where motors turn.")
+    type: str | None = field(
+        default=None, metadata=option("Type of the legs, where the table has none: UPS.")
     )
     min_length: float | None = field(
-        default=None,
-        metadata=option("Shortest length of a leg, where readings are zero; without --offset."),
+        default=None, metadata=option("Shortest length of a leg, where readings are zero.")
     )
-    max_length: float | None = field(
-        default=None, metadata=option("Longest length of a leg, in place of --travel.")
-    )
+    max_length: float | None = field(default=None, metadata=option("Longest length of a leg."))
     leg_radius: float | None = field(default=None, metadata=option("Radius of tube and rod."))
-    arm_length: float | None = field(
-        default=None, metadata=option("Length of the arms of a delta, or horns of servos.")
+    height: float | None = field(
+        default=None, metadata=option("Height of the platform above the base at home.")
     )
-    arm_radius: float | None = field(
-        default=None, metadata=option("Radius of arms that are cylinders; boxes without it.")
+    base_radius: float | None = field(
+        default=None, metadata=option("Radius of the circle of base joints, or motors.", _FAMILY)
+    )
+    platform_radius: float | None = field(
+        default=None, metadata=option("Radius of the circle of platform joints.", _FAMILY)
+    )
+    arm_length: float | None = field(
+        default=None, metadata=option("Length of the arms of a delta.", _FAMILY)
     )
     rod_length: float | None = field(
-        default=None, metadata=option("Length of rods on carriages or arms.")
-    )
-    rod_spacing: float | None = field(
-        default=None, metadata=option("Distance of the two rods of a parallelogram.")
-    )
-    type: str | None = field(
-        default=None, metadata=option("Type of the legs of a table that has none: UPS.")
-    )
-    platform_in: Literal["base", "platform"] | None = field(
-        default=None,
-        metadata=option(
-            "What the platform joints of a table are coordinates of: the platform, or the "
-            "base with the machine at home."
-        ),
-    )
-    tilt: float | None = field(
-        default=None,
-        metadata=option("Tilt of R and U axes from their default, in degrees; default 0."),
+        default=None, metadata=option("Length of the rods of a delta.", _FAMILY)
     )
 
     def stated(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from legcal.geometry.types import Array
-from legcal.machine.parameters import owner_of_parameter
+from legcal.machine.parameter_id import ParameterId
 
 SHOWN = 0.02  # of the largest component
 
@@ -67,7 +67,6 @@ _NOUN_OF_ACTUATOR = {
     "arm_point": ("place of the arm of", "places of the arms of"),
     "gain": ("gain of", "gains of"),
 }
-_OF_ACTUATOR = re.compile(r"(.+)\.(?:(direction|axis|axis_point|arm_axis|arm_point)\.[12]|(gain))")
 
 
 def list_in_words(words: Sequence[str]) -> str:
@@ -124,18 +123,16 @@ def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
 
 
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
-    """Return leg, kind and coordinate of a parameter, or view, nothing and coordinate.
+    """Return owner, kind and component of a parameter as sentences group them.
 
-    Of the size of a board it is the link.
-    Names of legs may contain dots. Of a motor that moves joints at A it is its joint.
+    The owner of the size of a board is its link, and an intrinsic parameter of a camera is the
+    component of no kind.
     """
-    leg = owner_of_parameter(name, leg_names)
-    kind, _, which = name[len(leg) + 1 :].partition(".")
-    if leg and kind in _NOUN:
-        return leg, kind, which
-    if of_actuator := _OF_ACTUATOR.fullmatch(name):
-        return of_actuator[1], of_actuator[2] or of_actuator[3], ""
     if name in _BOARDS:
         return _BOARDS[name], "board", ""
-    view, _, which = name.rpartition(".")
-    return view, "", which
+    parameter = ParameterId.parse(name)
+    if parameter.owner in leg_names and parameter.kind in _NOUN:
+        return parameter.owner, parameter.kind, parameter.component
+    if parameter.kind in _NOUN_OF_ACTUATOR:
+        return parameter.owner, parameter.kind, ""
+    return parameter.owner, "", parameter.kind

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.figures import new_figure, plain
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
+from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.rods import actuator_index, actuators_of
 
 if TYPE_CHECKING:
@@ -105,52 +105,51 @@ class Sketch:
     radii: tuple[float, ...]  # the largest of what is seen of each leg [m]; zero without any
     panels: tuple[Panel, ...]  # from above (y up), and in space from the side (z up)
 
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        leg_names: tuple[str, ...],
-        frame_legs: tuple[int, ...],
-        radii: tuple[float, ...],
-        joints: tuple[Array, Array],  # (n_legs, 3) of base and platform at home, in the base [m]
-        frames: tuple[tuple[str, RigidTransform], ...],  # in the base
-        motors: MotorLines,
-        *,
-        spatial: bool,
-    ) -> Sketch:
-        """Return that of a machine with these parts."""
-        A, B = joints
-        views = [("from above", [0, 1])] + [("from the side", [0, 2])] * spatial
-        panels = tuple(
-            Panel(
-                f"{view}: x to the right, {'xyz'[axes[1]]} up",
-                axes == [0, 1],
-                A[:, axes],
-                B[:, axes],
-                tuple(
-                    (frame, np.vstack([T.translation, T.rotation.as_matrix().T])[:, axes])
-                    for frame, T in frames
-                ),
-                corners_of_base(A, motors.anchors)[:, axes],
-                motors.standing[..., axes],
-                motors.moving[0][..., axes],
-            )
-            for view, axes in views
-        )
-        return cls(name, leg_names, frame_legs, radii, panels)
 
-    def plot(self) -> Figure:
-        """Return a Matplotlib figure, lengths in millimetres."""
-        with new_figure(len(self.panels), 2, _PANEL) as (figure, axes):
-            for panel, ax in zip(self.panels, axes, strict=True):
-                _draw(self, panel, ax)
-            rings = ", ".join(plain(self.leg_names[j]) for j in self.frame_legs)
-            figure.suptitle(
-                f"{plain(self.name)} at home [mm]; rings: joints of {rings}, which define R_b "
-                "and R_e",
-                fontsize="medium",
-            )
-        return figure
+def sketch_of(machine: Machine) -> Sketch:
+    """Return what pictures of a machine at home show."""
+    B = machine.home.apply(machine.B_platform)
+    A = B - vectors_A_to_B(machine, machine.home)
+    motors = motor_lines(machine.legs, A[None])
+    frames = {"R_b": machine.T_base_Rb, "R_e": machine.home * machine.T_platform_Re}
+    views = [("from above", [0, 1])] + [("from the side", [0, 2])] * machine.spatial
+    panels = tuple(
+        Panel(
+            f"{view}: x to the right, {'xyz'[axes[1]]} up",
+            axes == [0, 1],
+            A[:, axes],
+            B[:, axes],
+            tuple(
+                (name, np.vstack([T.translation, T.rotation.as_matrix().T])[:, axes])
+                for name, T in frames.items()
+            ),
+            corners_of_base(A, motors.anchors)[:, axes],
+            motors.standing[..., axes],
+            motors.moving[0][..., axes],
+        )
+        for view, axes in views
+    )
+    radii = tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in machine.legs)
+    return Sketch(machine.name, machine.leg_names, machine.frame_legs, radii, panels)
+
+
+def plot_machine(machine: Machine) -> Figure:
+    """Return a figure of a machine at home from above and from the side, in millimetres.
+
+    Joints have the number of their leg (A1 on the base, B1 on the platform); those that define
+    R_b and R_e have a ring, and axes are red (x), green (y) and blue (z).
+    """
+    sketch = sketch_of(machine)
+    with new_figure(len(sketch.panels), 2, _PANEL) as (figure, axes):
+        for panel, ax in zip(sketch.panels, axes, strict=True):
+            _draw(sketch, panel, ax)
+        rings = ", ".join(plain(sketch.leg_names[j]) for j in sketch.frame_legs)
+        figure.suptitle(
+            f"{plain(sketch.name)} at home [mm]; rings: joints of {rings}, which define R_b and "
+            "R_e",
+            fontsize="medium",
+        )
+    return figure
 
 
 def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:

@@ -9,10 +9,9 @@ follows from its joints (:class:`legcal.machine.leg.JointType`); each is one fun
 gives the residual and its gradients by the vector from A to B and by the axes.
 
 The joint at A of a rod on an actuator moves with its reading, and with it all equations of the rod
-(:func:`pose_equations` with ``q``); B of a rod on a body of a platform of several moves with the
-joint between them. Where no coordinates are given these are eliminated: one combination of the
-equations of all rods on an actuator tells its reading, one of those on a body of the platform how
-this stands, the others are constraints.
+(:func:`pose_equations` with ``q``). Where no readings are given they are eliminated: one
+combination of the equations of all rods on an actuator tells its reading, the others are
+constraints.
 """
 
 from __future__ import annotations
@@ -36,10 +35,8 @@ from legcal.machine.rods import (
     actuator_index,
     actuators_of,
     carried_at_A,
-    coordinates_at,
     first_rods,
-    internal_index,
-    internal_joints_of,
+    readings_of_rods,
 )
 
 
@@ -49,12 +46,12 @@ class PoseEquations:
 
     values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 25) by the numbers of the row's leg (LegColumns), axes by turns about
+    by_local: Array  # (k, m, 21) by the numbers of the row's leg (LegColumns), axes by turns about
     # their normal_basis, exact where residuals are zero; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
     kinds: tuple[EquationKind, ...]  # (m,) what each row is about
     measured: BoolArray  # (m,) rows of readings; the others are constraints
-    by_q: Array  # (k, m, n) by readings of actuators and internal coordinates; or (k, m, 0)
+    by_q: Array  # (k, m, n) by readings of actuators; or (k, m, 0)
 
     def of(self, rows: BoolArray) -> PoseEquations:
         """Return some of the rows."""
@@ -84,37 +81,31 @@ def pose_equations(
     """Return the equations of legs at poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
 
     *q* (k, n) are the readings of actuators [m, rad], in the order of
-    :func:`~legcal.machine.rods.actuators_of`, and after them the coordinates of internal joints;
-    all rows of their rods then count as measured: they hold at these readings. Without *q* they
-    are at those of :func:`~legcal.machine.rods.coordinates_at`, one row for each actuator measured
-    and the others constraints, and derivatives by parameters are not to be had. Without *by_local*
-    these have no columns, which takes two thirds of the time.
+    :func:`~legcal.machine.rods.actuators_of`; all rows of their rods then count as measured: they
+    hold at these readings. Without *q* they are at those of
+    :func:`~legcal.machine.rods.readings_of_rods`, one row for each actuator measured and the others
+    constraints, and derivatives by parameters are not to be had. Without *by_local* these have no
+    columns, which takes two thirds of the time.
     """
-    on, inside = actuator_index(legs), internal_index(legs)
-    n_actuators = max(on, default=-1) + 1
-    if q is None and n_actuators:
-        there = pose_equations(legs, R, t, by_local=False, q=coordinates_at(legs, R, t))
-        internal = enumerate(internal_joints_of(legs), start=n_actuators)
-        follow = [c for c, joint in internal if joint.follows]
-        return _without_coordinates(legs, there, [*follow, *range(n_actuators)])
+    on = actuator_index(legs)
+    if q is None and max(on, default=-1) >= 0:
+        there = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
+        return _without_readings(legs, there)
     if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
         return _lengths(legs, R, t, by_local, q)
     groups: dict[tuple[object, ...], list[int]] = {}  # legs alike at once, those on actuators alone
     for j, leg in enumerate(legs):
-        own = j if on[j] >= 0 or inside[j] >= 0 else -1
+        own = j if on[j] >= 0 else -1
         joints = leg.base_joint, leg.platform_joint
         groups.setdefault((own, leg.kind, *joints, *leg.equations), []).append(j)
     parts: dict[int, PoseEquations] = {}
     for alike in groups.values():
-        leg, a, c = legs[alike[0]], on[alike[0]], n_actuators + inside[alike[0]]
+        leg, a = legs[alike[0]], on[alike[0]]
         at = None if q is None or a < 0 else q[:, a]
-        s = None if q is None or c < n_actuators else q[:, c]
-        length, *found, by_own = _of_alike([legs[j] for j in alike], R, t, by_local, at, s)
+        length, *found, by_own = _of_alike([legs[j] for j in alike], R, t, by_local, at)
         by_q = np.zeros((*found[0].shape, 0 if q is None else q.shape[1]))
         if at is not None:
             by_q[..., a] = by_own[..., 0]
-        if s is not None:
-            by_q[..., c] = by_own[..., 1]
         rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
         kinds = leg.equations[rows]
         is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
@@ -138,46 +129,26 @@ def pose_equations(
 
 def n_pose_constraints(legs: Sequence[Leg]) -> int:
     """Return how many equations of legs hold whatever the readings are."""
-    n_joints = len(actuators_of(legs)) + len(internal_joints_of(legs))
-    return sum(leg.n_constraints for leg in legs) - n_joints
+    return sum(leg.n_constraints for leg in legs) - len(actuators_of(legs))
 
 
-def _without_coordinates(
-    legs: Sequence[Leg], found: PoseEquations, coordinates: Sequence[int]
-) -> PoseEquations:
-    """Return the equations of legs with some coordinates eliminated, in their order.
+def _without_readings(legs: Sequence[Leg], found: PoseEquations) -> PoseEquations:
+    """Return the equations of legs with the readings of all actuators eliminated.
 
-    The rows in which one stands are turned (by a reflection) so that it stands in one of them only:
-    that of the first rod on an actuator, which is measured then, or one that is left out, of an
-    internal joint. The others are constraints, unless readings of actuators are kept.
+    The rows in which a reading stands are turned (by a reflection) so that it stands only in that
+    of the first rod on the actuator, which is measured then; the others are constraints.
     """
-    n_actuators, first = len(actuators_of(legs)), first_rods(legs)
     values, measured = found.values.copy(), found.measured.copy()
     slopes = np.concatenate([found.by_pose, found.by_q], axis=2)  # turned together
-    on = np.array([actuator_index(legs), internal_index(legs)])[:, found.leg]
-    stands = np.concatenate(
-        [on[0][:, None] == np.arange(n_actuators),
-         on[1][:, None] == np.arange(found.by_q.shape[2] - n_actuators)], axis=1
-    )  # fmt: skip
-    is_first = np.isin(found.leg, first) & (np.diff(found.leg, prepend=-1) != 0)
-    left = np.ones(len(found.leg), dtype=np.bool_)  # rows that no coordinate has taken yet
-    kept = left.copy()
-    for c in coordinates:
-        rows = np.flatnonzero(left & stands[:, c])
-        is_read = c < n_actuators
-        if is_read:
-            pivot = int(np.argmax(is_first[rows] & (found.leg[rows] == first[c])))
-        else:
-            pivot = int(np.flatnonzero(~is_first[rows] | is_first[rows].all())[-1])
-        left[rows[pivot]] = False
-        if is_read:
-            measured[rows] = np.arange(len(rows)) == pivot
-        else:
-            kept[rows[pivot]] = False
-        stands[rows] |= stands[rows].any(axis=0)
+    on = np.array(actuator_index(legs))[found.leg]
+    is_first = np.diff(found.leg, prepend=-1) != 0
+    for a, first in enumerate(first_rods(legs)):
+        rows = np.flatnonzero(on == a)
+        pivot = int(np.argmax(is_first[rows] & (found.leg[rows] == first)))
+        measured[rows] = np.arange(len(rows)) == pivot
         if len(rows) == 1:
             continue
-        g = slopes[:, rows, 6 + c]
+        g = slopes[:, rows, 6 + a]
         size = np.linalg.norm(g, axis=1, keepdims=True)
         e = np.eye(len(rows))[pivot]
         g = np.where(size > 0.0, g / np.where(size > 0.0, size, 1.0), e)
@@ -186,21 +157,16 @@ def _without_coordinates(
         along = scale[:, None] * np.einsum("kr,krc->kc", v, slopes[:, rows])
         slopes[:, rows] -= v[:, :, None] * along[:, None]
         values[:, rows] -= v * (scale * np.einsum("kr,kr->k", v, values[:, rows]))[:, None]
-        if not is_read:  # the rows that are left keep their orientation where g[pivot] changes sign
-            sign = np.where(g[:, pivot] < 0.0, -1.0, 1.0)
-            slopes[:, rows[pivot - 1]] *= sign[:, None]
-            values[:, rows[pivot - 1]] *= sign
     none = np.zeros((*values.shape, 0))
-    turned = PoseEquations(
+    return PoseEquations(
         values, slopes[:, :, :6], none, found.leg, found.kinds, measured, slopes[:, :, 6:]
     )
-    return turned.of(kept)
 
 
 def posture_constraints(
     legs: Sequence[Leg], R: Array, t: Array, q: Array, *, by_local: bool = False
 ) -> PoseEquations:
-    """Return what holds at poses and coordinates q (k, n), whatever was measured."""
+    """Return what holds at poses and readings q (k, n) of actuators, whatever was measured."""
     found = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
     hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
     return found.of(~found.measured | hangs[found.leg])
@@ -212,16 +178,12 @@ def equations_at_readings(
     """Return what legs miss at poses and readings, if asked with derivatives by parameters.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad]; rows
-    of readings that are not known (NaN) are zero. Internal coordinates are eliminated, and with
-    them derivatives by parameters.
+    of readings that are not known (NaN) are zero.
     """
     on = actuator_index(legs)
     rods = [on.index(a) for a in range(max(on, default=-1) + 1)]
-    q = coordinates_at(legs, R, t, np.nan_to_num(lengthening[:, rods])) if rods else None
-    found = pose_equations(legs, R, t, by_local=by_local, q=q)
-    internal = range(len(rods), found.by_q.shape[2])
-    if internal:
-        found = _without_coordinates(legs, found, internal)
+    q = np.nan_to_num(np.broadcast_to(lengthening[:, rods], (len(t), len(rods))))
+    found = pose_equations(legs, R, t, by_local=by_local, q=q if rods else None)
     wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
     known = np.isfinite(wanted)
     hangs = np.array(on)[found.leg] >= 0
@@ -243,15 +205,13 @@ def leg_equations(
     *,
     by_local: bool = True,
     q: Array | None = None,
-    s: Array | None = None,
 ) -> PoseEquations:
     """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as the paper has them.
 
     Rows but that of the length have no unit; a passive leg has the row of its length too. Of a rod
-    on an actuator *q* (k,) are its readings, *s* (k,) the coordinates of the internal joint that
-    carries B, zero if they are not given.
+    on an actuator *q* (k,) are its readings, zero if they are not given.
     """
-    _, *found = _of_alike([leg], R, t, by_local, q, s)
+    _, *found = _of_alike([leg], R, t, by_local, q)
     values, by_pose, local, by_q = (x[:, 0] for x in found)
     owner = np.zeros(len(leg.equations), dtype=np.intp)
     return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
@@ -274,28 +234,24 @@ def _of_alike(
     t: Array,
     by_local: bool,
     q: Array | None,
-    s: Array | None = None,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the equations of n legs with the same joints and equations; n is 1 where one moves.
 
     They are lengths (k, n), and of m rows values (k, n, m) and derivatives (k, n, m, 6) by the
-    pose, (k, n, m, 25) by the numbers of the legs and (k, n, m, 2) by the reading q (k,) and the
-    internal coordinate s (k,).
+    pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the reading q (k,).
     """
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
-    actuator, internal, moved, inner = legs[0].actuator, legs[0].internal, None, None
+    actuator, moved = legs[0].actuator, None
     if actuator is not None:
         moved = actuator.motion(legs[0].A, np.zeros(len(t)) if q is None else q)
-    if internal is not None:
-        inner = internal.motion(legs[0].B, np.zeros(len(t)) if s is None else s)
-    arm = (B if inner is None else inner.A[:, None]) @ np.swapaxes(R, 1, 2)
+    arm = B @ np.swapaxes(R, 1, 2)
     vector = arm + t[:, None] - (A if moved is None else moved.A[:, None])
     length = np.linalg.norm(vector, axis=2)
     at = _Placed(legs, R, length, vector / length[..., None], moved)
     kinds, shape = legs[0].equations, length.shape
     values, by_pose = np.empty((*shape, len(kinds))), np.empty((*shape, len(kinds), 6))
     local = np.zeros((*shape, len(kinds), LegColumns.COUNT if by_local else 0))
-    by_q = np.zeros((*shape, len(kinds), 2))
+    by_q = np.zeros((*shape, len(kinds), 1))
     for i, kind in enumerate(kinds):
         row = _RESIDUALS[kind](at)
         values[:, :, i] = row.value
@@ -304,12 +260,9 @@ def _of_alike(
             by_pose[:, :, i, :3] += cross(at.in_base(row.tied), row.by_tied)
         if moved is not None:
             by_q[:, 0, i, 0] = _by_actuator(legs[0], moved, row, local[:, 0, i])
-        if inner is not None:
-            by_B = np.einsum("kn,knj->kj", row.by_leg[:, 0], R)
-            by_q[:, 0, i, 1] = _by_internal(inner, by_B, local[:, 0, i])
         if by_local:
             local[:, :, i, LegColumns.A] = -_back(moved, row.by_leg)
-            local[:, :, i, LegColumns.B] = _back(inner, row.by_leg @ R)
+            local[:, :, i, LegColumns.B] = row.by_leg @ R
             local[:, :, i, LegColumns.LENGTH] = row.by_q0
             local[:, :, i, LegColumns.TWIST] = row.by_twist
             if row.by_base_axis is not None:
@@ -325,33 +278,22 @@ def _of_alike(
 
 
 def _back(moved: JointMotion | None, vectors: Array) -> Array:
-    """Return gradients (k, ..., 3) by what is fixed in the base by what is at reading 0."""
+    """Turn gradients (k, ..., 3) by moved points into gradients by the points at reading 0."""
     return vectors if moved is None else np.einsum("kij,k...i->k...j", moved.by_A, vectors)
 
 
 def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
-    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 25)."""
+    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 21)."""
     columns = ActuatorColumns
     local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, by_leg)
     local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, by_leg)
     local[:, columns.GAIN] = -_dot(moved.by_gain, by_leg)
 
 
-def _by_internal(inner: JointMotion, by_B: Array, local: Array) -> Array:
-    """Return the derivative (k,) by an internal coordinate; write those by the joint's numbers.
-
-    *by_B* (k, 3) are those by B in the platform; *local* (k, 25) may have no columns.
-    """
-    if local.shape[1]:
-        local[:, LegColumns.INTERNAL_AXIS] = np.einsum("kij,ki->kj", inner.by_axis, by_B)
-        local[:, LegColumns.INTERNAL_POINT] = np.einsum("kij,ki->kj", inner.by_point, by_B)
-    return _dot(inner.by_q, by_B)
-
-
 def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
     """Return the derivative (k,) of a row by the reading; write those by the actuator's numbers.
 
-    They go into *local* (k, 25), which may have no columns.
+    They go into *local* (k, 21), which may have no columns.
     """
     by_leg = row.by_leg[:, 0]
     by_q, columns = -_dot(moved.by_q, by_leg), ActuatorColumns
@@ -441,11 +383,8 @@ def pose_sensitivity(
     frame_legs: Sequence[int],
     R: Array,
     t: Array,
-    q: Array | None = None,
 ) -> Array:
     """Return how parameters move R_e in R_b at given readings, (k, 6, p): rotation, displacement.
-
-    *q* (k, n) are readings of actuators and internal coordinates, those of the poses without it.
 
     The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Of redundant
     motors the squares of the lengths are least, with the constraints exact; where constraints alone
@@ -456,14 +395,9 @@ def pose_sensitivity(
     NotIdentifiable
         If readings and legs do not determine a pose.
     """
-    q = coordinates_at(legs, R, t) if q is None else q
-    equations = pose_equations(legs, R, t, q=q)
+    equations = pose_equations(legs, R, t, q=readings_of_rods(legs, R, t))
     columns = list(freedoms(frame_legs))
     F, by_parameters = equations.by_pose[:, :, columns], equations.by_parameters(parametrization)
-    by_s = equations.by_q[:, :, len(actuators_of(legs)) :]
-    if by_s.shape[2]:  # internal joints follow: what they cannot make good is left
-        left = np.swapaxes(np.linalg.svd(by_s)[0][:, :, by_s.shape[2] :], 1, 2)
-        F, by_parameters = left @ F, left @ by_parameters
     singular = np.linalg.svd(F, compute_uv=False)
     bad = np.arange(len(t))
     if singular.shape[1] == len(columns):
@@ -476,7 +410,7 @@ def pose_sensitivity(
             "pose out."
         )
     moved = np.zeros((len(t), 6, len(parametrization)))
-    if by_s.shape[2] or not is_overdetermined(equations, columns):
+    if not is_overdetermined(equations, columns):
         moved[:, columns] = -np.linalg.pinv(F) @ by_parameters
         return moved
     read = equations.measured
@@ -544,19 +478,11 @@ def _lengths(
     A = np.array([leg.A for leg in legs]).reshape(-1, 3)
     on, moved = actuator_index(legs), dict[int, JointMotion]()
     hung = {} if q is None else {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator}
-    inner, n_actuators = dict[int, JointMotion](), len(set(on) - {-1})
     if q is not None:
         A = carried_at_A(tuple(legs)).at(q)
         for j, actuator in hung.items() if by_local else ():
             moved[j] = actuator.motion(legs[j].A, q[:, on[j]])
     B = np.array([leg.B for leg in legs]).reshape(-1, 3)
-    inside = internal_index(legs)
-    if q is not None and max(inside, default=-1) >= 0:
-        B = np.repeat(B[None], len(t), axis=0)
-        for j, leg in enumerate(legs):
-            if leg.internal is not None:
-                inner[j] = leg.internal.motion(leg.B, q[:, n_actuators + inside[j]])
-                B[:, j] = inner[j].A
     arms = B @ np.swapaxes(R, 1, 2)
     vectors = arms + t[:, None] - A
     lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
@@ -568,16 +494,11 @@ def _lengths(
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
     if q is not None and hung:
         carried, own = list(hung), [on[j] for j in hung]
-        by_reading = carried_at_A(tuple(legs)).by_coordinate(q)[:, carried]
+        by_reading = carried_at_A(tuple(legs)).by_reading(q)[:, carried]
         by_q[:, carried, own] = -np.sum(by_reading * u[:, carried], axis=2)
     for j, motion in moved.items():
         local[:, j, LegColumns.A] = -_back(motion, u[:, j])
         _write_actuator(motion, u[:, j], local[:, j])
-    for j, motion in inner.items():
-        by_B = np.einsum("kn,knj->kj", u[:, j], R)
-        by_q[:, j, n_actuators + inside[j]] = _by_internal(motion, by_B, local[:, j])
-        if by_local:
-            local[:, j, LegColumns.B] = _back(motion, by_B)
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
         np.concatenate([cross(arms, u), u], axis=2),

@@ -159,8 +159,8 @@ class Feasibility:
         if problem is not None:
             raise ModelError(
                 f"{machine.yaml_path}: no pose could be drawn: found {problem} at home, needed "
-                "every joint inside its limits there; correct legcal.home or the limits of the "
-                "URDF."
+                f"every joint inside its limits there; correct the limits, or "
+                f"{machine.urdf.wording.correct_home}."
             )
 
     def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:

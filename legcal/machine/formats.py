@@ -26,7 +26,6 @@ from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
-    DRAWING,
     Loop,
     LoopKind,
     Source,
@@ -51,6 +50,7 @@ from legcal.machine.urdf import (
     parse_xml,
     read_urdf,
 )
+from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
 XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
@@ -60,20 +60,8 @@ STEPS = 200
 CLOSED = 1e-10  # [m] and [rad]
 _OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
 _RIGID = 1e-3  # determinants of rotations but for rounding
-_SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
-_MAX_STEP = 0.3  # step [rad, m]
-
-_NO_BLOCK = (
-    ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "the file draws no closed pose"),
-    ("write legcal.home", "add a block legcal with home"),
-    ("correct legcal.home", "add a block legcal with another home"),
-    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
-    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
-    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
-    ("write legcal.base, legcal.platform and legcal.legs",
-     "add a block legcal with base, platform and legs"),
-)  # fmt: skip
+_SPREAD = 0.1  # [rad], and of the size of the machine: of the start of a trial, times its number
+_MAX_STEP = 0.3  # [rad], and of the size of the machine
 
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
@@ -81,7 +69,6 @@ KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
     "universal": "universal",
 }
-_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
 
 
 def read_source(model: str | Path) -> Source:
@@ -133,7 +120,7 @@ def read_yaml_source(path: Path) -> Source:
     )
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
+        return Source(path, file, urdf if block else replace(urdf, wording=NO_BLOCK))
     return _converted(path, file, urdf)
 
 
@@ -157,8 +144,9 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
                 "for another joint (joint_name), needed another joint of that leg; name its "
                 "prismatic joint."
             )
-    words = _NO_BLOCK if file.legcal is None else ()
-    return Source(path, file.model_copy(update=changes), completed, words=words)
+    wording = NO_BLOCK if file.legcal is None else BLOCK
+    completed = replace(completed, wording=wording)
+    return Source(path, file.model_copy(update=changes), completed)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -268,8 +256,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         type=[kind for _, kind in pairs],
         name_mot=motors,
     )
-    urdf = parse_urdf(path, written, travel_needed=False)
-    return Source(path, file, urdf, tuple(notes), words=_WORDS)
+    urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
+    return Source(path, file, urdf, tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
@@ -421,13 +409,16 @@ def completed(source: Source) -> Source:
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
-    found = closed_near(chain, start, source.urdf.links)
+    drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
+    unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
+    unit[chain.rotation_columns()] = 1.0
+    found = closed_near(chain, start, source.urdf.links, unit)
     configuration = start if found is None else found
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
     off = _off(chain, start)
     if sliders and found is not None and off > CLOSED:
-        configuration = found = _levelled(chain, found, source, closures)
+        configuration = found = _levelled(chain, found, source, closures, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
@@ -435,11 +426,21 @@ def completed(source: Source) -> Source:
     if found is None:
         return source
     size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
-    return replace(source, poses=poses, is_drawn_open=not sliders and off > _OPEN * size)
+    drawn = {
+        name: float(configuration[chain.q_index(name)])
+        for name in source.file.name_mot
+        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
+    }
+    is_open = not sliders and off > _OPEN * size
+    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
 
 
 def _levelled(
-    chain: ClosedChain, configuration: Array, source: Source, closures: Sequence[Closure]
+    chain: ClosedChain,
+    configuration: Array,
+    source: Source,
+    closures: Sequence[Closure],
+    unit: Array,
 ) -> Array:
     """Return a closed configuration with the platform level, the given one where it cannot be.
 
@@ -469,7 +470,7 @@ def _levelled(
         rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
         return rows[0][None], rows[1][None]
 
-    found = _solved(chain, equations, configuration)
+    found = _solved(chain, equations, configuration, unit)
     if found is None:
         return configuration
     sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
@@ -478,18 +479,20 @@ def _levelled(
     for _ in range(STEPS):
         free = null_space(equations(found[None])[1][0], rcond=1e-9)
         step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
-        step *= min(1.0, _MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
-        nearer = _solved(chain, equations, chain.integrate(found, step))
+        nearer = _solved(chain, equations, chain.integrate(found, _shortened(step, unit)), unit)
         if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
             break
         found = nearer
     return found
 
 
-def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
+def closed_near(
+    chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
+) -> Array | None:
     """Return a closed configuration near a given one, or None where none was found.
 
-    Among those that several starts lead to, the one with the smallest rotations of links.
+    Among those that several starts lead to, the one with the smallest rotations of links. *unit*
+    (nv,) is the size of the machine [m], 1 for angles.
     """
     if _off(chain, start) <= CLOSED:
         return start
@@ -497,8 +500,8 @@ def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array
     best: tuple[float, Array] | None = None
     drawn = chain.turns(start, links[0], links)
     for trial in range(TRIALS):
-        away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
-        found = _close(chain, away)
+        away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
+        found = _close(chain, away, unit)
         if found is None:
             continue
         turned = _turned(drawn, chain.turns(found, links[0], links))
@@ -515,25 +518,34 @@ def _turned(before: Array, after: Array) -> float:
     return float(Rotation.from_matrix(apart).magnitude().sum())
 
 
-def _close(chain: ClosedChain, configuration: Array) -> Array | None:
+def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
     """Close the loops near a configuration, or return None."""
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         return residual[None], jacobian[None]
 
-    return _solved(chain, equations, configuration)
+    return _solved(chain, equations, configuration, unit)
 
 
-def _solved(chain: ClosedChain, equations: Equations, configuration: Array) -> Array | None:
+def _shortened(step: Array, unit: Array) -> Array:
+    """Return a step (nv,), no longer than ``_MAX_STEP``."""
+    longest = float(np.abs(step / unit).max(initial=0.0))
+    return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
+
+
+def _solved(
+    chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
+) -> Array | None:
     """Return the configuration near a given one where equations hold, or None."""
-
-    def retract(points: Array, step: Array) -> Array:
-        step = step[0] * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))
-        return chain.integrate(points[0], step)[None]
-
     found = solve(
-        equations, retract, configuration[None], tolerance=CLOSED, damped=True, steps=STEPS
+        equations,
+        lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
+        configuration[None],
+        tolerance=CLOSED,
+        unit=unit,
+        damped=True,
+        steps=STEPS,
     )
     return found.points[0] if found.worst[0] <= CLOSED else None
 
@@ -555,6 +567,6 @@ def _with_travel(
     names: Sequence[str] = list(readings)
     return replace(
         source,
-        urdf=parse_urdf(source.urdf.path, content),
+        urdf=replace(parse_urdf(source.urdf.path, content), wording=source.urdf.wording),
         notes=(*source.notes, travel_note(names, travel)),
     )

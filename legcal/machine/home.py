@@ -38,6 +38,7 @@ MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # steps that change little
 _FAR, _DEPENDENT = 0.1, 1e-7  # of a leg length, and of the largest singular value
+_CLOSED = 1e-9  # of a leg length
 _REGULAR = 1e-4  # singularity measure, beyond which motors hold the platform
 MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
 _MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
@@ -73,8 +74,8 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     projected, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
-            f"{machine.yaml_path}: legcal.home could not be used: found {problem} there, needed "
-            "a closed pose; correct legcal.home."
+            f"{machine.yaml_path}: {machine.urdf.wording.home} could not be used: found {problem} "
+            f"there, needed a closed pose; {machine.urdf.wording.correct_home}."
         )
     return projected
 
@@ -124,7 +125,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     if best is None:
         raise DidNotConverge(
             f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
-            f"loops did not close from {TRIALS} starts, needed a closed pose; write legcal.home."
+            f"loops did not close from {TRIALS} starts, needed a closed pose; "
+            f"{machine.urdf.wording.state_home}."
         )
     home = best[1]
     if machine.actuators:
@@ -134,10 +136,11 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
         if np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
             poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            wording = machine.urdf.wording
             raise ModelError(
-                f"{machine.yaml_path}: the assembly at home is ambiguous: found no legcal.home, "
-                f"and that at the same readings of the motors the rods reach the platform at "
-                f"{poses}, needed one; write legcal.home with the pose in which the machine is "
+                f"{machine.yaml_path}: the assembly at home is ambiguous: found that "
+                f"{wording.no_home}, and that at the same readings of the motors the rods reach "
+                f"the platform at {poses}, needed one; {wording.state_home}, as the machine is "
                 "assembled."
             )
     return home
@@ -172,7 +175,6 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
             actuator=wanted.actuator,
-            internal=wanted.internal,
         )
         for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True)
     )
@@ -210,12 +212,12 @@ def _at_readings(
         )
 
     found = solved(exact, poses)
-    holds = found.worst < 1e-9
+    holds = found.worst < _CLOSED * reach
     if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
         poses, n_dependent = _on_constraints(machine, found.points)
         found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
         singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
-        holds = (found.worst < 1e-9) & (singular > _REGULAR)
+        holds = (found.worst < _CLOSED * reach) & (singular > _REGULAR)
         holds &= [_in_travel(machine, pose) for pose in found.points]
     return [
         motion_of(pose[:, :3], pose[:, 3]) if held else None

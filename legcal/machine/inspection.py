@@ -55,14 +55,6 @@ class InspectedActuator(ActuatorBlock):
     us_per_deg: Number | None = None
 
 
-class InspectedInternalJoint(ActuatorBlock):
-    """A joint inside a platform of several bodies, in the platform link with the joint at 0 [m]."""
-
-    travel: list[Number] | None  # [m, or rad of what turns]
-    at_home: Number
-    follows: bool  # whether the pose of the platform says where it stands
-
-
 class CylinderBlock(Document):
     """A visible cylinder of a leg [m]."""
 
@@ -88,7 +80,6 @@ class InspectedLeg(SparseDocument):
     twist: Number | None  # [rad]
     cylinders: list[CylinderBlock]
     actuator: str | None = None  # the joint of the motor that moves A; left out where none does
-    internal: str | None = None  # the joint inside the platform that carries B; left out if none
 
 
 class Inspection(SparseDocument):
@@ -108,7 +99,6 @@ class Inspection(SparseDocument):
     home: Pose  # T_base_platform
     legs: list[InspectedLeg]
     actuators: dict[str, InspectedActuator] | None = None  # in the base link, with A at reading 0
-    internal_joints: dict[str, InspectedInternalJoint] | None = None  # of a platform of several
     diagnostics: list[str]
 
 
@@ -138,18 +128,6 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         home=Pose.of(machine.home),
         legs=[_leg(leg, q) for leg, q in zip(machine.legs, readings, strict=True)],
         actuators=actuators or None,
-        internal_joints={
-            joint.joint: InspectedInternalJoint.model_validate(
-                joint.document()
-                | {
-                    "travel": list(joint.travel) if np.isfinite(joint.travel).all() else None,
-                    "at_home": machine.chain.value(machine.home_configuration, joint.joint),
-                    "follows": joint.follows,
-                }
-            )
-            for joint in machine.internal_joints
-        }
-        or None,
         diagnostics=list(machine.diagnostics),
     ).document()
 
@@ -173,5 +151,4 @@ def _leg(leg: Leg, q_home: float) -> InspectedLeg:
         twist=leg.twist,
         cylinders=[CylinderBlock(link=c.link, radius=c.radius) for c in leg.cylinders],
         actuator=None if leg.actuator is None else leg.actuator.joint,
-        internal=None if leg.internal is None else leg.internal.joint,
     )

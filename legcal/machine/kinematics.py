@@ -7,15 +7,13 @@ is flipped. Where the joints of the spanning tree stand in the way, the pose alo
 and the chain closed where it ends.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.files.schema import closest
 from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import close_at, closure_equations
@@ -41,7 +39,6 @@ from legcal.machine.model import (
     slider_columns,
 )
 from legcal.machine.redundancy import contradictions
-from legcal.machine.rods import actuator_index, coordinates_at
 from legcal.machine.solved_poses import TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 from legcal.machine.ties import machine_ties
@@ -253,11 +250,7 @@ def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
         yield reached[-1]
 
 
-def inverse_kinematics(
-    mechanism: Machine,
-    T_base_platform: RigidTransform,
-    inside: Mapping[str, float] = MappingProxyType({}),
-) -> Array:
+def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
     Of a rod it is the reading of the actuator that it hangs on, with ``|A(q) - B| = l``.
@@ -271,9 +264,6 @@ def inverse_kinematics(
         The machine.
     T_base_platform : RigidTransform
         Pose of the platform link in the base link.
-    inside : mapping of str to float
-        Of a platform of several bodies, by name where joints inside it stand [m, rad] that the
-        pose leaves free, as the guide of an I4; at zero without it. Others follow.
 
     Returns
     -------
@@ -285,7 +275,6 @@ def inverse_kinematics(
     UsageError
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
-        If no joint inside the platform has one of the names.
     """
     problem = violated_constraint(mechanism, T_base_platform)
     if problem is not None:
@@ -294,28 +283,8 @@ def inverse_kinematics(
             "allows; choose one that keeps it."
         )
     q = readings_at(mechanism, T_base_platform)
-    if inside:
-        q = _with_inside(mechanism, T_base_platform, inside, q)
     q[[not leg.has_value for leg in mechanism.legs]] = 0.0
     return q
-
-
-def _with_inside(
-    machine: Machine, T: RigidTransform, inside: Mapping[str, float], q: Array
-) -> Array:
-    """Return joint values q (n_legs,) with joints inside the platform where they are to stand."""
-    names = [joint.joint for joint in machine.internal_joints]
-    for name in inside:
-        if name not in names:
-            raise UsageError(
-                f"The joint values could not be computed: found '{name}', needed a joint inside "
-                f"the platform; {closest(name, names or ['none'])}"
-            )
-    R, t = (part[None] for part in (T.rotation.as_matrix(), T.translation))
-    s = np.array([[inside.get(name, 0.0) for name in names]])
-    readings = coordinates_at(machine.legs, R, t, s=s)[0]
-    on = np.array(actuator_index(machine.legs))
-    return np.asarray(np.where(on >= 0, readings[on], q))
 
 
 def _disagreement(
@@ -441,8 +410,7 @@ def follow(
                 matrix_of(*machine.chain.placement(c, machine.base, machine.platform))
                 for c in (configuration, reached)
             ]
-            there = np.array([configuration[q_columns], trial[q_columns]])
-            if not is_on_same_side(*dimensionless(machine, np.array(ends), motors, there)):
+            if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
                 return False
         configuration, known = reached, jacobian
         return True
@@ -465,7 +433,7 @@ def follow(
             f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
             f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
             "legs meet no more or the mechanism is singular, needed a regular path; check the "
-            "readings and legcal.home."
+            f"readings and {machine.urdf.wording.home}."
         )
     sliders = dict(zip(q_columns, last.tolist(), strict=True)) if not is_redundant else {}
     closed = _closed_at(machine, T, configuration, sliders, free)
@@ -508,7 +476,7 @@ def follow_poses(
     The joints of the chain do not count. With them comes which part of each way is done, (k,).
     """
     T = start.as_matrix()[None]
-    known = dimensionless(machine, T, readings=first[None])
+    known = dimensionless(machine, T)
     poses, known = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], known))
     scale = leg_scale(machine, start)
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
@@ -534,7 +502,7 @@ def follow_poses(
             unit=unit,
             steps=REDUNDANT_STEPS if machine.is_redundant else FEW_STEPS,
         )
-        jacobian = dimensionless(machine, found.points, readings=readings)
+        jacobian = dimensionless(machine, found.points)
         good = found.converged | (found.worst < TOLERANCE * scale)
         good &= ~_is_reversed(machine, found.points)
         for i in np.flatnonzero(good):

@@ -18,7 +18,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.geometry.lines import distance_to_line
-from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
+from legcal.geometry.motions import matrix_inverse
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.bodies import Connection
@@ -34,10 +34,9 @@ class LegColumns:
 
     A, B, LENGTH = slice(0, 3), slice(3, 6), 6
     BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
-    OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns), and those of the
-    ACTUATOR = slice(OWN, OWN + ActuatorColumns.COUNT)  # joint that carries B in the platform
-    INTERNAL_AXIS, INTERNAL_POINT, INTERNAL = slice(21, 23), slice(23, 25), slice(21, 25)
-    COUNT = 25
+    OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns)
+    ACTUATOR = slice(OWN, OWN + ActuatorColumns.COUNT)
+    COUNT = ACTUATOR.stop
 
 
 class LegKind(StrEnum):
@@ -232,22 +231,11 @@ class LegChain:
     u: Array  # (3,) in which a slider moves the platform end; else from A to B
     idle_spins: int  # freedoms that turn nothing but the leg about itself
     actuator: Step | None = None  # the first of the steps, where a rod hangs on what it moves
-    internal: Step | None = None  # the joint by which the platform carries the body where it ends
-
-    @property
-    def T_platform_end(self) -> Array:
-        """The body where the leg ends in that of the platform, (4, 4), its joint there at zero."""
-        if self.internal is None:
-            return np.eye(4)
-        T_body_joint = self.internal.connection.T_body_joint
-        return matrix_product(
-            T_body_joint[self.internal.near], matrix_inverse(T_body_joint[self.internal.far])
-        )
 
     @property
     def B_platform(self) -> Array:
         """B in the platform's body, (3,) [m]."""
-        return matrix_applied(self.T_platform_end, self.line_in(-1, self.B)[0])
+        return self.line_in(-1, self.B)[0]
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -311,8 +299,6 @@ class Leg:
     chain: LegChain | None = None  # its joints in the URDF; None where no file describes it
     actuator: Actuator | None = None  # what a rod hangs on whose joint at A moves
     mode: int = 1  # of such a rod, the sign of d|AB|/dq: which of two readings reaches B
-    # The joint inside a platform of several bodies that carries B, which is B where it stands at 0
-    internal: Actuator | None = None
 
     @property
     def is_motor(self) -> bool:
@@ -352,15 +338,11 @@ class Leg:
     def type(self) -> str:
         """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there.
 
-        Of a rod that hangs on an actuator this comes first: ``PSS``, ``RSS``; the joint inside the
-        platform that carries its other end comes last: ``RSSR``.
+        Of a rod that hangs on an actuator this comes first: ``PSS``, ``RSS``.
         """
-        first, last = (
-            "" if joint is None else "R" if joint.turns else "P"
-            for joint in (self.actuator, self.internal)
-        )
+        first = "" if self.actuator is None else "R" if self.actuator.turns else "P"
         slider = "" if self.kind is LegKind.CONSTANT else "P"
-        return f"{first}{self.base_joint}{slider}{self.platform_joint}{last}"
+        return f"{first}{self.base_joint}{slider}{self.platform_joint}"
 
     @property
     def arm(self) -> Arm | None:

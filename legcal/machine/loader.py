@@ -12,10 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, LegcalError, ModelError, OutOfClass
+from legcal.errors import DidNotConverge, ModelError, OutOfClass
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest
@@ -24,10 +23,9 @@ from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import (
-    CONCURRENT,
     PERPENDICULAR,
     actuator_of,
-    internal_joint_of,
+    joint_tolerance,
     leg_of,
 )
 from legcal.machine.cylinders import (
@@ -41,7 +39,6 @@ from legcal.machine.equations import (
     constraints_at,
     leg_equations,
     n_pose_constraints,
-    pose_equations,
 )
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
@@ -54,7 +51,6 @@ from legcal.machine.leg import (
     EquationKind,
     JointType,
     LegChain,
-    Step,
 )
 from legcal.machine.mobility import (
     CONFIGURATIONS,
@@ -66,7 +62,7 @@ from legcal.machine.mobility import (
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import coordinates_at, reading_of_rod, rod_mode
+from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source
@@ -88,8 +84,6 @@ from legcal.machine.topology import (
 from legcal.machine.urdf import Urdf, UrdfJoint
 
 MAX_ORIGIN = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
-_FREE = 1e-6  # of the largest slope: a joint that moves no rod
-_FOLLOWS = 1e-3  # of how a joint inside the platform moves rods
 MAX_TURN = 4.0 * np.pi  # [rad] of an arm; limits beyond are most likely degrees
 _DEVIATION = {  # by [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
@@ -116,12 +110,7 @@ def load_mechanism(model: str | Path) -> Machine:
     OutOfClass
         If the mechanism is not one that the method covers.
     """
-    source = read_source(model)
-    try:
-        return _load(source)
-    except LegcalError as error:
-        said = [source.in_format_terms(problem) for problem in error.problems]
-        raise type(error)(said) from error
+    return _load(read_source(model))
 
 
 def _load(source: Source) -> Machine:
@@ -158,12 +147,11 @@ def _load(source: Source) -> Machine:
             machine = _in_modes(machine, given, q)
     else:
         if machine.actuators:
-            q = _readings_at_home(machine, block.home_readings or {})
+            q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
             machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
-    machine = _with_followers(machine, given)
     try:
         pose, configuration = closed_home(machine, given)
     except (ModelError, DidNotConverge):
@@ -178,19 +166,11 @@ def _load(source: Source) -> Machine:
     configurations = generic_configurations(machine, CONFIGURATIONS)
     machine = replace(machine, mobility=mobility(machine, configurations))
     machine = replace(machine, motor_rank=motor_rank(machine, configurations))
-    if machine.internal_joints and machine.is_redundant:
-        raise OutOfClass(
-            f"{machine.yaml_path}: this machine is outside the method: found {len(machine.motors)} "
-            f"motors for the {machine.mobility} freedoms of a platform of several bodies, needed "
-            "no more motors than freedoms there; remove one from name_mot."
-        )
     _check_equations(machine, configurations)
     _check_dependence(machine)
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = map(
-        source.in_format_terms, mechanism_notes(machine, home_is_given=block.home is not None)
-    )
+    found = mechanism_notes(machine, home_is_given=block.home is not None)
     return replace(machine, diagnostics=(*source.notes, *proposed, *found))
 
 
@@ -219,11 +199,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
     home = None if block.home is None else block.home.motion()
     actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
-    inside = {
-        step.name: internal_joint_of(chain, ends[1], *_moved_by(step, urdf))
-        for chain in reversed(chains)
-        if (step := chain.internal) is not None
-    }
     legs = tuple(
         leg_of(
             name,
@@ -234,7 +209,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
             spatial=normals is None,
             home=home,
             actuator=actuators.get(leg_chain.motor),
-            internal=None if leg_chain.internal is None else inside[leg_chain.internal.name],
         )
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
@@ -317,12 +291,6 @@ def _actuators(
     return stated
 
 
-def _moved_by(step: Step, urdf: Urdf) -> tuple[tuple[float, float], str]:
-    """Return the limits of a joint of the tree [m or rad], infinite without any, and its child."""
-    joint = urdf.joints[step.name]
-    return joint.limits or (-np.inf, np.inf), joint.child
-
-
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
     """Return the limits of a leg's slider or actuator [m or rad], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
@@ -356,8 +324,12 @@ def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[floa
     return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
 
 
-def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[float]:
+def _readings_at_home(
+    machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
+) -> list[float]:
     """Return the joint values at home: as *given* for actuators, else the one inside the travel.
+
+    Where both are, it is the one that the file has *drawn*.
 
     Raises
     ------
@@ -388,13 +360,16 @@ def _readings_at_home(machine: Machine, given: Mapping[str, float]) -> list[floa
                 )
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
-        scale = 1e-6 * max(1.0, float(np.ptp(leg.travel)))
+        scale = 1e-6 * float(np.ptp(leg.travel))
+        if all(inside) and leg.actuator.joint in drawn:
+            q[j] = min(both, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
+            continue
         if all(inside) and abs(both[0] - both[1]) > scale:
             raise ModelError(
                 f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
                 f"rod reaches the platform at {said} of '{leg.actuator.joint}', both inside its "
-                "travel, needed one; write legcal.home_readings with the reading of each actuator "
-                "at home, or narrow the limits of the joint."
+                f"travel, needed one; {machine.urdf.wording.state_readings}, or narrow the limits "
+                "of the joint."
             )
         middle = 0.5 * sum(leg.travel)
         q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
@@ -609,45 +584,6 @@ def _check_frames(machine: Machine) -> None:
         raise ModelError(problems)
 
 
-def _with_followers(machine: Machine, home: RigidTransform | None) -> Machine:
-    """Return the machine with its joints inside the platform marked: which follow from a pose.
-
-    Raises
-    ------
-    OutOfClass
-        If one of them moves no rod.
-    """
-    if not machine.internal_joints:
-        return machine
-    T = (machine.home if home is None else home).as_matrix()[None]
-    R, t, n = T[:, :3, :3], T[:, :3, 3], len(machine.actuators)
-    slopes = pose_equations(machine.legs, R, t, q=coordinates_at(machine.legs, R, t)).by_q[0]
-    of_motors, inside = slopes[:, :n], slopes[:, n:]
-    moved = np.linalg.norm(inside, axis=0)
-    if moved.min() < _FREE * np.abs(slopes).max():
-        free = machine.internal_joints[int(np.argmin(moved))].joint
-        raise OutOfClass(
-            f"{machine.yaml_path}: this machine is outside the method: found that the joint "
-            f"'{free}' inside the platform moves no rod at home, needed rods that hold the body "
-            "behind it; fix that joint if it does not move, otherwise this machine cannot be "
-            "calibrated this way."
-        )
-    # What motors cannot make good says where a joint stands
-    left = inside - of_motors @ (np.linalg.pinv(of_motors) @ inside)
-    _, upper, order = qr(left / moved, mode="economic", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(upper)) > _FOLLOWS))
-    follow = [machine.internal_joints[i].joint for i in order[:rank]]
-    joints = {
-        joint.joint: replace(joint, follows=joint.joint in follow)
-        for joint in machine.internal_joints
-    }
-    legs = tuple(
-        leg if leg.internal is None else replace(leg, internal=joints[leg.internal.joint])
-        for leg in machine.legs
-    )
-    return replace(machine, legs=legs)
-
-
 def _check_origins(urdf: Urdf) -> None:
     """Check that no joint is so far out that rounding hides how joints lie to each other.
 
@@ -756,7 +692,7 @@ def _check_ties(machine: Machine) -> None:
         If errors that its constraints allow one by one destroy it together.
     """
     ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
-    if machine.actuators and not machine.internal_joints and n_dependent_at_home(machine):
+    if machine.actuators and n_dependent_at_home(machine):
         joints = {leg.base_joint for leg in machine.legs} | {
             leg.platform_joint for leg in machine.legs
         }
@@ -789,21 +725,22 @@ def _check_across(machine: Machine) -> None:
     Raises
     ------
     OutOfClass
-        If one is more than 10 um open, or turned by more than 1 mrad.
+        If one is further open than joints may be off, or turned by more than 1 mrad.
     """
+    within = joint_tolerance((machine.A_base, machine.B_platform))
     row, residual = 0, machine.chain.residual(machine.home_configuration)
     problems = []
     for closure in machine.chain.closures:
         gap = float(np.linalg.norm(residual[row : row + 3]))
         tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
         row += closure.rows
-        if gap > CONCURRENT or tilt > PERPENDICULAR:
+        if gap > within or tilt > PERPENDICULAR:
             problems.append(
                 f"{machine.yaml_path}: the loops could not be closed: found "
                 f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
                 f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
-                f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
-                "axes along this leg."
+                f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg; correct "
+                "the origins and axes along this leg."
             )
     if problems:
         raise OutOfClass(problems)
@@ -819,25 +756,25 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
     Raises
     ------
     OutOfClass
-        If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
+        If a length is further off than joints may be, or an axis, a direction or a twist by more
+        than 1 mrad.
     """
     poses = [machine.chain.placement(c, machine.base, machine.platform) for c in configurations]
     R, t = np.array([R for R, _ in poses]), np.array([t for _, t in poses])
     q = np.array([joint_values(machine, c) for c in configurations])
     of_legs = []
     for j, leg in enumerate(machine.legs):
-        inside = None if leg.internal is None else leg.internal.joint
-        s = np.array([machine.chain.value(c, inside) if inside else 0.0 for c in configurations])
-        equations = leg_equations(leg, R, t, by_local=False, q=q[:, j], s=s)
+        equations = leg_equations(leg, R, t, by_local=False, q=q[:, j])
         values = equations.values.copy()
         if leg.actuator is None:
             values[:, 0] -= leg.sign * q[:, j]
         of_legs.append((leg.name, equations.kinds, np.abs(values)))
     problems: dict[str, str] = {}
+    within = joint_tolerance((machine.A_base, machine.B_platform))
     for k in range(len(configurations)):
         for name, kinds, values in of_legs:
             for kind, value in zip(kinds, values[k].tolist(), strict=True):
-                problem = _broken_equation(kind, value)
+                problem = _broken_equation(kind, value, within)
                 if problem is not None:
                     problems.setdefault(
                         name,
@@ -848,12 +785,15 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
         raise OutOfClass(list(problems.values()))
 
 
-def _broken_equation(kind: EquationKind, value: float) -> str | None:
-    """Return how an equation is broken, None if it is kept."""
+def _broken_equation(kind: EquationKind, value: float, within: float) -> str | None:
+    """Return how an equation is broken, None if it is kept; lengths *within* so much [m]."""
     if kind is EquationKind.LENGTH:
-        if value <= CONCURRENT:
+        if value <= within:
             return None
-        return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
+        return (
+            f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most "
+            f"{1e3 * within:.2g} mm,"
+        )
     if value <= PERPENDICULAR:
         return None
     angle = f"{np.degrees(np.arcsin(min(value, 1.0))):.3g}"

@@ -9,6 +9,7 @@ body, a constraint or a geom type that MJCF does not have is refused, since it m
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,6 @@ from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.schema import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
-    DRAWING,
     EYE,
     FULL_TURN,
     Loop,
@@ -35,6 +35,7 @@ from legcal.machine.spanning_tree import (
     moving_groups,
 )
 from legcal.machine.urdf import Problems, Urdf, number_list, parse_urdf, parse_xml
+from legcal.machine.wording import MJCF
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -45,7 +46,6 @@ _GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box"
 _NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
 _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
-_WORDS = (("closed_loop", "<equality>"), ("the root of the URDF", "<worldbody>"), *DRAWING)
 
 Attributes = Mapping[str, str]
 Defaults = dict[str, dict[str, str]]  # attributes by element
@@ -94,7 +94,7 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
     values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
-    return Source(path, file, urdf, notes * bool(dropped), values, words=_WORDS)
+    return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
 
 
 class MjcfReader:

@@ -12,11 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.equations import is_constrained, machine_equations, machine_equations_at
+from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.model import (
     B_at,
     Machine,
-    readings_at_poses,
     slider_columns,
     vectors_A_to_B,
     vectors_at,
@@ -36,7 +35,7 @@ def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
 
 
 def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
-    """Return the freedoms of the platform, the bodies that it carries counted.
+    """Return the freedoms of the platform.
 
     The rank is taken where the closures have their largest among closed configurations, of which
     some should be near home only, because a symmetric pose may be singular.
@@ -70,9 +69,6 @@ def _moved(machine: Machine, motions: Array) -> int:
     scale = leg_scale(machine, machine.home)
     twist = machine.chain.twist(machine.base, machine.platform) @ motions
     twist[:3] /= scale
-    for joint in machine.internal_joints:
-        rate = motions[machine.chain.v_index(joint.joint)] / (1.0 if joint.turns else scale)
-        twist = np.concatenate([twist, rate[None]])
     return int(np.sum(np.linalg.svd(twist, compute_uv=False) > RANK_TOLERANCE))
 
 
@@ -174,12 +170,10 @@ def dimensionless(
     machine: Machine,
     poses: Array,
     motors: Sequence[int] | None = None,
-    readings: Array | None = None,
 ) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
-    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some. *readings*
-    (k, n_motors) matter where poses leave joints inside the platform free.
+    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some.
     """
     motors = list(machine.motors if motors is None else motors)
     R, t = poses[:, :3, :3], poses[:, :3, 3]
@@ -188,16 +182,10 @@ def dimensionless(
     lengths = np.linalg.norm(vectors, axis=2)
     scale = lengths.mean(axis=1)[:, None, None]
     centre = turned.mean(axis=1, keepdims=True)
-    jacobian = None
-    if machine.internal_joints:
-        if readings is None:
-            readings = readings_at_poses(machine, poses)[:, motors]
-        jacobian = machine_equations_at(machine, R, t, readings).by_pose
-    elif is_constrained(machine):
+    if is_constrained(machine):
         equations = machine_equations(machine, R, t)
         counts = ~equations.measured | np.isin(equations.leg, motors)
         jacobian = equations.by_pose[:, counts]
-    if jacobian is not None:
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
         return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
     u = (vectors / lengths[..., None])[:, motors]  # lines alone; of rods one hangs on each

@@ -4,18 +4,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import OutOfClass, UsageError
+from legcal.errors import UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
-from legcal.machine.drawing import Sketch, motor_lines
 from legcal.machine.leg import (
     Cylinder,
     KinematicParameters,
@@ -27,18 +26,12 @@ from legcal.machine.leg import (
 from legcal.machine.rods import (
     AT_ZERO,
     actuators_of,
-    coordinates_at,
     first_rods,
-    internal_joints_of,
     joints_at,
-    platform_joints_at,
     reading_legs,
     reading_of_rod,
 )
 from legcal.machine.urdf import Urdf
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @brief
@@ -75,6 +68,12 @@ class Machine:
         reach = float(np.ptp(self.A_base, axis=0).max())
         return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
 
+    @cached_property
+    def size(self) -> float:
+        """Mean leg length at home [m]: what errors and tolerances of lengths are parts of."""
+        vectors = vectors_at(self, self.home.as_matrix()[None])[0]
+        return float(np.linalg.norm(vectors, axis=1).mean())
+
     @property
     def n_legs(self) -> int:
         """Number of legs."""
@@ -92,7 +91,7 @@ class Machine:
 
     @cached_property
     def reads(self) -> tuple[int, ...]:
-        """The leg whose motor moves each leg: its own, or the first on the same actuator."""
+        """Index of the leg whose encoder reads each leg: rods on one motor share one."""
         return reading_legs(self.legs)
 
     @property
@@ -120,30 +119,6 @@ class Machine:
     def actuators(self) -> tuple[Actuator, ...]:
         """What moves joints at A, each once, in the base link."""
         return actuators_of(self.legs)
-
-    @cached_property
-    def internal_joints(self) -> tuple[Actuator, ...]:
-        """The joints inside a platform of several bodies, each once, in the platform link."""
-        return internal_joints_of(self.legs)
-
-    def require_rigid_platform(self) -> "Machine":
-        """Return the machine itself, for what can be done with a platform of one body only.
-
-        Raises
-        ------
-        OutOfClass
-            If its platform has several bodies.
-        """
-        if not self.internal_joints:
-            return self
-        joints = " and ".join(f"'{joint.joint}'" for joint in self.internal_joints)
-        plural = "s" * (len(self.internal_joints) > 1)
-        raise OutOfClass(
-            f"{self.yaml_path}: legcal identifies machines whose platform has several bodies, and "
-            f"does not calibrate them yet: found the joint{plural} {joints} inside the platform, "
-            "needed one rigid platform; inspect and identify work, and forward and inverse "
-            "kinematics in Python."
-        )
 
     @property
     def at_zero(self) -> str:
@@ -200,7 +175,7 @@ class Machine:
 
     @property
     def B_platform(self) -> Array:
-        """Platform joint centres in the platform link, (n_legs, 3) [m]; internal joints at 0."""
+        """Platform joint centres in the platform link, (n_legs, 3) [m]."""
         return self._arrays[1].copy()
 
     @property
@@ -266,30 +241,6 @@ class Machine:
         found = parameters_of_legs(self.legs_of_frames)
         return replace(found, base_joints=base, platform_joints=platform)
 
-    def plot(self) -> "Figure":
-        """Return a figure of the machine at home from above and from the side, in millimetres.
-
-        Joints have the number of their leg (A1 on the base, B1 on the platform); those that define
-        R_b and R_e have a ring, and axes are red (x), green (y) and blue (z).
-        """
-        return self.sketch.plot()
-
-    @cached_property
-    def sketch(self) -> Sketch:
-        """What pictures of the machine at home show."""
-        B = B_at(self, self.home.as_matrix()[None])[0]
-        A = B - vectors_A_to_B(self, self.home)
-        return Sketch.of(
-            self.name,
-            self.leg_names,
-            self.frame_legs,
-            tuple(max([c.radius for c in leg.cylinders], default=0.0) for leg in self.legs),
-            (A, B),
-            (("R_b", self.T_base_Rb), ("R_e", self.home * self.T_platform_Re)),
-            motor_lines(self.legs, A[None]),
-            spatial=self.spatial,
-        )
-
     def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
         """Return the mechanism with other radii of its visible cylinders, as :func:`with_radii`."""
         others = with_radii([leg.cylinders for leg in self.legs], radius)
@@ -326,23 +277,10 @@ def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
 def B_at(machine: Machine, poses: Array) -> Array:
     """Return the platform joint centres in the base link, (k, n_legs, 3) [m].
 
-    At poses T_base_platform (k, 3 or 4, 4); a body of a platform of several is where its rods hold
-    it.
+    Poses T_base_platform are (k, 3 or 4, 4).
     """
     R, t = poses[:, :3, :3], poses[:, :3, 3]
-    B = machine.B_platform
-    if machine.internal_joints:
-        B = platform_joints_at(machine.legs, internal_coordinates(machine, poses))
-    return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
-
-
-def internal_coordinates(machine: Machine, poses: Array) -> Array:
-    """Return the coordinates of the joints inside the platform at the same poses, (k, n).
-
-    Those that the pose leaves free are at zero.
-    """
-    found = coordinates_at(machine.legs, poses[:, :3, :3], poses[:, :3, 3])
-    return found[:, len(machine.actuators) :]
+    return np.asarray(machine.B_platform @ np.swapaxes(R, 1, 2) + t[:, None])
 
 
 def vectors_at(machine: Machine, poses: Array) -> Array:

@@ -246,7 +246,7 @@ def check_closes(machine: Machine) -> None:
             f"{machine.yaml_path}: the mechanism does not close at home: found a pose "
             f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
             f"readings, needed at most {1e3 * CLOSES:.0e} mm and {np.degrees(CLOSES):.0e} deg; "
-            "check legcal.home."
+            f"check {machine.urdf.wording.home}."
         )
 
 

@@ -11,7 +11,7 @@ get a link of its own there (:func:`with_own_origins`).
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -125,7 +125,7 @@ def with_own_origins(
                     frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
                 )
                 changed = _renamed(changed, frame, link)
-            urdf = parse_urdf(urdf.path, patch.content())
+            urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
             return urdf, changed
 
@@ -138,10 +138,7 @@ def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
     if chain.actuator is not None:
         arm = handles.link(chain.actuator, chain.actuator.far)
         handles.of(chain.steps[1], chain.steps[1].near, arm, leg.name)
-    platform = machine.platform
-    if chain.internal is not None:
-        platform = handles.link(chain.internal, chain.internal.far)
-    handles.of(last, last.far, platform, leg.name)
+    handles.of(last, last.far, machine.platform, leg.name)
     if chain.slider is None:
         _in_rod(handles, leg, chain, (0.0, 0.0))
 

@@ -1,13 +1,12 @@
 """The parameter vector of legs: names, units, where each number stands, and steps on it.
 
 Parameters are joint centres in R_b and R_e, without those that are zero by the definition of these
-frames (their gauge), lengths, two turns of each axis that is a parameter, the lines of the joints
-inside a platform of several bodies, and twists where asked.
+frames (their gauge), lengths, two turns of each axis that is a parameter, and twists where asked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -28,17 +27,15 @@ from legcal.machine.leg import (
     with_platform_points,
 )
 from legcal.machine.model import Machine
-from legcal.machine.rods import actuators_of, internal_joints_of
+from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.rods import actuators_of
 
-ARM_KINDS = ("arm_axis", "arm_point")  # of parameters: the line of an arm
 _STEP = 1e-6  # [m or rad], of numerical derivatives
 # Of LegColumns, in this order
 _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
     *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # of its actuator
-    *((21, 22), (23, 24)),  # of the joint that carries B in the platform
 )
-_COORDINATES = ("x", "y", "z", "1", "2")  # of what is more than one number
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
@@ -53,15 +50,15 @@ class Parametrization:
 
     names: tuple[str, ...]  # leg2.base.x, leg1.offset, leg1.length, leg1.base_axis.1, leg1.twist
     units: tuple[str, ...]  # m or rad
-    # (n_legs, 25) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator, or
-    # of a joint inside the platform, are shared by all legs on it
+    # (n_legs, 21) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator are
+    # shared by all legs on it
     place: IntArray
 
     def __len__(self) -> int:
         return len(self.names)
 
     def scatter(self, by_local: Array, leg: int) -> Array:
-        """Return derivatives (..., 25) by a leg's numbers as derivatives by all parameters."""
+        """Return derivatives (..., 21) by a leg's numbers as derivatives by all parameters."""
         place = self.place[leg]
         wide = np.zeros((*by_local.shape[:-1], len(self)))
         wide[..., place[place >= 0]] = by_local[..., place >= 0]
@@ -89,9 +86,6 @@ def parametrize(
             free[j, ActuatorColumns.GAIN] = twists
             has_arm = twists and leg.actuator.arm is not None
             free[j, ActuatorColumns.ARM_AXIS] = free[j, ActuatorColumns.ARM_POINT] = has_arm
-        if leg.internal is not None:
-            free[j, columns.INTERNAL_AXIS] = True
-            free[j, columns.INTERNAL_POINT] = leg.internal.turns
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is anywhere on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
@@ -105,7 +99,7 @@ def parametrize(
                 if column < columns.OWN:
                     name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
                 else:
-                    name, unit = _name_of_joint(leg, column)
+                    name, unit = _name_of_actuator(leg, column)
                     shared = next((i for i, (n, _) in enumerate(found) if n == name), None)
                     if shared is not None:
                         place[j, column] = shared
@@ -113,17 +107,6 @@ def parametrize(
                 place[j, column] = len(found)
                 found.append((name, unit))
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
-
-
-def kind_of_parameter(name: str) -> str:
-    """Return what a parameter is, the name of its leg or motor (which may have dots) left out."""
-    parts = name.split(".")
-    return parts[-2] if len(parts) > 2 and parts[-1] in _COORDINATES else parts[-1]
-
-
-def owner_of_parameter(name: str, owners: Iterable[str]) -> str:
-    """Return which of some legs, or views, a parameter is of; "" if none. Names may have dots."""
-    return max((owner for owner in owners if name.startswith(f"{owner}.")), key=len, default="")
 
 
 def _local_name(leg: Leg, column: int) -> str:
@@ -137,14 +120,14 @@ def _unit(column: int) -> str:
     return "m" if column <= LegColumns.LENGTH else "rad"
 
 
-def _name_of_joint(leg: Leg, column: int) -> tuple[str, str]:
-    """Return the name and the unit of a number of what carries an end of a leg."""
-    joint = leg.actuator if column < LegColumns.ACTUATOR.stop else leg.internal
-    if joint is None:
-        raise ValueError("an end of a leg that nothing carries has no numbers of a joint")
+def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
+    """Return the name and the unit of a number of the actuator of a leg."""
+    actuator = leg.actuator
+    if actuator is None:
+        raise ValueError("a leg that hangs on no actuator has no numbers of one")
     if column == ActuatorColumns.GAIN:
-        return f"{joint.joint}.gain", ""
-    axis = "axis" if joint.turns else "direction"
+        return f"{actuator.joint}.gain", ""
+    axis = "axis" if actuator.turns else "direction"
     what, columns, unit = next(
         (what, columns, unit)
         for what, columns, unit in (
@@ -152,12 +135,10 @@ def _name_of_joint(leg: Leg, column: int) -> tuple[str, str]:
             ("axis_point", ActuatorColumns.POINT, "m"),
             ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
             ("arm_point", ActuatorColumns.ARM_POINT, "m"),
-            (axis, LegColumns.INTERNAL_AXIS, "rad"),
-            ("axis_point", LegColumns.INTERNAL_POINT, "m"),
         )
         if columns.start <= column < columns.stop
     )
-    return f"{joint.joint}.{what}.{column - columns.start + 1}", unit
+    return f"{actuator.joint}.{what}.{column - columns.start + 1}", unit
 
 
 def is_held_by_default(name: str) -> bool:
@@ -165,7 +146,7 @@ def is_held_by_default(name: str) -> bool:
 
     That of an arm which is seen is estimated about where the model draws it.
     """
-    return kind_of_parameter(name) in ("twist", "gain", *ARM_KINDS)
+    return ParameterId.parse(name).kind in ("twist", "gain", *ARMS)
 
 
 def parametrization_of(machine: Machine, *, twists: bool = False) -> Parametrization:
@@ -223,7 +204,6 @@ def _in_frames(
         return None if axis is None else matrix[:3, :3] @ axis
 
     moved = {actuator.joint: actuator.in_frame(base) for actuator in actuators_of(legs)}
-    inner = {joint.joint: joint.in_frame(platform) for joint in internal_joints_of(legs)}
     return tuple(
         replace(
             leg,
@@ -233,7 +213,6 @@ def _in_frames(
             platform_axis=turned(platform, leg.platform_axis),
             twist=twist_after(leg, turn),
             actuator=None if leg.actuator is None else moved[leg.actuator.joint],
-            internal=None if leg.internal is None else inner[leg.internal.joint],
         )
         for leg in legs
     )
@@ -266,7 +245,7 @@ def vector_of(
 
 
 def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
-    """Return the numbers of legs, (n_legs, 25), in the order of :class:`LegColumns` [m, rad].
+    """Return the numbers of legs, (n_legs, 21), in the order of :class:`LegColumns` [m, rad].
 
     Axes are ``axis_angles`` from the nominal ones, zero for legs without one.
     """
@@ -280,15 +259,13 @@ def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
         row[LegColumns.TWIST] = _twist(leg, start)
         if leg.actuator is not None and start.actuator is not None:
             row[LegColumns.ACTUATOR] = leg.actuator.numbers(start.actuator)
-        if leg.internal is not None and start.internal is not None:
-            row[LegColumns.INTERNAL] = leg.internal.numbers(start.internal)[:4]
     return numbers
 
 
 def with_numbers(
     legs: Sequence[Leg], nominal: Sequence[Leg], numbers: Array, given: BoolArray
 ) -> tuple[Leg, ...]:
-    """Return legs of which some numbers, *given* (n_legs, 25), are those of :func:`numbers_of`.
+    """Return legs of which some numbers, *given* (n_legs, 21), are those of :func:`numbers_of`.
 
     Where an axis at the platform or a twist is given the leg has its twist as given.
     """
@@ -316,15 +293,11 @@ def with_numbers(
         )
         if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any():
             moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
-        of_actuator, inside = own[LegColumns.ACTUATOR], own[LegColumns.INTERNAL]
+        of_actuator = own[LegColumns.ACTUATOR]
         if leg.actuator is not None and start.actuator is not None and of_actuator.any():
             numbers_there = leg.actuator.numbers(start.actuator)
             wanted = np.where(of_actuator, row[LegColumns.ACTUATOR], numbers_there)
             moved = replace(moved, actuator=leg.actuator.with_numbers(start.actuator, wanted))
-        if leg.internal is not None and start.internal is not None and inside.any():
-            wanted = leg.internal.numbers(start.internal)
-            wanted[:4] = np.where(inside, row[LegColumns.INTERNAL], wanted[:4])
-            moved = replace(moved, internal=leg.internal.with_numbers(start.internal, wanted))
         found.append(moved)
     return tuple(found)
 
@@ -352,11 +325,6 @@ def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, 
                 twist=None if twist is None else twist + float(local[columns.TWIST]),
                 actuator=(
                     None if leg.actuator is None else leg.actuator.moved(local[columns.ACTUATOR])
-                ),
-                internal=(
-                    None
-                    if leg.internal is None
-                    else leg.internal.with_line(leg.internal.line.moved(local[columns.INTERNAL]))
                 ),
             )
         )

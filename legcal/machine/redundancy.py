@@ -13,7 +13,7 @@ them from wrong readings: they are estimated from the readings, with a prior.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -23,12 +23,14 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
-from legcal.machine.model import Machine, readings_at, slider_columns, vectors_A_to_B
+from legcal.machine.mobility import leg_scale
+from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import actuator_index
 from legcal.machine.solved_poses import solve_poses
 
-ROUGH_READING = 6e-5  # standard deviation of rough readings, as far as they move a joint [m]
+# Standard deviation of rough readings, as far as they move a joint: of the mean leg length
+ROUGH_READING = 1.5e-4
 REJECTION = 4.5  # a test beyond is that of a wrong reading; of a right one in 150,000 it is
 AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearly the wrong one
 MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
@@ -87,7 +89,7 @@ class Contradiction:
     allowed: float  # how far that of the first may be if readings agree [m]
 
     def in_words(self, machine: Machine) -> str:
-        """Return what is found, and what was needed."""
+        """Describe how far the redundant readings disagree, and how far they may."""
         legs = [machine.legs[j] for j in self.legs]
         first, *others = [leg.motor_label for leg in legs]
         also = zip(others, self.distances[1:], strict=True)
@@ -120,8 +122,8 @@ def contradictions(
         return {}
     R, t = components(T_Rb_Re)
     unit = np.array([machine.legs[j].reading_of(1.0) for j in machine.motors])  # of a metre
-    sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, ROUGH_READING)
     surplus = _Surplus.of(machine, R, t, readings)
+    sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, surplus.rough)
     used, scale = np.ones(len(readings), dtype=np.bool_), 1.0
     model = _fitted_model(surplus, sigma_m, used)
     # One after the other, since a wrong one bends the model, and others seem wrong in its place.
@@ -198,6 +200,7 @@ class _Surplus:
     by_reading: Array  # (k, s, n_motors) by what readings move joints [m]
     by_model: Array  # (k, s, p) by parameters, over their standard deviations
     is_told: BoolArray  # (k, n_motors) of which readings they say anything
+    rough: float  # standard deviation of what is not exact [m]
 
     @classmethod
     def of(cls, machine: Machine, R: Array, t: Array, readings: Array) -> _Surplus:
@@ -214,25 +217,29 @@ class _Surplus:
             else:
                 by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
         parametrization = parametrization_of(machine)
-        length = float(np.mean([np.linalg.norm(v) for v in vectors_A_to_B(machine, machine.home)]))
+        length = leg_scale(machine, machine.home)
         size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
         by_model = found.by_parameters(parametrization) * (_MODEL * size)
         values, own, of_model = (
             np.einsum("kms,km...->ks...", left, x) for x in (found.values, by_reading, by_model)
         )
         share = np.sum(own**2, axis=1) / np.maximum(np.sum(by_reading**2, axis=1), 1e-300)
-        return cls(values, own, of_model, share > _SAYS)
+        return cls(values, own, of_model, share > _SAYS, ROUGH_READING * length)
 
     def at(self, poses: BoolArray) -> _Surplus:
         """Return those of some poses."""
-        return _Surplus(
-            self.values[poses], self.by_reading[poses], self.by_model[poses], self.is_told[poses]
+        return replace(
+            self,
+            values=self.values[poses],
+            by_reading=self.by_reading[poses],
+            by_model=self.by_model[poses],
+            is_told=self.is_told[poses],
         )
 
     def information(self, sigma_m: Array) -> Array:
         """Return the inverse covariance (k, s, s) if the model is right."""
         moved = self.by_reading * sigma_m
-        rough = ROUGH_READING**2 * np.eye(self.values.shape[1])  # constraints are not exact either
+        rough = self.rough**2 * np.eye(self.values.shape[1])  # constraints are not exact either
         return np.asarray(np.linalg.inv(moved @ np.swapaxes(moved, 1, 2) + rough))
 
 

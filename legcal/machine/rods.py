@@ -1,7 +1,6 @@
-"""What carries the ends of rods: which hang on which, where A and B are, and at which readings.
+"""What carries the joints A of rods: which hang on which, where A is, and at which readings.
 
-See :mod:`legcal.machine.actuator` for how A and B move. The coordinates of a machine at a pose are
-the readings of its actuators, and after them those of the joints inside its platform.
+See :mod:`legcal.machine.actuator` for how A moves with the reading of its actuator.
 """
 
 from __future__ import annotations
@@ -17,85 +16,50 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
-from legcal.machine.solver import solve
 
-_CLOSED = 1e-15  # [m], of the lengths of rods
-_MAX_STEP = 0.3  # [rad or m] of an internal joint towards where rods hold it
-_STALLED = 3  # steps that hardly improve: the squares are least there
 AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, after their name
 
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the actuators of legs, each once, in the order of their first legs."""
-    return _each_once([leg.actuator for leg in legs])
+    found: dict[str, Actuator] = {}
+    for leg in legs:
+        if leg.actuator is not None:
+            found.setdefault(leg.actuator.joint, leg.actuator)
+    return tuple(found.values())
 
 
 def actuator_index(legs: Sequence[Leg]) -> list[int]:
     """Return which of :func:`actuators_of` each leg hangs on, -1 for none."""
-    return _places([leg.actuator for leg in legs])
-
-
-def internal_joints_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
-    """Return the joints inside a platform of several bodies, each once, by their first legs."""
-    return _each_once([leg.internal for leg in legs])
-
-
-def internal_index(legs: Sequence[Leg]) -> list[int]:
-    """Return which of :func:`internal_joints_of` carries B of each leg, -1 for none."""
-    return _places([leg.internal for leg in legs])
-
-
-def _each_once(joints: Sequence[Actuator | None]) -> tuple[Actuator, ...]:
-    """Return the joints that carry ends of legs, each once, in the order of their first legs."""
-    found: dict[str, Actuator] = {}
-    for joint in joints:
-        if joint is not None:
-            found.setdefault(joint.joint, joint)
-    return tuple(found.values())
-
-
-def _places(joints: Sequence[Actuator | None]) -> list[int]:
-    """Return which of :func:`_each_once` each leg has, -1 for none."""
-    number = {joint.joint: i for i, joint in enumerate(_each_once(joints))}
-    return [-1 if joint is None else number[joint.joint] for joint in joints]
+    number = {actuator.joint: i for i, actuator in enumerate(actuators_of(legs))}
+    return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
 
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """Many points that ride on joints, each on its path (:meth:`Actuator.path`)."""
+    """The joints A of legs, each on the path of its actuator (:meth:`Actuator.path`)."""
 
-    on: IntArray  # (n,) which joint carries each, of those that are counted once; -1 for none
-    gain: Array  # (n,) of joints that turn
+    on: IntArray  # (n,) which of :func:`actuators_of` carries each; -1 for none
+    gain: Array  # (n,) of actuators that turn
     middle: Array  # (n, 3), as the others [m]
     cos: Array
     sin: Array
     slide: Array
 
-    @classmethod
-    def of(cls, points: Array, joints: Sequence[Actuator | None]) -> Carried:
-        """Return points (n, 3), where their joints are at 0, on a joint each."""
-        middle, cos, sin, slide = points.copy(), *(np.zeros_like(points) for _ in range(3))
-        gain = np.zeros(len(points))
-        for j, joint in enumerate(joints):
-            if joint is not None:
-                middle[j], cos[j], sin[j], slide[j] = joint.path(points[j])
-                gain[j] = joint.gain if joint.turns else 0.0
-        return cls(np.array(_places(joints), dtype=np.intp), gain, middle, cos, sin, slide)
-
     def at(self, q: Array) -> Array:
-        """Return the points (k, n, 3) at coordinates of joints (k, n_joints)."""
+        """Return the joints (k, n, 3) at readings of actuators (k, n_actuators)."""
         own, angle = self._own(q)
         found = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
         return np.asarray(found + self.slide * own)
 
-    def by_coordinate(self, q: Array) -> Array:
-        """Return how each point moves with its joint there, (k, n, 3)."""
+    def by_reading(self, q: Array) -> Array:
+        """Return how each joint moves with the reading of its actuator there, (k, n, 3)."""
         _, angle = self._own(q)
         turning = self.sin * np.cos(angle) - self.cos * np.sin(angle)
         return np.asarray(self.gain[:, None] * turning + self.slide)
 
     def _own(self, q: Array) -> tuple[Array, Array]:
-        """Return the coordinate of the joint of each point, and its angle, (k, n, 1)."""
+        """Return the reading of the actuator of each joint, and its angle, (k, n, 1)."""
         own = np.zeros((len(q), len(self.on)))
         carried = self.on >= 0
         own[:, carried] = q[:, self.on[carried]]
@@ -105,20 +69,14 @@ class Carried:
 @lru_cache(maxsize=16)
 def carried_at_A(legs: tuple[Leg, ...]) -> Carried:
     """Return the joints A of legs, which ride on actuators."""
-    A = np.array([leg.A for leg in legs]).reshape(-1, 3)
-    return Carried.of(A, [leg.actuator for leg in legs])
-
-
-@lru_cache(maxsize=16)
-def carried_at_B(legs: tuple[Leg, ...]) -> Carried:
-    """Return the joints B of legs, which ride on joints inside the platform."""
-    B = np.array([leg.B for leg in legs]).reshape(-1, 3)
-    return Carried.of(B, [leg.internal for leg in legs])
-
-
-def platform_joints_at(legs: Sequence[Leg], s: Array) -> Array:
-    """Return B of legs (k, n_legs, 3) [m] in a platform whose internal joints are at s (k, n)."""
-    return carried_at_B(tuple(legs)).at(s)
+    middle = np.array([leg.A for leg in legs]).reshape(-1, 3)
+    cos, sin, slide = (np.zeros_like(middle) for _ in range(3))
+    gain = np.zeros(len(legs))
+    for j, leg in enumerate(legs):
+        if leg.actuator is not None:
+            middle[j], cos[j], sin[j], slide[j] = leg.actuator.path(leg.A)
+            gain[j] = leg.actuator.gain if leg.actuator.turns else 0.0
+    return Carried(np.array(actuator_index(legs), dtype=np.intp), gain, middle, cos, sin, slide)
 
 
 def joints_at(legs: Sequence[Leg], q: Array) -> Array:
@@ -147,13 +105,13 @@ def ends_at_poses(
     Joints at A that move are where readings q (k, n_actuators) have them, or without these where
     the first rod on their actuator reaches the platform.
     """
-    c = coordinates_at(legs, R, t, q)
-    n = len(actuators_of(legs))
-    return joints_at(legs, c[:, :n]), _in_base(R, t, platform_joints_at(legs, c[:, n:]))
+    q = readings_of_rods(legs, R, t) if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
+    return joints_at(legs, q), _platform_joints(legs, R, t)
 
 
-def _in_base(R: Array, t: Array, B: Array) -> Array:
-    """Return points B (k, n, 3) of the platform in the frame of the base, at poses R, t."""
+def _platform_joints(legs: Sequence[Leg], R: Array, t: Array) -> Array:
+    """Return B of legs (k, n_legs, 3) [m] in the frame of the base at poses R, t."""
+    B = np.array([leg.B for leg in legs]).reshape(-1, 3)
     return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
 
 
@@ -169,7 +127,7 @@ def ends_in_base(
 
 
 def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
-    """Return whose reading each leg has: its own, or of rods on one actuator that of the first."""
+    """Return the index of the leg whose encoder reads each leg: rods on one motor share one."""
     first: dict[str | None, int] = {}
     return tuple(
         j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
@@ -184,72 +142,13 @@ def first_rods(legs: Sequence[Leg]) -> list[int]:
 
 def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
     """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
-    return coordinates_at(legs, R, t)[:, : len(actuators_of(legs))]
-
-
-def coordinates_at(
-    legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None, s: Array | None = None
-) -> Array:
-    """Return readings of actuators and then coordinates of internal joints, (k, n), at poses R, t.
-
-    Readings are *q* (k, n_actuators), or one row for all, if they are given, else those at which
-    the first rod on each actuator reaches the platform. Internal joints stand where rods miss their
-    lengths least, near *s* (k, n), or near zero: there if the pose leaves them free, as on an I4.
-    """
-    s = np.zeros((len(t), len(internal_joints_of(legs)))) if s is None else s
-    q = None if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
-    if s.shape[1]:
-        found = solve(
-            lambda points: _missed_lengths(legs, R, t, points, q),
-            lambda points, step: points + np.clip(step, -_MAX_STEP, _MAX_STEP),
-            s,
-            tolerance=_CLOSED,
-            damped=True,
-            max_stalled=_STALLED,
-        )
-        s = found.points
-    if q is None:
-        q = _readings_at(legs, _in_base(R, t, platform_joints_at(legs, s)))
-    return np.concatenate([q, s], axis=1)
-
-
-def _readings_at(legs: Sequence[Leg], B: Array) -> Array:
-    """Return the readings (k, n) at which the first rods on actuators reach B (k, n_legs, 3)."""
     first = first_rods(legs)
-    q = np.zeros((len(B), len(first)))
-    for a, j in enumerate(first):
-        q[:, a] = reading_of_rod(legs[j], B[:, j])
+    q = np.zeros((len(t), len(first)))
+    if first:
+        B = _platform_joints(legs, R, t)
+        for a, j in enumerate(first):
+            q[:, a] = reading_of_rod(legs[j], B[:, j])
     return q
-
-
-def _missed_lengths(
-    legs: Sequence[Leg], R: Array, t: Array, s: Array, q: Array | None
-) -> tuple[Array, Array]:
-    """Return what rods on actuators miss at internal coordinates s (k, n) [m], and the slopes by s.
-
-    Without readings q what these can make good is left out of both.
-    """
-    at_A, at_B = carried_at_A(tuple(legs)), carried_at_B(tuple(legs))
-    rods = np.flatnonzero(at_A.on >= 0)
-    B = _in_base(R, t, at_B.at(s))
-    read = _readings_at(legs, B) if q is None else q
-    vectors = (B - at_A.at(read))[:, rods]
-    length = np.linalg.norm(vectors, axis=2)
-    u = vectors / length[..., None]
-    values = length - np.array([leg.q0 for leg in legs])[rods]
-    slopes = np.zeros((*length.shape, s.shape[1]))
-    on_inside = np.flatnonzero(at_B.on[rods] >= 0)
-    by_s = at_B.by_coordinate(s)[:, rods[on_inside]] @ np.swapaxes(R, 1, 2)
-    slopes[:, on_inside, at_B.on[rods[on_inside]]] = np.sum(u[:, on_inside] * by_s, axis=2)
-    by_q = np.zeros((*length.shape, read.shape[1]))
-    if q is None:
-        by_reading = at_A.by_coordinate(read)[:, rods]
-        by_q[:, np.arange(len(rods)), at_A.on[rods]] = np.sum(u * by_reading, axis=2)
-    if q is None:
-        by_q /= np.maximum(np.linalg.norm(by_q, axis=1, keepdims=True), 1e-300)
-        left = np.eye(len(rods)) - by_q @ np.swapaxes(by_q, 1, 2)
-        values, slopes = (left @ values[..., None])[..., 0], left @ slopes
-    return values, slopes
 
 
 def measured_readings(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:

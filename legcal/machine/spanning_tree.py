@@ -25,15 +25,6 @@ from legcal.machine.bodies import frame_link
 from legcal.machine.schema import MechanismFile
 from legcal.machine.urdf import Urdf
 
-DRAWING = (
-    ("legcal.home is not given", "the file draws no closed pose"),
-    ("write legcal.home", "draw the machine nearer to closed"),
-    ("legcal.home", "the pose that the file draws"),
-    (", legcal.base and legcal.platform", " and that the root is the base"),
-    ("legcal.base or legcal.platform", "the joints between them"),
-    ("write legcal.", "write a mechanism YAML with legcal."),
-)
-
 
 @dataclass(frozen=True, eq=False)
 class Source:
@@ -46,13 +37,7 @@ class Source:
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
     is_drawn_open: bool = False  # poses close what a file with all travels draws open
-    words: Sequence[tuple[str, str]] = ()
-
-    def in_format_terms(self, problem: str) -> str:
-        """Return a message that names keys of the YAML in the words of this format."""
-        for key, word in self.words:
-            problem = problem.replace(key, word)
-        return problem
+    drawn: Mapping[str, float] = field(default_factory=dict)  # values of motors there [m, rad]
 
 
 FULL_TURN = 2.0 * pi

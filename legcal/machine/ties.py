@@ -4,16 +4,12 @@ A leg that is fixed to the platform and defines R_e has B at its
 :func:`~legcal.machine.leg.frame_point`: sliding B along the leg together with its offset shows
 nowhere.
 
-A joint inside a platform of several bodies has no reading: where it stands at zero shows nowhere.
-B of the rods that it carries moves with it, and R_e with that of frame legs; what this changes of
-the parameters together is tied.
-
 An overconstrained machine has more constraints of joints than they take freedoms away (an Exechon,
 whose axes are parallel in pairs). Errors of its parameters keep the mobility if the constraints
 stay dependent: at every pose where they hold the machine has self-stresses, forces w of its joints
 in equilibrium, w . F_pose = 0, and a step of the parameters must do no work on any of them,
-w . F_xi step = 0. Over several postures (poses, with what motors and joints inside the platform
-read) these are the ties; parameters move on the manifold where all of them hold.
+w . F_xi step = 0. Over several postures (poses, with what motors read) these are the ties;
+parameters move on the manifold where all of them hold.
 """
 
 from __future__ import annotations
@@ -38,13 +34,12 @@ from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
-    free_coordinates,
     geometries,
     is_spatial,
     moved_legs,
     parametrization_of,
 )
-from legcal.machine.rods import actuators_of, coordinates_at, internal_index, internal_joints_of
+from legcal.machine.rods import actuators_of, readings_of_rods
 from legcal.machine.solver import poses_after
 
 _POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it is seen that
@@ -61,11 +56,11 @@ class TieRows(NamedTuple):
     """Ties at some legs."""
 
     values: Array  # (m,) what is left of each [m]
-    by_local: Array  # (m, n_legs, 25) derivative by the numbers of legs (LegColumns)
+    by_local: Array  # (m, n_legs, 21) derivative by the numbers of legs (LegColumns)
 
 
 class _Postures(NamedTuple):
-    """Poses of R_e in R_b, and what actuators and internal joints read there."""
+    """Poses of R_e in R_b, and what actuators read there."""
 
     R: Array  # (k, 3, 3)
     t: Array  # (k, 3) [m]
@@ -82,11 +77,10 @@ class Ties:
     frame_legs: tuple[int, ...]
     points: tuple[int, ...] = ()  # the frame legs that are fixed to the platform
     n_dependent: int = 0  # constraints at a pose that follow from the others
-    n_zeros: int = 0  # joints inside the platform, whose zeros are tied
     postures: _Postures = _NOWHERE  # where constraints are looked at
 
     def __bool__(self) -> bool:
-        return bool(self.points) or self.n_dependent > 0 or self.n_zeros > 0
+        return bool(self.points) or self.n_dependent > 0
 
     def at(self, legs: Sequence[Leg]) -> TieRows:
         """Return the ties at legs; those of constraints are not independent of each other."""
@@ -95,8 +89,6 @@ class Ties:
         for j in self.points:
             value, row = self._point(legs, j)
             parts.append((np.array([value]), row[None]))
-        if self.n_zeros:
-            parts.append((np.zeros(self.n_zeros), self._zeros(legs)))
         if self.n_dependent:
             _, found, stress = _closed(legs, self.n_dependent, self.postures)
             wide = np.zeros((*found.values.shape, *shape))
@@ -124,31 +116,6 @@ class Ties:
             row[others[1], LegColumns.B] += 0.5 * between
         return float((B - frame_point(legs, self.frame_legs, leg)) @ u), row
 
-    def _zeros(self, legs: Sequence[Leg]) -> Array:
-        """Return what other zeros of internal joints change, (n, n_legs, 25)."""
-        B = np.array([leg.B for leg in legs])
-        zero = ~free_coordinates(len(legs), self.frame_legs)
-        # Of the frame, turned about its origin and moved, by its zero coordinates
-        moves = np.broadcast_to(np.eye(3), (len(B), 3, 3))
-        of_frame = np.concatenate([-cross(B[:, None], np.eye(3)), moves], axis=1)
-        columns, inside = LegColumns, np.array(internal_index(legs))
-        first = [int(np.argmax(inside == i)) for i in range(self.n_zeros)]  # of legs that share one
-        rows = np.zeros((self.n_zeros, len(legs), columns.COUNT))
-        for i, (row, joint) in enumerate(zip(rows, internal_joints_of(legs), strict=True)):
-            moved = np.where((inside == i)[:, None], joint.by_reading(B), 0.0)
-            step = np.linalg.solve(of_frame.transpose(0, 2, 1)[zero], moved[zero])
-            turn, shift = step[:3], step[3:]
-            row[:, columns.B] = moved - cross(turn, B) - shift
-            for j, (leg, own) in enumerate(zip(legs, row, strict=True)):
-                if leg.platform_axis is not None:
-                    own[columns.PLATFORM_AXIS] = -normal_basis(leg.platform_axis) @ turn
-                if leg.internal is not None and j in first:
-                    basis = normal_basis(leg.internal.axis)
-                    own[columns.INTERNAL_AXIS] = -basis @ turn
-                    across = basis @ (cross(turn, leg.internal.point) + shift)
-                    own[columns.INTERNAL_POINT] = -across * leg.internal.turns
-        return rows
-
 
 def ties_of(
     legs: Sequence[Leg],
@@ -159,15 +126,14 @@ def ties_of(
     """Return the ties of a machine from its nominal legs in R_b and R_e."""
     fixed = [j for j in frame_legs if legs[j].is_fixed_to_platform]
     defined = any(not legs[j].is_fixed_to_platform for j in frame_legs)
-    n_zeros = len(internal_joints_of(legs))
-    ties = Ties(tuple(frame_legs), tuple(fixed) if defined else (), n_zeros=n_zeros)
+    ties = Ties(tuple(frame_legs), tuple(fixed) if defined else ())
     n_dependent = 0 if home is None or not is_spatial(frame_legs) else _n_dependent(legs, home)
     if home is None or n_dependent == 0:
         return ties
     for n in _POSES:
         at = _postures_near(legs, n_dependent, home, n, 0)
         ties = replace(ties, n_dependent=n_dependent, postures=at)
-        alone = replace(ties, points=(), n_zeros=0)
+        alone = replace(ties, points=())
         rows = alone.at(legs).by_local.reshape(-1, len(legs) * LegColumns.COUNT)
         if np.linalg.matrix_rank(rows, _RANK) < len(rows):  # more poses say no more
             break
@@ -197,7 +163,7 @@ def independent(rows: TieRows, by_unknowns: Array, n: int | None = None) -> tupl
 
 
 def by_step(rows: TieRows, place: IntArray) -> Array:
-    """Return derivatives (m, p) by steps of parameters that stand at *place* (n_legs, 25).
+    """Return derivatives (m, p) by steps of parameters that stand at *place* (n_legs, 21).
 
     Legs may share some, those of what carries their ends.
     """
@@ -212,7 +178,7 @@ def on_ties(
     """Return legs moved to where all ties hold, where the nominal ones are.
 
     Numbers move as little as possible over their *scale* (p,), not at all where that is zero; they
-    stand at *place* (n_legs, 25).
+    stand at *place* (n_legs, 21).
     """
     if not ties:
         return tuple(legs)
@@ -268,7 +234,7 @@ def ties_in_words(machine: Machine) -> str | None:
     ties, found = machine_ties(machine), parametrization_of(machine, twists=True)
     if ties.n_dependent == 0:
         return None
-    rows = replace(ties, n_zeros=0).at(geometries(machine))
+    rows = ties.at(geometries(machine))
     scale = np.where([name == "m" for name in found.units], leg_scale(machine, machine.home), 1.0)
     tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
@@ -298,7 +264,7 @@ def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) 
 
 def _slopes(legs: Sequence[Leg], found: PoseEquations, home: Array) -> tuple[Array, Array]:
     """Return derivatives (k, m, 6 + n) by postures, and what makes these comparable, (6 + n,)."""
-    joints = (*actuators_of(legs), *internal_joints_of(legs))
+    joints = actuators_of(legs)
     length = _length(legs, home)
     unit = np.array([length] * 3 + [1.0] * 3 + [length if j.turns else 1.0 for j in joints])
     return np.concatenate([found.by_pose, found.by_q], axis=2) / unit, unit
@@ -332,7 +298,7 @@ def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
 def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
     """Return how many constraints follow from the others at one pose (3, 4)."""
     R, t = home[None, :, :3], home[None, :, 3]
-    here = _constraints(legs, _Postures(R, t, coordinates_at(legs, R, t)))
+    here = _constraints(legs, _Postures(R, t, readings_of_rods(legs, R, t)))
     if len(here.leg) < 2:
         return 0
     found = np.linalg.svd(_slopes(legs, here, home)[0][0], compute_uv=False)
@@ -344,7 +310,7 @@ def _postures_near(
 ) -> _Postures:
     """Return n postures around home, home first, where the independent constraints hold."""
     R, t = home[None, :, :3], home[None, :, 3]
-    at = _Postures(R, t, coordinates_at(legs, R, t))
+    at = _Postures(R, t, readings_of_rods(legs, R, t))
     slopes, unit = _slopes(legs, _constraints(legs, at), home)
     step = _REACH * np.random.default_rng(seed).uniform(-1.0, 1.0, (n, len(unit)))
     if at.q.shape[1]:  # motors follow the platform, as far as constraints leave it free
@@ -361,7 +327,7 @@ def _closed(
     """Return postures nearby, their constraints and self-stresses (k, m, n_dependent) there.
 
     What the self-stresses see is left, whatever the posture: with errors that are not tied the
-    constraints contradict each other there. The stresses do no work on motors and internal joints.
+    constraints contradict each other there. The stresses do no work on motors.
     """
     home = np.concatenate([at.R[0], at.t[0][:, None]], axis=1)
     for _ in range(_STEPS):

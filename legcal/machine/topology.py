@@ -7,7 +7,7 @@ in front of the first underscore, where that tells them apart. The frames stand 
 joints span the largest triangle, or lie farthest apart in a plane.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -22,10 +22,9 @@ from legcal.geometry.types import Array
 from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
-    CONCURRENT,
-    check_carried,
     classify_leg,
     is_actuator,
+    joint_tolerance,
     nearest,
     off_square,
     parallel,
@@ -50,8 +49,7 @@ def find_chains(
 ) -> list[LegChain]:
     """Return the legs between two links, each classified as joint, slider or rod, joint.
 
-    Several rods may hang on what one of the *motors* on the base moves, and end on a body that the
-    platform carries by a joint.
+    Several rods may hang on what one of the *motors* on the base moves.
 
     Raises
     ------
@@ -62,61 +60,39 @@ def find_chains(
     if ends[0] == ends[1]:
         raise OutOfClass(
             f"{urdf.path}: this is not a parallel mechanism: found the platform '{platform}' fixed "
-            f"to the base '{base}', needed legs between them; correct legcal.base or "
-            "legcal.platform."
+            f"to the base '{base}', needed legs between them; {urdf.wording.correct_ends}."
         )
     origin = bodies.T_body_link[platform][:3, 3]
-    inside = _internal_joints(bodies, urdf, *ends)
-    chains = []
-    for steps in _paths(bodies, urdf, *ends, motors, inside):
-        chain = classify_leg(steps, origin, urdf.path, motors)
-        last = steps[-1]
-        carrier = inside.get(last.connection.bodies[last.far])
-        if carrier is not None:
-            check_carried(chain, carrier, urdf.path)
-            chain = replace(chain, internal=carrier)
-        chains.append(chain)
-    return chains
+    within = joint_tolerance(_joints_on(bodies, end) for end in ends)
+    return [
+        classify_leg(steps, origin, urdf.path, within, motors)
+        for steps in _paths(bodies, urdf, *ends, motors, within)
+    ]
 
 
-def _internal_joints(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> dict[str, Step]:
-    """Return the joint by which the platform carries each body on which legs end, by that body.
-
-    Seen from such a body, the legs without base and platform reach the base by several joints, and
-    the platform by this one.
-    """
-    found = {}
-    for connection in bodies.connections:
-        if platform not in connection.bodies or connection.joint is None:
-            continue
-        near = connection.bodies.index(platform)
-        body = connection.bodies[1 - near]
-        n_joints = sum(body in c.bodies for c in bodies.connections)
-        if body in (base, platform) or n_joints < 3:
-            continue
-        on_base, on_platform = _reached(bodies, body, (base, platform))
-        if len(on_base) > 1 and on_platform == [connection]:
-            found[body] = _step(connection, near, urdf)
-    return found
+def _joints_on(bodies: Bodies, body: str) -> list[Array]:
+    """Return where the joints of a body stand in it, (3,) each [m]."""
+    return [
+        T[:3, 3]
+        for connection in bodies.connections
+        for end, T in zip(connection.bodies, connection.T_body_joint, strict=True)
+        if end == body
+    ]
 
 
 def _paths(
-    bodies: Bodies,
-    urdf: Urdf,
-    base: str,
-    platform: str,
-    motors: Sequence[str],
-    inside: Mapping[str, Step],
+    bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
 ) -> list[list[Step]]:
-    """Return the joints of every leg from base to platform, or to a body that this carries."""
+    """Return the joints of every leg from base to platform."""
     _refuse_second_mechanism(bodies, urdf, base, platform)
+    _refuse_carried_bodies(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
     begun: list[tuple[str, list[Step], Connection]] = []
-    used = {id(step.connection) for step in inside.values()}
+    used = set[int]()
     for first in at.get(base, []):
         step = _step(first, first.bodies.index(base), urdf)
         body = first.bodies[step.far]
@@ -132,7 +108,7 @@ def _paths(
             near = connection.bodies.index(body)
             steps.append(_step(connection, near, urdf))
             body = connection.bodies[1 - near]
-            if body == platform or body in inside:
+            if body == platform:
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
@@ -143,10 +119,10 @@ def _paths(
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
                 problem = ""
-                if len(onward) > 1 and not _is_an_arm(steps):
+                if len(onward) > 1 and not _is_an_arm(steps, within):
                     problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
                 raise OutOfClass(
-                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors)
+                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors, within)
                 )
             connection = onward[0]
         paths.append(steps)
@@ -404,6 +380,24 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
             )
 
 
+def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
+    """Refuse a platform that carries, by a joint, another body on which legs end.
+
+    Seen from such a body, the legs without base and platform reach the base by several joints, and
+    the platform by this one.
+    """
+    for connection in bodies.connections:
+        if platform not in connection.bodies or connection.joint is None:
+            continue
+        body = connection.bodies[1 - connection.bodies.index(platform)]
+        n_joints = sum(body in c.bodies for c in bodies.connections)
+        if body in (base, platform) or n_joints < 3:
+            continue
+        on_base, on_platform = _reached(bodies, body, (base, platform))
+        if len(on_base) > 1 and on_platform == [connection]:
+            raise OutOfClass(_platform_of_several_bodies(urdf, body, connection))
+
+
 def _most_joined(bodies: Bodies, members: set[str]) -> str:
     """Return the body of some where most joints meet."""
     ends = [body for c in bodies.connections for body in c.bodies if body in members]
@@ -461,15 +455,18 @@ def _several_bodies(
             "own, otherwise this machine cannot be calibrated this way."
         )
     if len(on_base) > 1:
-        return (
-            f"{urdf.path}: this machine is outside the method: found a platform of several bodies, "
-            f"with {len(on_base)} legs that meet on link '{body}' and more than the internal "
-            f"{_name(on_platform[0])} between it and the platform, needed one revolute or "
-            "prismatic joint between the platform and each other body on which legs end; name the "
-            "body between these in legcal.platform (on an H4 the bar in the middle), otherwise "
-            "this machine cannot be calibrated this way."
-        )
+        return _platform_of_several_bodies(urdf, body, on_platform[0])
     return ""
+
+
+def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> str:
+    """Return why a platform that carries a body on which legs end is refused."""
+    return (
+        f"{urdf.path}: this machine is outside the method: found a platform of several bodies (as "
+        f"of an H4 or I4), because legs end on link '{body}', which {_name(joint)} connects to the "
+        f"platform, needed legs that end on one rigid platform; make {_name(joint)} fixed if it "
+        "does not move, otherwise this machine cannot be calibrated this way."
+    )
 
 
 def _reached(
@@ -496,7 +493,13 @@ def _reached(
 
 
 def _not_a_chain(
-    urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int, motors: Sequence[str]
+    urdf: Urdf,
+    steps: list[Step],
+    body: str,
+    base: str,
+    n_onward: int,
+    motors: Sequence[str],
+    within: float,
 ) -> str:
     """Return why the leg that starts with some joints is not a chain."""
     needed = "needed one unbranched chain from base to platform for each leg;"
@@ -519,7 +522,7 @@ def _not_a_chain(
         found = "returns to the base"
     elif n_onward == 0:
         found = f"ends at link '{body}' without reaching the platform"
-    elif n_onward > 1 and _is_an_arm(steps):
+    elif n_onward > 1 and _is_an_arm(steps, within):
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = (
             "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
@@ -529,11 +532,12 @@ def _not_a_chain(
         found = f"shares link '{body}' with another leg or branches there"
     return (
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, {needed} check closed_loop, legcal.base and legcal.platform."
+        f"{_name(first)} {found}, {needed} check {urdf.wording.closures}, or "
+        f"{urdf.wording.correct_ends}."
     )
 
 
-def _is_an_arm(steps: list[Step]) -> bool:
+def _is_an_arm(steps: list[Step], within: float) -> bool:
     """Say whether joints make an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
@@ -541,7 +545,7 @@ def _is_an_arm(steps: list[Step]) -> bool:
         return True
     for one, two in pairwise(steps):
         near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
-        if near is None or far is None or float(np.linalg.norm(far - near)) > CONCURRENT:
+        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
             return True
     return False
 
@@ -582,13 +586,11 @@ def _platform_body(
     if n_base < 2:
         joints = "1 joint" if n_base == 1 else "no joint"
         raise OutOfClass(
-            f"{path}: this is not a parallel mechanism: found {joints} on the base (the root of "
-            "the URDF), needed one for each leg; write legcal.base, legcal.platform and "
-            "legcal.legs if another link is the base."
+            f"{path}: this is not a parallel mechanism: found {joints} on the base "
+            f"({urdf.wording.root}), needed one for each leg; {urdf.wording.state_ends} if another "
+            "link is the base."
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
-    # What lies between bodies where chains meet, as the bar in the middle of an H4
-    meeting += [b for b in at if b not in (base, *meeting) and set(at[b]) <= set(meeting)]
     candidates = meeting or [body for body in at if body != base]
     candidates = [body for body in candidates if body in carried] or candidates
     candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last
@@ -605,7 +607,7 @@ def _platform_body(
     if found:
         raise OutOfClass(
             f"{path}: no platform could be proposed: found several links where legs could end "
-            f"({', '.join(found)}), needed one; write legcal.platform and legcal.legs."
+            f"({', '.join(found)}), needed one; {urdf.wording.state_ends}."
         )
     if meeting:
         raise reasons[0]

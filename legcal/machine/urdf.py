@@ -19,6 +19,7 @@ from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.files import read_file
+from legcal.machine.wording import BLOCK, Wording
 
 MAX_ELEMENTS = 50_000
 MAX_LINKS = 1000
@@ -298,6 +299,7 @@ class Urdf:
     joints: dict[str, UrdfJoint]  # joints by name in the order of the file
     root: str  # the link without a parent
     has_cylinders: bool  # whether any visual is a cylinder
+    wording: Wording = BLOCK  # of messages about the mechanism
 
     @property
     def text(self) -> str:
@@ -386,8 +388,7 @@ def _joint(
         problems.add(
             element,
             "has <mimic>, which is not followed",
-            "close the loop in the mechanism YAML, or make a joint beyond the legs fixed (the tool "
-            "on the rack of an I4)",
+            "close the loop in the mechanism YAML, or make a joint beyond the legs fixed",
         )
     axis = _axis(element, kind, problems)
     limits = _limits(element, kind, problems, travel_needed)

@@ -172,7 +172,8 @@ class OutlineEditor:
     An image has ``view`` and ``image`` as the table names it, a ``label``, its ``photograph``
     relative to the page, ``width`` and ``height`` [px], the number of its ``camera``, and
     ``expected``: both ends [px] of outlines that were not found, by leg, part and edge. A camera
-    has ``K``, ``distortion`` and ``model``.
+    has ``K``, ``distortion`` and ``model``. ``reasons`` has the words of each code of a rejection,
+    without a detail and with one in place of ``{}``.
     """
 
     kind: ClassVar = "editor"
@@ -181,6 +182,7 @@ class OutlineEditor:
     images: Sequence[Mapping[str, Any]]
     cameras: Sequence[Mapping[str, Any]]
     sigma: float  # of ends that are placed by hand, unless people say otherwise [px]
+    reasons: Mapping[str, tuple[str, str]]
 
     @cached_property
     def packed(self) -> Markup:

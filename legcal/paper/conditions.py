@@ -8,9 +8,6 @@ The paper has no joints at A that move. Where actuators carry them the counts ar
 and marked as ours: (12) counts the axis of every actuator among the revolute axes, with four
 unknowns of an arm and two of a carriage, and the middle of the circle of every rod on an arm as a
 further point; (6') asks for three readings of a carriage, or five of an arm, in one view.
-
-Nor has it a platform of several bodies. (15) and (17) then count distances within each of them, and
-(17) has the joints on each, up to where it stands, for its unknowns.
 """
 
 from __future__ import annotations
@@ -57,21 +54,17 @@ def count_conditions(
     passive: Collection[int] = (),
     board: bool = False,
     actuators: Sequence[tuple[Collection[int], bool]] = (),
-    bodies: Sequence[Collection[int]] = (),
 ) -> tuple[Condition, ...]:
     """Return (12), (15), (17) and "every leg seen" from the legs that each camera position shows.
 
     As printed. Of E = l + 2(n - N_d) the first term is read as 1; passive legs count in E
     although (19) finds them. ``revolute`` are the legs with a revolute joint at the base,
-    ``actuators`` those on each actuator that moves joints at A, and whether it turns, ``bodies``
-    those on each body of a platform of several.
+    ``actuators`` those on each actuator that moves joints at A, and whether it turns.
     """
     n_d = n_frame_legs(spatial=spatial)  # N_d: joint centres that define a frame
     joints_base = 3 + 3 * (n_legs - n_d) + 2 * len(revolute) if spatial else 2 + 2 * (n_legs - n_d)
     joints_base += sum(4 if turns else 2 for _, turns in actuators)
     joints_platform = 3 + 3 * (n_legs - n_d) if spatial else 1 + 2 * (n_legs - n_d)
-    if bodies:
-        joints_platform = sum(max(3 * len(on) - 6, len(on) - 1) for on in bodies)
     products = distances = 0
     for legs in views:
         n, r = len(set(legs)), len(set(legs) & set(revolute))
@@ -80,9 +73,8 @@ def count_conditions(
         n += middles
         # The arm of a rod is square to the axis of its actuator, which says nothing
         products += comb(r, 2) + comb(n, 2) + r * max(n - 1, 0) - middles
-        ends = set(legs) - set(passive)
-        distances += sum(comb(len(ends & set(on)), 2) for on in bodies or [range(n_legs)])
-    n_offsets, ours = n_legs - len(set(passive)), bool(actuators) or bool(bodies)
+        distances += comb(len(set(legs) - set(passive)), 2)
+    n_offsets, ours = n_legs - len(set(passive)), bool(actuators)
     counts = (
         Condition("eq12", products >= joints_base, products, joints_base, needed=not board),
         Condition("eq15", distances >= n_offsets, distances, n_offsets),

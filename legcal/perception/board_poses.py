@@ -18,6 +18,7 @@ from scipy.special import chdtri
 from legcal.data.corners import Corners
 from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements, few, row_names
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import BoardImages, adjust_board
@@ -158,7 +159,7 @@ def board_poses_in_images(
             continue
         except DatasetError as error:
             wrong += error.problems
-            corners = corners.reject(of_place, "no pose of the board explains it")
+            corners = corners.reject(of_place, Reason.NO_BOARD_POSE)
             continue
         if pose is not None:
             T_camera_board |= dict.fromkeys(rows, pose.T_camera_plane)
@@ -174,7 +175,7 @@ def _without_outliers(corners: Corners, here: IntArray, pose: PlanePose) -> Corn
     off[here] = np.linalg.norm(pose.residual_px, axis=1)
     outlier = np.zeros(len(corners), dtype=np.bool_)
     outlier[here] = _outliers(pose, corners.choose(here))
-    why = [f"{px:.2g} px from where the other corners put it" for px in off]
+    why = [Rejection(Reason.CORNER_OFF, f"{px:.2g}") for px in off]
     return corners.reject(outlier, why)
 
 

@@ -36,25 +36,26 @@ HINTED_SUPPORT = 0.6  # share near a rough pose that is clear
 MIN_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
 HINTED_MIN_SUPPORT = 1.6  # the same near a rough pose
 
-TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
-LAST_TOLERANCES = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
-NOMINAL_JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
+# Lengths are parts of the mean leg length.
+TOLERANCES = (0.12, 0.085, 0.06, 0.044, 0.03, 0.02, 0.015)  # of an axis
+LAST_TOLERANCES = (0.024, 0.017, 0.012, 0.01, 0.0075)  # with the joints known better
+NOMINAL_JOINT_ERROR = 0.015  # standard deviation of the joint centres of the nominal model
 START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, until one is clear
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 N_KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
 N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
 N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
-POLISH = (0.018, 0.012, 0.008)  # tolerances
+POLISH = (0.044, 0.03, 0.02)  # tolerances
 POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
 OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
 SAME_LEG = np.deg2rad(4.0), 0.6  # of two pairs on one leg: angle, distance in widths
 MIN_MATCH_SCORE = 0.15  # score of a segment with its pair that counts as a match
-FINAL_TOLERANCE = 3e-3  # tolerance with which poses are scored in the end [m]
+FINAL_TOLERANCE = 0.0075  # with which poses are scored in the end
 SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
-MIN_MATCHES, MIN_ERROR_OF_FEW = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
+MIN_MATCHES, MIN_ERROR_OF_FEW = 3, 0.0075  # below so many the place of a leg is this uncertain
 
 LEFT_RIGHT = np.array([-1.0, 1.0])
 UP_DOWN = np.array([1.0, -1.0])
@@ -71,7 +72,8 @@ class PoseCandidates:
     support: Array  # (n, n_pictures) legs that agree, by how well and how much of them
     expected: Array  # (n, n_pictures) legs that each picture would show
     score: Array  # (n,) support of all pictures, less what the shifts of the joints cost: legs
-    leg_error: Array  # (n_legs,) of legs from their pairs at the first pose, infinite without [m]
+    # (n_legs,) of legs from their pairs at the first pose, of the mean leg length; infinite without
+    leg_error: Array
     hinted: bool = False  # whether it was searched for near a rough pose only
     by_outlines: bool | None = None  # whether outlines measured at the poses support the first
     # one; None where pairs were clear
@@ -260,7 +262,8 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     found = match_pairs(pictures, poses, FINAL_TOLERANCE)
     value = found.exclusive_score
     support, expected = (_by_legs(pictures, x).T for x in (value, found.visible))
-    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / NOMINAL_JOINT_ERROR**2
+    joint_error = NOMINAL_JOINT_ERROR * pictures.size
+    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
     score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, found, value >= MIN_MATCH_SCORE, score)
     best = poses.take(order[:1])
@@ -307,13 +310,13 @@ def _one_leg(pairs: Array) -> BoolArray:
 
 
 def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
-    """Return the root mean square distance (n_legs,) of legs from their pairs [m]."""
+    """Return the root mean square distance (n_legs,) of legs from their pairs, of the size."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
     found = match_pairs(pictures, pose, FINAL_TOLERANCE)
     matched = found.exclusive_score[:, 0] >= MIN_MATCH_SCORE
     if matched.any():
-        distance = distances(pictures, pose, found)[:, 0]
+        distance = distances(pictures, pose, found)[:, 0] / pictures.size
         np.add.at(square, pictures.leg[matched], distance[matched] ** 2)
         np.add.at(count, pictures.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 
 from legcal.data.outlines import Outlines, join_outlines, no_outlines
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array
 from legcal.perception.outline import (
-    OUTSIDE,
     ImageSearch,
     Method,
     PartLines,
@@ -19,8 +19,6 @@ from legcal.perception.outline import (
 from legcal.perception.placement import Placement, Search, predict_legs_and_arms
 from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run, in_turn
-
-NOT_PLACED = "the camera of its view could not be placed"  # a reason
 
 
 def measure_outlines(
@@ -70,7 +68,8 @@ def _of_image(
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]
         error = np.concatenate([error, [arm.error for arm in arms.values()]])
         for leg in predicted:
-            window[leg.leg] += placement.pixel_error + error[leg.leg] * _pixels_per_metre(leg)
+            joint_error = search.size * error[leg.leg]
+            window[leg.leg] += placement.pixel_error + joint_error * _pixels_per_metre(leg)
     known = placement.blur[view] if placement.blur else np.nan
     blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(
@@ -87,7 +86,7 @@ def _of_image(
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
-    why = NOT_PLACED if T is None else OUTSIDE
+    why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
     others = [PartLines(j, _longest(search, j), (why, why)) for j in wanted if j not in seen]
     return join_outlines([found, outline_table(one, others)]) if others else found, blur
 
@@ -100,5 +99,7 @@ def _longest(search: Search, leg: int) -> str:
 
 def _pixels_per_metre(leg: PredictedLeg) -> float:
     """Return how large a metre appears at the nearer joint of a leg [px/m]."""
-    nearest = max(min(leg.A_camera[2], leg.B_camera[2]), 0.2 * leg.A_camera[2], 1e-3)
+    depths = leg.A_camera[2], leg.B_camera[2]
+    length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
+    nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
     return float(leg.band.scale / nearest)

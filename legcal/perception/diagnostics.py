@@ -18,12 +18,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.image_causes import by_cause, images_in_words
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, is_edited
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.motions import pose_distance
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.perception.detection import NOT_PLACED
-from legcal.perception.outline import HIDDEN, OUTSIDE, TOO_SHORT
 from legcal.perception.pair_matching import (
     CameraPoses,
     Picture,
@@ -34,18 +33,18 @@ from legcal.perception.pair_matching import (
 from legcal.perception.placement import Placement, Search, sensor_extent
 from legcal.workers import Run
 
-TOLERANCE = 0.006  # of an axis from its edge pair [m]
-NOMINAL_TOLERANCE = 0.015  # the same of a leg that nothing has moved from where the model has it
+TOLERANCE = 0.015  # of an axis from its edge pair, of the mean leg length
+NOMINAL_TOLERANCE = 0.0375  # the same of a leg that nothing has moved from where the model has it
 MIN_SHARE = 0.35  # share of the legs that explain
 MIN_GAIN = 2.0, 0.15  # the same against the reading's: factor, more
 MIN_SHARE_OF_USUAL = 0.5  # of the share that the other images of the view reach
 ONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
 AMBIGUOUS = 0.85  # of the best explanation: then another one is about as good
-MIRRORED = "the image is mirrored"  # reasons
-TURNED = "the image is upside down"
 _ORIGINAL = "replace it by the original"  # a remedy
 _ZOOMS = [1.02**k for k in range(-12, 36) if k]  # of images that are zoomed, or cut out and scaled
-_FLIPS = ((LEFT_RIGHT, MIRRORED), (UP_DOWN, MIRRORED), (UPSIDE_DOWN, TURNED))
+_FLIPS = (
+    (LEFT_RIGHT, Reason.MIRRORED), (UP_DOWN, Reason.MIRRORED), (UPSIDE_DOWN, Reason.UPSIDE_DOWN)
+)  # fmt: skip
 
 MAX_SHARE_OF_OTHERS = 0.5  # found, against other images
 N_REFERENCES = 3  # good images that others are compared with
@@ -53,8 +52,7 @@ MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly v
 MIN_USUAL_SHARE = 0.3  # the least that images of a view must find to be compared with
 GOOD_PERCENTILE = 75.0  # percentile of what images find, for what good ones do
 TAKE_AGAIN = "take it again"  # a remedy
-NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
-NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
+NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 
 MILLIMETRE = 1e-3  # [m]
 # Axes of cameras in other software, as columns the x, y and z of ours in them.
@@ -63,8 +61,8 @@ _CAMERA_AXES = {
     "x forward and z up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "x left and y up, or its images are upside down": np.diag([-1.0, -1.0, 1.0]),
 }
-FAR_OFF = (0.06, np.deg2rad(6.0))  # three times what a rough pose is good to: [m], angle
-FAR_OFF_PART = 0.06  # of the distance of the camera, where that is more
+# Three times what a rough pose is good to: part of the distance of the camera, angle
+FAR_OFF = (0.06, np.deg2rad(6.0))
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
 
@@ -72,7 +70,7 @@ class ImageExplanation(NamedTuple):
     """What an image shows."""
 
     own: float  # share of the legs, by visible length, that are where its reading has them
-    reason: str = ""  # what it shows instead; "" where nothing explains it clearly
+    reason: Rejection = USED  # what it shows instead; false where nothing explains it clearly
     remedy: str = ""  # what to do then
 
 
@@ -93,9 +91,9 @@ def find_wrong_images(
     placement: Placement,
     outlines: Outlines,
     rows: IntArray,
-    defects: Mapping[int, str],
+    defects: Mapping[int, Rejection],
     run: Run,
-) -> tuple[Placement, dict[int, str]]:
+) -> tuple[Placement, dict[int, Rejection]]:
     """Return the placement with what is said of images, and why they are left out, by row.
 
     ``rows`` were searched; ``defects`` are what is wrong with single images. A view all of whose
@@ -110,12 +108,12 @@ def find_wrong_images(
     usual = _usual(search, placement, found, suspects, run)
     task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
-    single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
+    single = {row: str(why) for row, why in sorted(defects.items()) if view[row] not in defective}
     notes = left_out_notes(search.measurements, single, dict.fromkeys(single, TAKE_AGAIN))
     why, remedies, barely = dict[int, str](), dict[int, str](), dict[int, str]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
         reason, said, remedy = image_verdict(search.measurements, row, explanation, usual, found)
-        if reason == NOTHING_LIKE:
+        if reason.reason is Reason.OTHER_SCENE:
             reasons[row], barely[row] = reason, f"was left out: {said}; {remedy}."
         elif reason:
             reasons[row], why[row], remedies[row] = reason, said, remedy
@@ -126,7 +124,7 @@ def find_wrong_images(
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
-def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
+def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outlines:
     """Return outlines with those of some images rejected; edited ones stay.
 
     Those that an image should not show keep the reason for that, so that they do not count as
@@ -134,7 +132,7 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
     """
     out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
     reason = tuple(
-        reasons[row] if is_out and not why.startswith(NOT_IN_SIGHT) else why
+        reasons[row] if is_out and why.reason not in NOT_IN_SIGHT else why
         for row, is_out, why in zip(
             outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
         )
@@ -144,32 +142,30 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
 
 def is_out_of_sight(outlines: Outlines) -> BoolArray:
     """Return which outlines an image cannot show: they are outside it, or hidden."""
-    return np.array([why.startswith(NOT_IN_SIGHT) for why in outlines.reason], dtype=np.bool_)
+    return outlines.rejected_for(*NOT_IN_SIGHT)
 
 
 def is_visible(outlines: Outlines) -> BoolArray:
     """Return which outlines an image should show."""
-    hidden = (*NOT_IN_SIGHT, NOT_PLACED)
-    return np.array([not why.startswith(hidden) for why in outlines.reason], dtype=np.bool_)
+    return ~outlines.rejected_for(*NOT_IN_SIGHT, Reason.NOT_PLACED)
 
 
 def is_measurable(outlines: Outlines) -> BoolArray:
     """Return which outlines an image should show at a length that can be measured."""
-    too_short = [why.startswith(TOO_SHORT) for why in outlines.reason]
-    return is_visible(outlines) & ~np.array(too_short, dtype=np.bool_)
+    return is_visible(outlines) & ~outlines.rejected_for(Reason.SHORT)
 
 
 def _without_views(
     measurements: Measurements,
     placement: Placement,
     defective: Sequence[int],
-    defects: Mapping[int, str],
+    defects: Mapping[int, Rejection],
 ) -> Placement:
     """Return the placement with views unplaced all of whose images show nothing."""
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
-        own = {row: why for row, why in defects.items() if measurements.view[row] == v}
+        own = {row: str(why) for row, why in defects.items() if measurements.view[row] == v}
         why = "; ".join(what for what, _ in by_cause(own))
         if len(own) == 1:
             why = f"{measurements.image[next(iter(own))]}: {why}"
@@ -188,18 +184,18 @@ def image_verdict(
     explanation: ImageExplanation,
     usual: Mapping[int, float],
     found: Mapping[int, OutlineCount],
-) -> tuple[str, str, str]:
-    """Return why an image is left out, "" if it is not, what is said of it, and what to do."""
+) -> tuple[Rejection, str, str]:
+    """Return why an image is left out, false if it is not, what is said of it, and what to do."""
     count = found[row]
     much = f"{count.used} of {count.visible} outlines where its reading has the legs"
     if explanation.reason:
-        return explanation.reason, explanation.reason, explanation.remedy
+        return explanation.reason, str(explanation.reason), explanation.remedy
     view = int(measurements.view[row])
     if explanation.own >= MAX_SHARE_OF_OTHERS * usual[view]:
         shows = f"shows little of the legs: found {much}, in other images most"
-        return "", shows, "look at its light and sharpness"
+        return USED, shows, "look at its light and sharpness"
     return (
-        NOTHING_LIKE,
+        Rejection(Reason.OTHER_SCENE),
         f"found {much}, and nothing else that it shows",
         "check that it is a photograph of this machine, taken by this camera at this reading",
     )
@@ -217,7 +213,7 @@ def left_out_notes(
     return notes
 
 
-def images_left_out(outlines: Outlines) -> dict[int, str]:
+def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
     """Return why no outline is used of images that should show some, by row: what most say."""
     found = {}
     for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
@@ -226,9 +222,13 @@ def images_left_out(outlines: Outlines) -> dict[int, str]:
             reasons = Counter(
                 why
                 for i in own.tolist()
-                if (why := outlines.reason[i]) and not why.startswith(NOT_IN_SIGHT)
+                if (why := outlines.reason[i]) and why.reason not in NOT_IN_SIGHT
             )
-            found[row] = reasons.most_common(1)[0][0] if reasons else "no outline is used"
+            found[row] = (
+                reasons.most_common(1)[0][0]
+                if reasons
+                else Rejection(Reason.OTHER, "no outline is used")
+            )
     return found
 
 
@@ -265,9 +265,9 @@ def explain(
     others = [
         (
             _share(replace(picture, pairs=flipped(pairs, picture.corners, flip)), placement, view),
-            why,
+            Rejection(reason),
         )
-        for flip, why in _FLIPS
+        for flip, reason in _FLIPS
     ]
     tried = [(share, why, _ORIGINAL) for share, why in others]
     zooms = [
@@ -276,8 +276,7 @@ def explain(
     ]
     share = max(share for share, _ in zooms)
     zoom = float(np.median([z for own, z in zooms if own == share]))
-    why = f"it shows the legs about {zoom:.2f} times as large as the others: zoom, or a crop scaled"
-    tried.append((share, why, _ORIGINAL))
+    tried.append((share, Rejection(Reason.ZOOMED, f"{zoom:.2f}"), _ORIGINAL))
     rows = _other_readings(search, row)
     readings = [
         (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
@@ -300,15 +299,23 @@ def explain(
                 if other == row
                 else f" at the reading given for image {measurements.image[other]}"
             )
-            why = f"it was taken by the camera of view {other_view.name}{at}"
-            tried.append((share, why, "check which image belongs to which row"))
+            shown = f"it was taken by the camera of view {other_view.name}{at}"
+            tried.append(
+                (
+                    share,
+                    Rejection(Reason.OTHER_VIEW, shown),
+                    "check which image belongs to which row",
+                )
+            )
     share, why, remedy = max(tried, key=lambda one: one[0])
     factor, more = MIN_GAIN
     least = max(MIN_SHARE, MIN_SHARE_OF_USUAL * usual.get(view, 0.0), factor * own, own + more)
     return ImageExplanation(own, why, remedy) if share >= least else ImageExplanation(own)
 
 
-def _at_other_reading(search: Search, row: int, other: int, exchanged: bool) -> tuple[str, str]:
+def _at_other_reading(
+    search: Search, row: int, other: int, exchanged: bool
+) -> tuple[Rejection, str]:
     """Return what an image shows that suits another image's reading, and what to do.
 
     Where that image shows its own reading, the two were not exchanged: it may be near this pose,
@@ -317,7 +324,8 @@ def _at_other_reading(search: Search, row: int, other: int, exchanged: bool) -> 
     measurements = search.measurements
     image, remedy = measurements.image[other], "check which image belongs to which row"
     if exchanged:
-        return f"it shows the reading given for image {image}", remedy
+        shown = f"it shows the reading given for image {image}"
+        return Rejection(Reason.OTHER_READING, shown), remedy
     why = f"its legs are about where the reading of image {image} has them"
     difference = np.abs(measurements.q[row] - measurements.q[other])
     *_, second, first = np.argsort(np.nan_to_num(difference))
@@ -325,7 +333,7 @@ def _at_other_reading(search: Search, row: int, other: int, exchanged: bool) -> 
         given, there = 1e3 * measurements.q[[row, other], first]
         name = search.leg_names[first]
         remedy = f"check its reading of {name}, {given:.2f} mm against {there:.2f} mm, and {remedy}"
-    return why, remedy
+    return Rejection(Reason.OTHER_READING, why), remedy
 
 
 def _best(
@@ -361,7 +369,8 @@ def _picture(
     """Return pairs with what a view should show at the reading of a row."""
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
     targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
-    return Picture(pairs, targets, sensor_extent(search.measurements.views[view].camera))
+    corners = sensor_extent(search.measurements.views[view].camera)
+    return Picture(pairs, targets, corners, search.size)
 
 
 def _share(
@@ -438,7 +447,7 @@ def _leg_notes(
     placement: Placement,
     outlines: Outlines,
     found: Mapping[int, OutlineCount],
-    reasons: Mapping[int, str],
+    reasons: Mapping[int, Rejection],
 ) -> list[str]:
     """Return notes on the legs that views are stated to show."""
     measurements, names = search.measurements, search.leg_names
@@ -487,8 +496,7 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
     """Say whether a rough pose is farther from a pose than rough ones are."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = pose_distance(hint, T_base_camera)
-    nearest, part = reach * FAR_OFF[0], reach * FAR_OFF_PART
-    return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
+    return apart > reach * FAR_OFF[0] * distance or angle > reach * FAR_OFF[1]
 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:

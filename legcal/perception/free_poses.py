@@ -39,7 +39,6 @@ from legcal.geometry.rotations import rotation_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.leg import LegKind
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -58,10 +57,11 @@ from legcal.workers import Run
 N_CHAINS, SEED = 100, 1965  # random walks through the workspace, all at once
 STRIDE, STEPS, SNAPSHOTS = 0.12, 48, (24, 32, 40, 48)  # [rad] and leg lengths; poses that are tried
 KEPT = (100, 30, 8, 3)  # of them, before a step with each of these tolerances
-TOLERANCES = (0.05, 0.035, 0.025, 0.018)  # of an axis beside its pair, cameras being rough [m]
-FITTED = (0.025, 0.018, 0.012, 0.008, 0.006, 0.006)  # of all images together
-EQUATION_SIGMA = 3e-3  # of lengths and constraints by the nominal model [m]
-TRAVEL_SIGMA = 5e-3  # beyond the travel of a slider without a motor [m]
+# Lengths are parts of the mean leg length.
+TOLERANCES = (0.12, 0.085, 0.06, 0.044)  # of an axis beside its pair, cameras being rough
+FITTED = (0.06, 0.044, 0.03, 0.02, 0.015, 0.015)  # of all images together
+EQUATION_SIGMA = 0.0075  # of lengths and constraints by the nominal model
+TRAVEL_SIGMA = 0.0125  # beyond the travel of a slider without a motor
 # Of the score, for squares of what the model says against a pose; larger ones count no more.
 MODEL_COST, MODEL_WIDTH = 0.01, 5.0
 CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle [rad], place as a part of the distance
@@ -123,7 +123,7 @@ class _Scene:
                 camera = cameras[n, image.view]
                 shown = replace(own, share=own.share * self.wanted[image.view, own.leg])
                 at = camera[:, :3], camera[:, 3]
-                found.append(Picture(image.pairs, shown, image.corners, *at))
+                found.append(Picture(image.pairs, shown, image.corners, self.machine.size, *at))
                 index.append(n)
         return Pictures.of(found), np.array(index, dtype=np.intp)
 
@@ -167,7 +167,7 @@ def _drawn(machine: Machine) -> Array:
     Steps of random walks from home that leave the travel are not taken.
     """
     rng = np.random.default_rng(SEED)
-    size = leg_scale(machine, machine.home)
+    size = machine.size
     unit = np.array([1.0] * 3 + [size] * 3)
     poses = np.repeat(machine.home.as_matrix()[None, :3], N_CHAINS, axis=0)
     found = []
@@ -290,7 +290,7 @@ def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
     """Return which are the first n poses (m, 3, 4) that are not near an earlier one."""
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
-    near = np.sqrt(np.mean(off**2, axis=2)) < APART * leg_scale(machine, machine.home)
+    near = np.sqrt(np.mean(off**2, axis=2)) < APART * machine.size
     kept = list[int]()
     for i in range(len(poses)):
         if len(kept) < n and not near[i, kept].any():
@@ -414,7 +414,7 @@ def _camera_unit(rough: Array) -> Array:
 
 def _pose_unit(scene: _Scene) -> Array:
     """Return how far a pose may be from where it is if nothing says so, (6,) [rad, m]."""
-    size = leg_scale(scene.machine, scene.machine.home)
+    size = scene.machine.size
     return np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * size] * 3)
 
 
@@ -453,11 +453,12 @@ def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]
     wanted = np.zeros_like(found.values)
     measured = found.measured
     wanted[:, measured] = (machine.sign * scene.q[k])[:, found.leg[measured]]
-    values, jacobian = (found.values - wanted) / EQUATION_SIGMA, found.by_pose / EQUATION_SIGMA
+    sigma, sigma_travel = EQUATION_SIGMA * machine.size, TRAVEL_SIGMA * machine.size
+    values, jacobian = (found.values - wanted) / sigma, found.by_pose / sigma
     beyond, by_travel = _beyond_travel(machine, poses)
     return (
-        np.concatenate([values, beyond / TRAVEL_SIGMA], axis=1),
-        np.concatenate([jacobian, by_travel / TRAVEL_SIGMA], axis=1),
+        np.concatenate([values, beyond / sigma_travel], axis=1),
+        np.concatenate([jacobian, by_travel / sigma_travel], axis=1),
     )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.light import reduce
 from legcal.vision.image_file import Grey
@@ -58,15 +59,15 @@ class Exposure:
     clipped: float = 0.0  # share of it that is as bright as a file can say
 
     @property
-    def defect(self) -> str:
-        """Why nothing can be seen in the image, "" if something may."""
+    def defect(self) -> Rejection:
+        """Why nothing can be seen in the image; false if something may."""
         if self.bright < BLACK:
-            return f"the image is black, at most {self.bright:.0f} of 255 grey levels"
+            return Rejection(Reason.BLACK, f"{self.bright:.0f}")
         if self.dark > WHITE:
-            return f"the image is overexposed, at least {self.dark:.0f} of 255 grey levels"
+            return Rejection(Reason.OVEREXPOSED_IMAGE, f"{self.dark:.0f}")
         if self.range < MIN_RANGE:
-            return f"the image shows nothing, all of it within {self.range:.0f} of 255 grey levels"
-        return ""
+            return Rejection(Reason.EMPTY, f"{self.range:.0f}")
+        return USED
 
 
 def measure_exposure(grey: Grey) -> Exposure:
@@ -153,7 +154,7 @@ def _blur_of(ratios: Grey) -> float:
 
 def image_defects(
     exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, Hashable]
-) -> dict[int, str]:
+) -> dict[int, Rejection]:
     """Return why images cannot be used: by themselves, or beside others, by row.
 
     ``view`` and ``camera`` are those of each row: images of a view show about the same through the
@@ -170,7 +171,7 @@ def image_defects(
         usual = float(np.percentile(others, USUAL_PERCENTILE))
         factor, more = MAX_BLUR_OF_OTHERS
         if blur > max(factor * usual, usual + more):
-            found[row] = (
-                f"the image is blurred by {blur:.1f} px, the others of its {whose} by {usual:.1f}"
+            found[row] = Rejection(
+                Reason.BLURRED, f"{blur:.1f} px, the others of its {whose} by {usual:.1f}"
             )
     return found

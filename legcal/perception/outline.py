@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, IntArray
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
@@ -23,10 +24,6 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
-OUTSIDE = "outside the image"  # a reason
-HIDDEN = "hidden by"  # the beginning of one
-TOO_SHORT = "too short"  # to be measured: beginning of the reason
-WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of another one
 MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
 MIN_WIDTH = 5.0  # of a part [px]
 MAX_GUIDED_WINDOW = 0.8  # of the width, up to which a window separates both outlines
@@ -87,7 +84,7 @@ class PartLines(NamedTuple):
 
     leg: int
     part: str
-    reasons: tuple[str, str]  # why each outline is rejected, "" for used ones
+    reasons: tuple[Rejection, Rejection]  # why each outline is rejected
     lines: Sequence[OutlineLine | None] = (None, None)
     band: Band | None = None  # the frame of the lines
 
@@ -102,9 +99,10 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     if parts:
         near = search.near_fit
         edges = [
-            Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
+            Edge(part.band, v, float(epsilon), 0.5 * float(np.mean(pair[1] - pair[0])), part.hidden)
             for part in parts
-            for v, epsilon in zip(part.near if near else part.edges.v, EPSILON, strict=True)
+            for pair in [part.near if near else part.edges.v]
+            for v, epsilon in zip(pair, EPSILON, strict=True)
         ]
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near
@@ -138,14 +136,11 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     outwards, so that widths differ from those of a fit with the gamma before.
     """
     was = before.used_keys()
-    of_width = [
-        used or why.startswith(WRONG_WIDTH)
-        for used, why in zip(outlines.used.tolist(), outlines.reason, strict=True)
-    ]
-    seen = np.array(of_width, dtype=np.bool_) & np.isfinite(outlines.covariance[:, 0, 0])
+    seen = outlines.used | outlines.rejected_for(Reason.WIDTH)
+    seen &= np.isfinite(outlines.covariance[:, 0, 0])
     used = seen & np.array([key in was for key in outlines.row_keys()], dtype=np.bool_)
     reason = tuple(
-        "" if is_used else why or "not used before"
+        USED if is_used else why or Rejection(Reason.NOT_BEFORE)
         for is_used, why in zip(used.tolist(), outlines.reason, strict=True)
     )
     return replace(outlines, used=used, reason=reason)
@@ -158,7 +153,8 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     """
     rejected: list[PartLines] = []
 
-    def reject(leg: PredictedLeg, part: str, why: str) -> None:
+    def reject(leg: PredictedLeg, part: str, reason: Reason, detail: str = "") -> None:
+        why = Rejection(reason, detail)
         rejected.append(PartLines(leg.leg, part, (why, why)))
 
     searched: list[_Predicted] = []
@@ -167,14 +163,14 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
             continue
         for segment, band, h in zip(leg.segments, leg.bands, leg.outlines, strict=True):
             if band is None:
-                reject(leg, segment.link, OUTSIDE)
+                reject(leg, segment.link, Reason.OUTSIDE)
                 continue
             v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
             width = 0.5 * float((v[1] - v[0]).sum())
             if width < MIN_WIDTH:
-                reject(leg, segment.link, f"too narrow, {width:.1f} px wide")
+                reject(leg, segment.link, Reason.NARROW, f"{width:.1f}")
             elif band.length < least_length(width):
-                reject(leg, segment.link, f"{TOO_SHORT}, {band.length:.0f} px in the image")
+                reject(leg, segment.link, Reason.SHORT, f"{band.length:.0f} px in the image")
             else:
                 searched.append(_Predicted(leg, segment, band, h, v, width))
     free_parts: list[LegPart] = []
@@ -183,8 +179,8 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
         hidden = np.any(front >= 0, axis=0)
         if np.mean(~hidden) * band.length < least_length(width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
-            why = f"{HIDDEN} {search.names[values[np.argmax(counts)]]}"
-            reject(leg, segment.link, why)
+            in_front = search.names[values[np.argmax(counts)]]
+            reject(leg, segment.link, Reason.HIDDEN, in_front)
         else:
             window = float(search.window[leg.leg])
             guided = search.guided and window <= MAX_GUIDED_WINDOW * width
@@ -193,7 +189,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
         if pair is None:
-            reject(part.leg, part.segment.link, "no convincing pair of edges")
+            reject(part.leg, part.segment.link, Reason.NO_PAIR)
         else:
             parts.append(replace(part, pair=pair))
     return parts, rejected
@@ -299,7 +295,7 @@ def _with_verdict(
 class PartVerdict(NamedTuple):
     """Which outlines of a part are used."""
 
-    reasons: tuple[str, str]  # why each outline cannot be trusted, "" if it can
+    reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
     bias: float = 0.0  # how far used ones may be off besides their covariance [px]
 
 
@@ -324,7 +320,7 @@ def verdict(
     expected = predicted[1] - predicted[0]
     width = float(np.mean(pair.v[1] - pair.v[0]))
     reasons = [
-        _reason(edge, length, width) if seen else "no convincing edge"
+        _rejection(edge, length, width) if seen else Rejection(Reason.NO_EDGE)
         for edge, seen in zip(measured, pair.found, strict=True)
     ]
     one, two = measured
@@ -344,7 +340,7 @@ def verdict(
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
-        reason or ("" if alone else f"its other outline: {partner}")
+        reason or (USED if alone else Rejection(Reason.PARTNER, partner.reason))
         for reason, partner, alone in zip(reasons, reasons[::-1], stands, strict=True)
     )
     return PartVerdict((first, second))
@@ -362,9 +358,9 @@ def _by_width(
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
     if mismatch.max() <= 1.0:
-        return PartVerdict(("", ""))
+        return PartVerdict((USED, USED))
     i = int(np.argmax(mismatch))
-    reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
+    reason = Rejection(Reason.WIDTH, f"{widths[i]:.1f} px for {expected[i]:.1f} px")
     better, ratio = (
         (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
     )
@@ -376,7 +372,7 @@ def _by_width(
     ):
         return PartVerdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
-    return PartVerdict(("", reason) if better is one else (reason, ""), bias)
+    return PartVerdict((USED, reason) if better is one else (reason, USED), bias)
 
 
 def _by_place(
@@ -392,7 +388,7 @@ def _by_place(
         MAX_LONE_OFFSET * window, MAX_LONE_RATIO * off[1 - near]
     ) or not _is_clear_step(measured[near]):
         return judged
-    return PartVerdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
+    return PartVerdict((judged.reasons[0] if near else USED, USED if near else judged.reasons[1]))
 
 
 def _off(edge: MeasuredEdge, predicted: Array) -> float:
@@ -405,27 +401,27 @@ def _is_clear_step(edge: MeasuredEdge) -> bool:
     return edge.is_step and float(np.mean(edge.line.kept)) >= MIN_LONE_KEPT
 
 
-def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
-    """Return why an edge cannot be trusted whatever its partner, "" if it can."""
+def _rejection(edge: MeasuredEdge | None, length: float, width: float) -> Rejection:
+    """Return why an edge cannot be trusted whatever its partner."""
     if edge is None:
-        return "edge hardly visible"
+        return Rejection(Reason.FAINT)
     step = (STEP_END - edge.clipped) * edge.blur
     if step < MIN_STEP:
-        return f"the background is overexposed, {max(step, 0.0):.1f} px of the step are left"
+        return Rejection(Reason.OVEREXPOSED, f"{max(step, 0.0):.1f}")
     line = edge.line
     visible = (line.last - line.first) * length
     if visible < least_length(width):
-        return f"{TOO_SHORT}, {visible:.0f} px visible"
+        return Rejection(Reason.SHORT, f"{visible:.0f} px visible")
     if line.inlier_share < MIN_INLIER_SHARE:
-        return f"edge not straight, {100 * line.inlier_share:.0f} % of it on one line"
+        return Rejection(Reason.NOT_STRAIGHT, f"{100 * line.inlier_share:.0f}")
     kept = float(np.mean(line.kept))
     if kept < MIN_KEPT:
-        return f"edge hardly visible, found on {100 * kept:.0f} % of it"
+        return Rejection(Reason.FAINT, f"{100 * kept:.0f}")
     if edge.contrast < MIN_CONTRAST:
-        return f"low contrast, {edge.contrast:.1f} grey levels"
+        return Rejection(Reason.CONTRAST, f"{edge.contrast:.1f}")
     if line.scatter > max(MAX_SCATTER[0], MAX_SCATTER[1] * edge.blur):
-        return f"edge too rough, scatter {line.scatter:.2f} px"
+        return Rejection(Reason.ROUGH, f"{line.scatter:.2f}")
     sigma = edge.sigma
     if sigma > MAX_SIGMA:
-        return f"edge too uncertain, sigma {sigma:.2f} px"
-    return ""
+        return Rejection(Reason.UNCERTAIN, f"{sigma:.2f}")
+    return USED

@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from legcal.data.corners import Corners
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
-from legcal.perception.outline import OUTSIDE
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg
 
 MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair", "corner"]
 N_POINTS = 40  # of a curve
-OTHER_FAILS = "other outline fails"
 
 Canvas = NDArray[np.uint8]
 
@@ -84,13 +83,6 @@ class PartMarks(NamedTuple):
     marks: tuple[Mark, ...]
 
 
-def short_reason(reason: str) -> str:
-    """Return a reason without its figures, as it is counted and drawn."""
-    if reason.startswith("its other outline"):
-        return OTHER_FAILS
-    return reason.split(", ")[0].split(": ")[0]
-
-
 def marks_of_image(
     camera: Camera,
     outlines: Outlines,
@@ -145,15 +137,22 @@ def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
 
 def _reason(pair: Outlines) -> str:
     """Return why an outline of a part is not used."""
-    reasons = {
-        int(edge): short_reason(reason) or "rejected"
-        for edge, reason, used in zip(pair.edge, pair.reason, pair.used, strict=True)
+    rejections = {
+        int(edge): why
+        for edge, why, used in zip(pair.edge, pair.reason, pair.used, strict=True)
         if not used
     }
-    first = {edge: reason for edge, reason in reasons.items() if reason != OTHER_FAILS} or reasons
-    if len(reasons) == len(pair) and len(set(first.values())) == 1:
+    causes = {e: why for e, why in rejections.items() if why.reason is not Reason.PARTNER}
+    first = {edge: _drawn(why) for edge, why in (causes or rejections).items()}
+    if len(rejections) == len(pair) and len(set(first.values())) == 1:
         return next(iter(first.values()))
     return "; ".join(f"edge {edge}: {reason}" for edge, reason in sorted(first.items()))
+
+
+def _drawn(why: Rejection) -> str:
+    """Return a reason as it is drawn: with names and notes, without figures."""
+    named = Reason.HIDDEN, Reason.OTHER
+    return (str(why) if why.reason in named else why.summary) or "rejected"
 
 
 def _part_marks(
@@ -173,7 +172,7 @@ def _part_marks(
         # h1 . M = R and h2 . M = -R of all points M of the axis, eq (5): it is seen at h1 + h2.
         ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
         marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
-    if leg is not None and not np.all(found) and OUTSIDE not in pair.reason:
+    if leg is not None and not np.all(found) and not pair.rejected_for(Reason.OUTSIDE).any():
         for i, segment in enumerate(leg.segments):
             if segment.link == part:
                 edges = [e - 1 for e, seen in zip(pair.edge, found, strict=True) if not seen]

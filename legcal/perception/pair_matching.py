@@ -6,7 +6,7 @@ in which joints may be off what the model says.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,13 +20,14 @@ from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.vision.visibility import visible_segments
 
-MIN_DEPTH = 0.02  # depth of the nearest point of a leg [m]
+# Lengths are parts of the mean leg length of the machine.
+MIN_DEPTH = 0.05  # depth of the nearest point of a leg
 WIDTH_ERROR = 0.08  # of a pair and of what is predicted: relative, one standard deviation
 WIDTH_PIXELS = 1.0  # and of a pair in its pixels
 MAX_WIDTH_SIGMAS = 2.5  # standard deviations
 WIDTH_BIAS_PIXELS = 0.4  # of pairs: shading ends inside an outline [px of a pair]
 TOLERANCE_PIXELS = 1.5  # added to every tolerance [px of a pair]
-LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its pair: [m], [px]
+LINE_ERROR, LINE_PIXELS = 0.005, 0.7  # of an axis beside its pair: length, [px]
 ALONG_ERROR = 0.1  # of the middle of a pair that is as long as its segment, in its length
 MIN_LINE_SHARE = 1.0 / 6.0  # at least this part of the tolerance
 MIN_OVERLAP = 0.8  # share of a pair that should lie along the leg
@@ -128,6 +129,7 @@ class Picture:
     pairs: CandidatePairs
     targets: LegSegments  # segments of legs at its reading
     corners: Array  # (2, 2) least and greatest x and y of the sensor plane that it shows
+    size: float  # mean leg length of the machine, which tolerances are parts of [m]
     # Its camera frame, where poses are those of another one that is fixed to it: X_camera = R X + t
     R: Array = field(default_factory=lambda: np.eye(3))
     t: Array = field(default_factory=lambda: np.zeros(3))
@@ -151,6 +153,7 @@ class Pictures:
     R: Array  # (n_pictures, 3, 3) their camera frames, as in Picture
     t: Array  # (n_pictures, 3)
     corners: Array  # (n_pictures, 2, 2)
+    size: float  # mean leg length of the machine, which tolerances are parts of [m]
 
     @classmethod
     def of(cls, pictures: Sequence[Picture]) -> "Pictures":
@@ -182,11 +185,17 @@ class Pictures:
             np.array([p.R for p in pictures]).reshape(-1, 3, 3),
             np.array([p.t for p in pictures]).reshape(-1, 3),
             np.array([p.corners for p in pictures]).reshape(-1, 2, 2),
+            pictures[0].size if pictures else 1.0,
         )
 
     def __len__(self) -> int:
         """Return the number of pictures."""
         return len(self.ends)
+
+    @property
+    def min_depth(self) -> float:
+        """Depth of the nearest point of a leg [m]."""
+        return MIN_DEPTH * self.size
 
     @property
     def all_ends(self) -> Array:
@@ -195,7 +204,8 @@ class Pictures:
 
     def take(self, chosen: slice) -> "Pictures":
         """Return some of the pictures."""
-        return Pictures(*(getattr(self, one.name)[chosen] for one in fields(self)))
+        arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "size"}
+        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
     def blocks(self, n_poses: int) -> Iterator["Pictures"]:
         """Return the pictures a few at a time, fewer for more poses, so that arrays stay small."""
@@ -236,7 +246,7 @@ class PairMatches(NamedTuple):
 
 
 def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
-    """Match poses to pictures; ``tolerance`` is how far axes may be from pairs [m]."""
+    """Match poses to pictures; ``tolerance`` is how far axes may be from pairs, of the size."""
     n = len(poses)
     if len(pictures) == 0 or n == 0:
         nothing = np.zeros((len(pictures), n, pictures.ends.shape[1]))
@@ -276,7 +286,7 @@ def _projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Ar
     t = poses.t @ pictures.R.swapaxes(1, 2) + pictures.t[:, None]
     X = ends.reshape(K, ends.shape[1], 2 * T, 3) @ R.swapaxes(2, 3) + t[:, :, None]
     X = X.reshape(K, n, T, 2, 3)
-    z = np.maximum(X[..., 2], MIN_DEPTH)
+    z = np.maximum(X[..., 2], pictures.min_depth)
     xy = X[..., :2] / z[..., None]
     normal = cross(X[..., 0, :], X[..., 1, :])
     level = normal[..., 0] ** 2 + normal[..., 1] ** 2
@@ -299,7 +309,7 @@ def _shown(xy: Array, corners: Array) -> Array:
 def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match a few poses to a few pictures."""
     X, xy, width = _projected(pictures, poses)
-    front = (X[..., 0, 2] > MIN_DEPTH) & (X[..., 1, 2] > MIN_DEPTH)
+    front = (X[..., 0, 2] > pictures.min_depth) & (X[..., 1, 2] > pictures.min_depth)
     front &= pictures.share[:, None] > 0.0
     visible = np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
     K, n, T = visible.shape
@@ -337,9 +347,11 @@ def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pa
 
 
 def _tolerances(pictures: Pictures, X: Array, tolerance: float) -> Array:
-    """Return a tolerance [m] on the sensor plane at segments X (K, n, T, 2, 3), (K, n, T)."""
-    depth = np.maximum(0.5 * (X[..., 0, 2] + X[..., 1, 2]), MIN_DEPTH)
-    return np.asarray(tolerance / depth + TOLERANCE_PIXELS * pictures.pixel[:, None, None])
+    """Return a tolerance on the sensor plane at segments X (K, n, T, 2, 3), (K, n, T)."""
+    depth = np.maximum(0.5 * (X[..., 0, 2] + X[..., 1, 2]), pictures.min_depth)
+    return np.asarray(
+        tolerance * pictures.size / depth + TOLERANCE_PIXELS * pictures.pixel[:, None, None]
+    )
 
 
 def pair_widths(pairs: CandidatePairs) -> Array:
@@ -363,11 +375,13 @@ def gauss_newton_step(
     """Return poses after one Gauss-Newton step towards the pairs that they match.
 
     By pictures of one camera and matches with them, for a tolerance as in :func:`match_pairs`;
-    ``joint_error`` is the standard deviation of the model's joints [m], 0 to leave them in place.
+    ``joint_error`` is the standard deviation of the model's joints, of the size; 0 to leave them
+    in place.
     """
+    joint_error *= pictures.size
     n, n_legs = poses.shift.shape[:2]
     centre = _centre(pictures, poses)
-    H, b = _step_prior(centre), np.zeros((n, 6))
+    H, b = _step_prior(centre, pictures.min_depth), np.zeros((n, 6))
     of_legs = np.zeros((n, n_legs, 6, 13))  # products with shifts, with motions, with residuals
     done = 0
     for some in pictures.blocks(n):
@@ -390,7 +404,7 @@ def gauss_newton_step(
             of_legs += (own @ products).reshape(n, n_legs, 6, 13)
     if joint_error == 0.0:
         xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
-        return _moved(poses, xi, poses.shift, centre)
+        return _moved(poses, xi, poses.shift, centre, pictures.min_depth)
     H_leg = of_legs[..., :6] + np.eye(6) / joint_error**2
     right = of_legs[..., 6:]
     right[..., 6] = -right[..., 6] - poses.shift.reshape(n, n_legs, 6) / joint_error**2
@@ -399,7 +413,8 @@ def gauss_newton_step(
     taken = coupled @ back.reshape(n, 6 * n_legs, 7)
     xi = np.asarray(np.linalg.solve(H - taken[..., :6], (b - taken[..., 6])[..., None]))
     change = back[..., 6] - (back[..., :6] @ xi[:, None])[..., 0]
-    return _moved(poses, xi[..., 0], poses.shift + change.reshape(poses.shift.shape), centre)
+    shift = poses.shift + change.reshape(poses.shift.shape)
+    return _moved(poses, xi[..., 0], shift, centre, pictures.min_depth)
 
 
 def _centre(pictures: Pictures, poses: CameraPoses) -> Array:
@@ -409,12 +424,12 @@ def _centre(pictures: Pictures, poses: CameraPoses) -> Array:
     return np.asarray(poses.R @ middle + poses.t)
 
 
-def _step_prior(centre: Array) -> Array:
+def _step_prior(centre: Array, min_depth: float) -> Array:
     """Return the precision (n, 6, 6) of no step at all: what nothing fixes stays where it is."""
     J = np.concatenate(
         [-cross_matrices(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2
     )
-    distance = DISPLACEMENT_SIGMA * np.maximum(np.linalg.norm(centre, axis=1), MIN_DEPTH)
+    distance = DISPLACEMENT_SIGMA * np.maximum(np.linalg.norm(centre, axis=1), min_depth)
     H = J.swapaxes(1, 2) @ J / (distance**2)[:, None, None]
     H[:, :3, :3] += np.eye(3) / TURN_SIGMA**2
     return np.asarray(H)
@@ -436,7 +451,7 @@ def segment_equations(
     of_pair = table.reshape(K * n_pairs, -1).take(at, axis=0)
     middle, axes = of_pair[..., :2], of_pair[..., 2:6].reshape(*at.shape, 2, 2)
     half, seen, sigma_width = of_pair[..., 6], of_pair[..., 7], of_pair[..., 9]
-    z = np.maximum(X[..., 2], MIN_DEPTH)
+    z = np.maximum(X[..., 2], pictures.min_depth)
     depth = 0.5 * (z[..., 0] + z[..., 1])
     # Places of both ends along the pair and across it, and their derivatives by the ends.
     places = (xy - middle[..., None, :]) @ axes.swapaxes(-1, -2)
@@ -453,7 +468,7 @@ def segment_equations(
     share = -a[..., 0] / run
     shares = np.stack([1.0 - share, share], axis=-1)
     expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
-    deep = np.maximum(np.sum(shares * X[..., 2], axis=-1), MIN_DEPTH)
+    deep = np.maximum(np.sum(shares * X[..., 2], axis=-1), pictures.min_depth)
     # Derivatives (K, n, T, 4, 2, 3) of the residuals by the two ends in the camera frame.
     D = np.zeros((*at.shape, 4, 2, 3))
     D[..., :2, :, :] = parts[..., None] * slopes[..., None, 1, :, :]
@@ -478,7 +493,7 @@ def segment_equations(
     residual[..., :2] = (parts @ o[..., None])[..., 0]
     residual[..., 2] = np.log(expected / seen)
     residual[..., 3] = 0.5 * (a[..., 0] + a[..., 1])
-    sigma = max(LINE_ERROR, MIN_LINE_SHARE * tolerance) / depth
+    sigma = max(LINE_ERROR, MIN_LINE_SHARE * tolerance) * pictures.size / depth
     # A pair as long as the segment has its middle where the segment has it.
     length = np.abs(run)
     sigma_place = ALONG_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
@@ -499,11 +514,13 @@ def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Arr
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 
-def _moved(poses: CameraPoses, xi: Array, shift: Array, centre: Array) -> CameraPoses:
+def _moved(
+    poses: CameraPoses, xi: Array, shift: Array, centre: Array, min_depth: float
+) -> CameraPoses:
     """Return poses moved by rotation vectors and translations in their frame, (n, 6), not far."""
     turned = np.linalg.norm(xi[:, :3], axis=1) / MAX_TURN
     moved = np.linalg.norm(cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
-    distance = np.maximum(np.linalg.norm(centre, axis=1), MIN_DEPTH)
+    distance = np.maximum(np.linalg.norm(centre, axis=1), min_depth)
     xi = xi / np.maximum(np.maximum(turned, moved / (MAX_DISPLACEMENT * distance)), 1.0)[:, None]
     turn = rotation_matrices(xi[:, :3])
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]

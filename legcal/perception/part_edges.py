@@ -39,7 +39,9 @@ MAX_RIVAL = 0.6  # of its score, which no other line may reach
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
 BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
-MAX_PREDICTION_ERROR = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
+# An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
+# multiples of half a pixel: between two of these, rounding decides nothing.
+MAX_PREDICTION_ERROR = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +78,6 @@ class LegPart:
         if self.pair is None:
             raise ValueError("the edges of this part were not found")
         return self.pair
-
-    @property
-    def half_width(self) -> float:
-        """Half of the width that the edges have in the middle [px]."""
-        return float(0.5 * np.mean(self.edges.v[1] - self.edges.v[0]))
 
     @property
     def near(self) -> Array:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.image_causes import images_in_words
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, is_edited, join_outlines, merge_edited, no_outlines
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.model import Machine, vectors_at
@@ -28,14 +29,13 @@ from legcal.machine.rods import joints_at, measured_readings
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
-    NOTHING_LIKE,
     find_wrong_images,
     is_measurable,
     reject_images,
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.outline import WRONG_WIDTH, Method, measure, measure_in_brief
+from legcal.perception.outline import Method, measure, measure_in_brief
 from legcal.perception.placement import (
     NEAR_FIT_PX,
     Joined,
@@ -53,11 +53,10 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
-DETECTOR_VERSION = 13  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 14  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
-TOO_FEW_LEGS = "shows too few legs to place the platform"  # a reason
 # Outlines that check a pose which readings do not give: with fewer of them one image in two shows
 # as many at a wrong pose.
 MIN_OUTLINES = 5
@@ -118,6 +117,7 @@ class Photographs:
             self.cylinders,
             self.wanted,
             self.machine.leg_names,
+            self.machine.size,
             {} if pairs is None else pairs,
             {} if blur is None else blur,
         )
@@ -158,7 +158,7 @@ class MeasuredImages:
     photographs: Photographs  # the images, and the mechanism with the radii that they show
     placement: Placement  # with views that could not be placed, and notes on views and images
     outlines: Outlines  # of all images; those of images that are left out are rejected
-    left_out: dict[int, str]  # why images were left out, by row
+    left_out: dict[int, Rejection]  # why images were left out, by row
     blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
     # T_base_platform of every pose that images show, where the readings do not give it
     free_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
@@ -170,7 +170,7 @@ class MeasuredImages:
         return [
             row
             for row, why in self.left_out.items()
-            if why == NOTHING_LIKE and cameras[view[row]] is not None
+            if why.reason is Reason.OTHER_SCENE and cameras[view[row]] is not None
         ]
 
     def kept(self, rows: IntArray) -> IntArray:
@@ -358,15 +358,16 @@ def _at_poses(
 
 def _in_doubt(
     measurements: Measurements, rows: IntArray, n_outlines: Mapping[int, int]
-) -> dict[int, str]:
+) -> dict[int, Rejection]:
     """Return why images do not tell where the platform is, by row, by the outlines of poses."""
     checked = np.array([n_outlines[k] >= MIN_OUTLINES for k in measurements.pose[rows].tolist()])
-    reasons = dict.fromkeys(rows[~checked].tolist(), TOO_FEW_LEGS)
+    reasons = dict.fromkeys(rows[~checked].tolist(), Rejection(Reason.FEW_LEGS))
     left, view = rows[checked], measurements.view
     for v in np.unique(view[left]).tolist():
         own = left[view[left] == v]
         if len(np.unique(measurements.pose[own])) < MIN_POSES:
-            reasons |= dict.fromkeys(own.tolist(), f"{TOO_FEW_LEGS}, as most of its view do")
+            why = Rejection(Reason.FEW_LEGS, "as most of its view do")
+            reasons |= dict.fromkeys(own.tolist(), why)
     return reasons
 
 
@@ -435,7 +436,7 @@ def with_measured_radii(
     outlines of a cylinder are at a wrong distance, it speaks against none of them.
     """
     m, machine = photographs.measurements, photographs.machine
-    wrong = np.array([why.startswith(WRONG_WIDTH) for why in outlines.reason], dtype=np.bool_)
+    wrong = outlines.rejected_for(Reason.WIDTH)
     judged = (outlines.used | wrong) & np.isfinite(outlines.h).all(axis=1)
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
@@ -495,7 +496,7 @@ def _measured(
 
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
-) -> tuple[dict[int, str], dict[int, CandidatePairs], dict[int, float]]:
+) -> tuple[dict[int, Rejection], dict[int, CandidatePairs], dict[int, float]]:
     """Return why images show nothing, pairs of those recognised first, and blurs [px], by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
@@ -514,7 +515,9 @@ def _inspect_images(
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
 
 
-def defects_of(measurements: Measurements, exposures: Mapping[int, Exposure]) -> dict[int, str]:
+def defects_of(
+    measurements: Measurements, exposures: Mapping[int, Exposure]
+) -> dict[int, Rejection]:
     """Return why images show nothing, by themselves or beside others of their view, by row."""
     views = measurements.views
     camera = shared_cameras([view.name for view in views], [view.camera for view in views])
@@ -539,9 +542,8 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
     """
     visible = is_measurable(outlines)
     which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
-    of_wrong_width = {
-        one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
-    }
+    wrong_width = outlines.rejected_for(Reason.WIDTH).tolist()
+    of_wrong_width = {one for one, is_wrong in zip(which, wrong_width, strict=True) if is_wrong}
     used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
     part = np.array(outlines.part)
     parts = []

@@ -29,8 +29,8 @@ from legcal.vision.visibility import PredictedLeg, predict_legs
 Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
-# Of predicted joint centres: the nominal model's joints and platform pose [m].
-PREDICTED_JOINT_ERROR = 4e-3
+# Of predicted joint centres, of the mean leg length: the nominal model's joints and platform pose.
+PREDICTED_JOINT_ERROR = 0.01
 PIXEL_ERROR = 3.0  # added to every window [px]
 NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit [px]
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
@@ -47,6 +47,7 @@ class Search:
     cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
     wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
+    size: float  # mean leg length of the machine [m]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
 
@@ -59,7 +60,8 @@ class Search:
         """Return what the image of a row shows, and what it should."""
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
-        return Picture(self.pairs(row, view), self.targets(row, view), sensor_extent(camera))
+        extent = sensor_extent(camera)
+        return Picture(self.pairs(row, view), self.targets(row, view), extent, self.size)
 
     def pairs(self, row: int, view: int) -> CandidatePairs:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
@@ -99,7 +101,9 @@ class PlacedArm:
     name: str  # its motor, for reasons
     cylinder: Cylinder  # along its line, from its near end
     ends: Array  # (n_rows, 2, 3) in the base link [m]
-    error: float  # how far it may be from there: where only the model has it [m]
+    error: (
+        float  # how far it may be from there, of the mean leg length: where only the model has it
+    )
 
 
 def predict_legs_and_arms(
@@ -152,7 +156,8 @@ class Placement:
     A_base: Array  # (n_rows, n_legs, 3) where the view of each row sees them, in the base link [m]
     B_base: Array
     T_base_camera: tuple[RigidTransform | None, ...]  # of each view; None: not known
-    joint_error: float | Array = PREDICTED_JOINT_ERROR  # (n_views, n_legs) [m]
+    # (n_views, n_legs), of the mean leg length
+    joint_error: float | Array = PREDICTED_JOINT_ERROR
     pixel_error: float = PIXEL_ERROR  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known

@@ -46,8 +46,9 @@ from legcal.workers import Run, in_turn
 MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
-UNOBSERVED_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
-MIN_ERROR, ERROR_SIGMAS = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
+# Lengths are parts of the mean leg length.
+UNOBSERVED_ERROR = 0.015  # of the joint centres of a leg that a view did not show
+MIN_ERROR, ERROR_SIGMAS = 0.004, 2.5  # of those of a leg that it did: length, standard deviations
 
 N_POSES, N_REFINED = 4, 3  # at which outlines are measured, and at the best missing legs sought
 # Evidence for a pose: its ratio to that for any other one, and what it exceeds the least by.
@@ -55,7 +56,7 @@ RATIO, MARGIN = 1.6, 3.0
 RATIO_AGREED, MARGIN_AGREED = 1.5, 0.0  # the same where edge pairs are convincing by themselves
 RATIO_WITHOUT_RIVAL = 4.0  # ratio from which on no margin is needed either
 RATIO_ALONE, MARGIN_ALONE = 2.5, 6.0  # the same of a single image
-POSE_JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
+POSE_JOINT_ERROR = 0.0075  # of the legs as a pose has them
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 

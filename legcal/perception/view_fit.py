@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines, is_edited, join_outlines
+from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
 from legcal.estimation.problem import (
     Factor,
@@ -38,22 +39,22 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
-from legcal.perception.detection import NOT_PLACED, measure_outlines
-from legcal.perception.outline import OUTSIDE, Method, measure
+from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
-DISAGREES = "disagrees with the other legs of its view"  # a reason
 WINDOW_PX, WINDOW_SIGMAS, MAX_WINDOW_PX = 2.0, 3.0, 40.0  # around a fit
 CLEAR = 0.7  # of the evidence that an ambiguous pose must have, where edge pairs are clear
 
-JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model in all images, at first [m]
-JOINT_SIGMA_BOUNDS = 1.5e-3, 12e-3  # between which legs may show it
-IMAGE_SIGMA = 2e-3  # of the platform joints in an image besides, at first [m]
-IMAGE_SIGMA_BOUNDS = 0.7e-3, 12e-3  # between which images may show it
+# Lengths are parts of the mean leg length.
+JOINT_SIGMA = 0.015  # of the joint centres of the nominal model in all images, at first
+JOINT_SIGMA_BOUNDS = 0.0038, 0.03  # between which legs may show it
+IMAGE_SIGMA = 0.005  # of the platform joints in an image besides, at first
+IMAGE_SIGMA_BOUNDS = 0.0018, 0.03  # between which images may show it
 TURN_SIGMA, DISTANCE_SIGMA = 0.3, 0.15  # prior of the pose: angle, displacement by its distance
 MAX_TURN, MAX_DISPLACEMENT = 0.2, 0.1  # of a step: angle, part of the distance
 ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas are estimated
@@ -152,7 +153,8 @@ def fit_view(
     state = _State(pose, shift, np.zeros((lines.n_items, 3)))
     problem = _problem(group, lines, state, middle)
     weight = np.ones(lines.n_items)
-    joint_sigma, image_sigma = JOINT_SIGMA, IMAGE_SIGMA
+    size = search.size
+    joint_sigma, image_sigma = JOINT_SIGMA * size, IMAGE_SIGMA * size
     try:
         linear = linearize(problem, state)
         for iteration in range(ITERATIONS):
@@ -173,8 +175,13 @@ def fit_view(
                 variance = np.diag(normal.kept_covariance())[6:].reshape(state.shift.shape)
                 of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
                 of_image = np.sum(weight * offset_square) / (3.0 * weight.sum())
-                joint_sigma = float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMA_BOUNDS))
-                image_sigma = float(np.clip(np.sqrt(of_image), *IMAGE_SIGMA_BOUNDS))
+                joint_sigma, image_sigma = (
+                    float(np.clip(np.sqrt(variance), size * bounds[0], size * bounds[1]))
+                    for variance, bounds in (
+                        (np.median(of_leg), JOINT_SIGMA_BOUNDS),
+                        (of_image, IMAGE_SIGMA_BOUNDS),
+                    )
+                )
     except NotVisible:
         return None
     normal = _normal_equations(problem, state, linear, weight, joint_sigma, image_sigma)
@@ -194,7 +201,7 @@ def fit_view(
         state.offset,
         np.sqrt(square / lines.size),
         middle,
-        _evidence(lines, linear["outlines"], state, joint_sigma),
+        _evidence(lines, linear["outlines"], state, joint_sigma, size),
     )
 
 
@@ -300,12 +307,14 @@ def _squared_distances(
     )
 
 
-def _evidence(lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float) -> float:
+def _evidence(
+    lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float, size: float
+) -> float:
     """Return how much outlines support a state, each leg of an image by itself."""
-    square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA)
+    square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
-    joint = max(JOINT_SIGMA, joint_sigma)
+    joint = max(JOINT_SIGMA * size, joint_sigma)
     return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
 
 
@@ -330,7 +339,7 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
         T, camera = group.T_group_camera[v].inv(), m.views[v].camera
         X_group = T_group_base.apply(np.stack([A[rows], B[rows]], axis=2).reshape(-1, 3))
         X = T.apply(X_group).reshape(-1, 2, 3)
-        front = X[..., 2].min(axis=1) > MIN_DEPTH
+        front = X[..., 2].min(axis=1) > MIN_DEPTH * search.size
         X = np.where(front[:, None, None], X, [[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
         ends = X[..., :2] / X[..., 2:]
         thin, edge = np.zeros(len(X)), np.zeros(len(X), dtype=np.intp)
@@ -499,7 +508,7 @@ def refine_views(
     )
     placed = np.array([T is not None for T in placement.T_base_camera])
     unplaced_rows = ~placed[search.measurements.view[outlines.row]]
-    return placement, outlines.reject(unplaced_rows & ~is_edited(outlines), NOT_PLACED), fits
+    return placement, outlines.reject(unplaced_rows & ~is_edited(outlines), Reason.NOT_PLACED), fits
 
 
 def _fits(
@@ -554,7 +563,7 @@ def _without_outliers(
     if not wrong:
         return outlines, fits
     out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
-    outlines = outlines.reject(out, DISAGREES)
+    outlines = outlines.reject(out, Reason.VIEW_DISAGREES)
     return outlines, _fits(search, groups, placement, outlines, fits, {row for row, _ in wrong})
 
 
@@ -609,7 +618,7 @@ def group_name(names: Sequence[str]) -> str:
 def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:
     """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
     missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
-    visible = [not why.startswith((OUTSIDE, NOT_PLACED)) for why in outlines.reason]
+    visible = ~outlines.rejected_for(Reason.OUTSIDE, Reason.NOT_PLACED)
     missing[outlines.row[visible], outlines.leg[visible]] = True
     missing[outlines.row[outlines.used], outlines.leg[outlines.used]] = False
     window = np.full(missing.shape, np.nan)

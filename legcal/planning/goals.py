@@ -29,7 +29,7 @@ from legcal.planning.exchange import Criterion
 
 
 class Goal(StrEnum):
-    """What is made small."""
+    """The quantity that a plan minimises."""
 
     MEAN = "mean"  # error of the platform, mean over the workspace
     WORST = "worst"  # the same where it is largest

@@ -40,7 +40,6 @@ from legcal.estimation.problem import Frames, linearize
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import owner_of_parameter
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 
@@ -127,7 +126,7 @@ class Contributions:
         return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
 
     def repeated(self, times: float) -> Contributions:
-        """Return what so many photographs at each image add."""
+        """Return the information of *times* photographs in place of each one."""
         return replace(self, rows=self.rows * np.sqrt(times), at_site=self.at_site * times)
 
 
@@ -325,7 +324,8 @@ def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
         where = problem.where(block.name)
         labels = block.labels or tuple(str(i) for i in range(block.n_unknowns))
         for i, label in zip(where.tolist(), labels, strict=True):
-            head = owner_of_parameter(label, views)
+            owners = [view for view in views if label.startswith(f"{view}.")]
+            head = max(owners, key=len, default="")
             rest = label.removeprefix(f"{head}.")
             if block.name == "cameras" or (block.name == "biases" and rest == "gamma"):
                 names[i] = f"camera {rest}"  # all views share one

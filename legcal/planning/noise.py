@@ -1,4 +1,4 @@
-"""The errors of outlines that a plan counts on, from what was measured before."""
+"""The errors of outlines that a plan counts on, from an earlier result."""
 
 from __future__ import annotations
 
@@ -16,21 +16,14 @@ from legcal.files.reading import read_json
 from legcal.files.table import read_table
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise
 
-_USUAL_LENGTH = 200.0  # [px] of an outline, where a document does not say
-
 
 def read_noise(path: Path) -> PredictedNoise:
-    """Return the noise that an earlier result or a document of ``legcal noise --json`` shows.
-
-    A result is given by its folder or its ``result.json``.
-    """
+    """Return the noise that an earlier result shows, by its folder or its ``result.json``."""
     file = path / "result.json" if path.is_dir() else path
     try:
         found = read_json(file)
         if "legcal_result" in found:
             return _of_result(found, file)
-        if "legcal_noise" in found:
-            return _of_repeats(found, file)
     except FileNotFoundError as error:
         what = "no such file" if file == path else f"a folder without {file.name}"
         raise _useless(path, what) from error
@@ -47,8 +40,8 @@ def read_noise(path: Path) -> PredictedNoise:
 
 def _useless(path: Path, found: str) -> UsageError:
     return UsageError(
-        f"{path}: the noise could not be used: found {found}, needed an earlier result, its "
-        "result.json, or what legcal noise --json prints; correct --noise, or leave it out."
+        f"{path}: the noise could not be used: found {found}, needed the folder of an earlier "
+        "result or its result.json; correct --noise, or leave it out."
     )
 
 
@@ -75,18 +68,3 @@ def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
     places = tuple(max(both) for both in zip(of_edges, at_places, strict=True))
     gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
     return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))
-
-
-def _of_repeats(found: dict[str, Any], file: Path) -> PredictedNoise:
-    """Return the noise of repeated images: their scatter; what they share does not show in it."""
-    spread = found["methods"]["detector"]["all"]["outline"]
-    sigma = float(spread["sd"])
-    sigma *= float(np.sqrt(_USUAL_LENGTH / 2.0))
-    return PredictedNoise(
-        sigma,
-        DEFAULT_NOISE.correlation,
-        DEFAULT_NOISE.common_px,
-        DEFAULT_NOISE.places_px,
-        DEFAULT_NOISE.gamma_px,
-        str(file),
-    )

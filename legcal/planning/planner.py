@@ -71,7 +71,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is asked of a plan."""
+    """The planning task: machine, numbers of images and views, goal."""
 
     predictor: Predictor
     n_images: int

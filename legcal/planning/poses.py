@@ -17,7 +17,8 @@ from legcal.machine.feasibility import Feasibility, feasible_poses, motor_travel
 from legcal.machine.kinematics import follow, platforms_in_base
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, slider_columns
-from legcal.machine.parameters import ARM_KINDS, is_held_by_default, kind_of_parameter, moved_legs
+from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.parameters import is_held_by_default, moved_legs
 from legcal.planning.places import USUAL, Setting
 from legcal.progress import Report, no_progress
 
@@ -103,7 +104,7 @@ def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> 
     """Return legs, and arms that are seen, as they may be: within the prior errors of a machine."""
     found = legs.parametrization
     size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    arms = np.array([kind_of_parameter(name) in ARM_KINDS for name in found.names])
+    arms = np.array([ParameterId.parse(name).kind in ARMS for name in found.names])
     size = size * (arms | [not is_held_by_default(name) for name in found.names])
     return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
 

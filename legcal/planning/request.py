@@ -94,7 +94,7 @@ def plan(
         The camera, or its file; 1024 x 768 pixels and 43 degrees wide by default, or that of the
         dataset that is given.
     noise : PredictedNoise or path
-        Errors of outlines; an earlier result, or a document of ``legcal noise --json``.
+        Errors of outlines, or the folder of an earlier result that has them.
     encoder_sigma : float or str, optional
         One standard deviation of a reading: a number [m, of motors that turn rad], or a text with
         its unit ('0.5deg'), which is that of the motors that slide, or turn. By default 2 um,
@@ -139,7 +139,6 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    machine.require_rigid_platform()
     listed = () if places is None else tuple(read_places(Path(places), machine))
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
@@ -181,7 +180,7 @@ def plan(
             found = plan_session(task, report, stop, run)
         else:
             found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *counted, *_to_come(shot), *run.notes))
+        return replace(found, notes=(*found.notes, *counted, *_to_come(shot)))
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:

@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED
 from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg
@@ -117,7 +118,7 @@ class Seen:
             ends=self.ends.reshape(-1, 2, 2),
             covariance=np.repeat(covariance, 2, axis=0),
             used=np.ones(2 * n, dtype=np.bool_),
-            reason=("",) * (2 * n),
+            reason=(USED,) * (2 * n),
             source=("detected",) * (2 * n),
         )
 

@@ -1,8 +1,11 @@
-"""Bags of ROS 1 and 2 and MCAP files: images of one topic, and joint states."""
+"""Bags of ROS 1 and 2 and MCAP files: images of one topic, and joint states.
+
+A bag of several cameras is named with the topic of one behind it: ``run.mcap:/left/image_raw``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +26,7 @@ _BAGS = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _JOINTS = ("sensor_msgs/msg/JointState",)
+_USUAL_JOINTS = "/joint_states"  # the topic that counts among several
 _COLOURS = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -40,12 +44,16 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in _BAGS or (path / _METADATA).is_file()
 
 
+def split_topic(path: Path) -> tuple[Path, str | None]:
+    """Return the path of a recording, and the topic that is written behind it."""
+    file, colon, topic = str(path).rpartition(":/")
+    return (Path(file), f"/{topic}") if colon and is_bag(Path(file)) else (path, None)
+
+
 class Bag:
     """A bag with the images of one camera and, unless a table has them, joint states."""
 
-    def __init__(
-        self, path: Path, machine: Machine, image_topic: str | None, joint_topic: str | None
-    ) -> None:
+    def __init__(self, path: Path, machine: Machine, image_topic: str | None = None) -> None:
         if find_spec("rosbags") is None:
             raise UsageError(
                 f"{path}: the bag could not be read: found no package rosbags, needed it; install "
@@ -54,13 +62,12 @@ class Bag:
         self.path = path
         self._machine = machine
         self._image_topic = image_topic
-        self._joint_topic = joint_topic
         self._bad = 0
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of the bag; damaged ones are left out and counted."""
         self._bad, last, number = 0, -np.inf, -1
-        for time, kind, message in self._messages(_IMAGES, self._image_topic, "images"):
+        for time, kind, message in self._messages(_IMAGES, self._topic_of_images):
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
             if image is None or time <= last:
                 self._bad += 1
@@ -82,41 +89,55 @@ class Bag:
     def readings(self) -> Series | None:
         """Return the joint states, None if the bag holds none."""
         with self._opened() as reader:
-            if self._joint_topic is None and not self._topics(reader, _JOINTS):
+            if not self._topics(reader, _JOINTS):
                 return None
         times, states = [], []
-        for time, _, message in self._messages(_JOINTS, self._joint_topic, "joint states"):
+        for time, _, message in self._messages(_JOINTS, self._topic_of_joints):
             times.append(time)
             states.append(dict(zip(message.name, map(float, message.position), strict=False)))
-        topic = self._joint_topic or "joint states"
-        return series_of_joints(f"{self.path}, {topic}", times, states, self._machine)
+        return series_of_joints(f"{self.path}, joint states", times, states, self._machine)
+
+    def _topic_of_images(self, topics: Sequence[str]) -> str:
+        """Return the topic of the images: as stated, or the only one."""
+        if self._image_topic is not None and self._image_topic not in topics:
+            raise UsageError(
+                f"{self.path}: the images could not be read: found no topic "
+                f"{describe(self._image_topic)} with them, needed "
+                f"{', '.join(map(describe, topics)) or 'one'}; correct the name."
+            )
+        if self._image_topic is None and len(topics) != 1:
+            found = ", ".join(map(describe, topics)) or "no topic"
+            remedy = f"name it behind the bag, {self.path}:{topics[0]}" if topics else (
+                "give another bag")  # fmt: skip
+            raise DatasetError(
+                f"{self.path}: the images could not be read: found {found} with them, needed one; "
+                f"{remedy}."
+            )
+        return self._image_topic or topics[0]
+
+    def _topic_of_joints(self, topics: Sequence[str]) -> str:
+        """Return the topic of the joint states: the only one, or that of the usual name."""
+        if len(topics) > 1 and _USUAL_JOINTS not in topics:
+            raise DatasetError(
+                f"{self.path}: the joint states could not be read: found "
+                f"{', '.join(map(describe, topics))} with them, needed one or {_USUAL_JOINTS}; "
+                "give the readings as a table with --readings."
+            )
+        return topics[0] if len(topics) == 1 else _USUAL_JOINTS
 
     def _messages(
-        self, kinds: tuple[str, ...], topic: str | None, what: str
+        self, kinds: tuple[str, ...], choose: Callable[[Sequence[str]], str]
     ) -> Iterator[tuple[float, str, Any]]:
         """Yield time [s], type and content of the messages of one topic."""
         with self._opened() as reader:
-            topics = self._topics(reader, kinds)
-            if topic is None and len(topics) != 1:
-                found = ", ".join(map(describe, topics)) or "no topic"
-                option = "--image-topic" if kinds == _IMAGES else "--joint-topic"
-                raise DatasetError(
-                    f"{self.path}: the {what} could not be read: found {found} with them, needed "
-                    f"one; " + (f"name it with {option}." if topics else "give another bag.")
-                )
-            if topic is not None and topic not in topics:
-                raise UsageError(
-                    f"{self.path}: the {what} could not be read: found no topic {describe(topic)} "
-                    f"with them, needed {', '.join(map(describe, topics)) or 'one'}; correct the "
-                    "name."
-                )
-            chosen = [c for c in reader.connections if c.topic == (topic or next(iter(topics)))]
+            topic = choose(self._topics(reader, kinds))
+            chosen = [c for c in reader.connections if c.topic == topic]
             for connection, stamp, raw in reader.messages(connections=chosen):
                 message = reader.deserialize(raw, connection.msgtype)
                 yield _time(message, stamp), connection.msgtype, message
 
-    def _topics(self, reader: Any, kinds: tuple[str, ...]) -> Mapping[str, str]:
-        return {c.topic: c.msgtype for c in reader.connections if c.msgtype in kinds}
+    def _topics(self, reader: Any, kinds: tuple[str, ...]) -> list[str]:
+        return list(dict.fromkeys(c.topic for c in reader.connections if c.msgtype in kinds))
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:

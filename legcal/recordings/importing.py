@@ -12,7 +12,13 @@ import cv2
 import numpy as np
 
 from legcal.data.measurements import few
-from legcal.data.new_dataset import DATASET_FOLDER, MIN_SIGMA, plan_new_dataset, write_new_dataset
+from legcal.data.new_dataset import (
+    DATASET_FOLDER,
+    MIN_SIGMA,
+    SheetOptions,
+    plan_new_dataset,
+    write_new_dataset,
+)
 from legcal.data.reading_units import usual_sigma
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.folder import check_path, existing_parent, temporary_folder
@@ -22,7 +28,7 @@ from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.progress import Report, no_progress
-from legcal.recordings.bag import Bag, is_bag
+from legcal.recordings.bag import Bag, is_bag, split_topic
 from legcal.recordings.frames import VIDEOS, ImageFolder, Recording, Video
 from legcal.recordings.series import Series, read_series
 from legcal.recordings.stillness import (
@@ -175,12 +181,8 @@ def plan_import(
     *,
     readings: Sequence[Path] = (),
     cameras: Sequence[str] = (),
-    unit: str | None = None,
     lengths: bool = False,
     offset: float | None = None,
-    still: float = LEAST_STILL,
-    image_topic: str | None = None,
-    joint_topic: str | None = None,
     progress: Report = no_progress,
 ) -> Import:
     """Find the frames of recordings in which the machine stands still, and their readings.
@@ -188,7 +190,8 @@ def plan_import(
     Parameters
     ----------
     sources : sequence of path
-        A video, a ROS bag or a folder of images with times for each camera position.
+        A video, a ROS bag or a folder of images with times for each camera position; of a bag with
+        several cameras the topic of one behind it, ``run.mcap:/left/image_raw``.
     model : path or str
         The nominal model, as for :func:`legcal.load_mechanism`.
     destination : path
@@ -198,30 +201,21 @@ def plan_import(
         for bags that hold joint states.
     cameras : sequence of str
         Camera files: one for all views, or ``VIEW=FILE`` for each.
-    unit, lengths
-        As for :func:`legcal.data.new_dataset.plan_new_dataset`.
+    lengths : bool
+        Whether tables hold whole lengths of legs in place of readings.
     offset : float, optional
         The clock of the camera less that of the readings [s]; found from motion by default.
-    still : float
-        How long frames and readings must rest [s].
-    image_topic, joint_topic : str, optional
-        Topics of bags that hold several.
 
     Raises
     ------
     DatasetError, ModelError, UsageError
         If a file cannot be read, nothing moves or nothing rests, or the clocks cannot be compared.
     """
-    machine = load_mechanism(model).require_rigid_platform()
+    machine = load_mechanism(model)
     destination = Path(destination)
     check_path(destination, DATASET_FOLDER)
-    recordings = [open_recording(Path(path), machine, image_topic, joint_topic) for path in sources]
-    if (image_topic or joint_topic) and not any(isinstance(one, Bag) for one in recordings):
-        raise UsageError(
-            "The recordings could not be imported: found a topic and no bag, needed a bag (.bag, "
-            ".mcap, or the folder of a ROS 2 bag); leave --image-topic and --joint-topic out."
-        )
-    names = [_view_name(recording.path, destination) for recording in recordings]
+    recordings = [open_recording(Path(path), machine) for path in sources]
+    names = [_view_name(Path(path), destination) for path in sources]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise UsageError(
@@ -233,11 +227,6 @@ def plan_import(
             f"The recordings could not be imported: found {len(readings)} tables of readings for "
             f"{len(recordings)} recordings, needed one for all or one for each, in their order."
         )
-    if not np.isfinite(still) or still <= 0.0:
-        raise UsageError(
-            f"The recordings could not be imported: found {still:g} s of rest, needed a time above "
-            "zero; correct --still."
-        )
     if offset is not None and not np.isfinite(offset):
         raise UsageError(
             f"The recordings could not be imported: found an offset of {offset:g} s between the "
@@ -247,7 +236,7 @@ def plan_import(
         read_camera(
             Path(text if "=" not in text or os.path.isfile(text) else text.split("=", 1)[1])
         )
-    tables = {path: read_series(path, machine, unit, lengths) for path in dict.fromkeys(readings)}
+    tables = {path: read_series(path, machine, lengths=lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
         own = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
@@ -256,21 +245,20 @@ def plan_import(
                 f"{recording.path}: the readings could not be found: found none in it, needed a "
                 "table with times; give it with --readings."
             )
-        views.append(_view(name, recording, own, offset, still, progress, one_clock=not readings))
+        views.append(_view(name, recording, own, offset, progress, one_clock=not readings))
     return Import(machine, model, destination, tuple(views), tuple(cameras))
 
 
-def open_recording(
-    path: Path, machine: Machine, image_topic: str | None = None, joint_topic: str | None = None
-) -> Recording:
-    """Return the recording at a path: a bag, a folder of images or a video."""
+def open_recording(path: Path, machine: Machine) -> Recording:
+    """Return the recording at a path: a bag (with a topic behind it), images or a video."""
+    path, topic = split_topic(path)
     if not os.path.exists(path):
         raise DatasetError(
             f"{path}: the recording could not be read: found no such file, needed a video, a bag "
             "or a folder of images; check the path."
         )
     if is_bag(path):
-        return Bag(path, machine, image_topic, joint_topic)
+        return Bag(path, machine, topic)
     if path.is_dir():
         return ImageFolder(path)
     if path.suffix.lower() in VIDEOS:
@@ -283,7 +271,11 @@ def open_recording(
 
 
 def _view_name(path: Path, destination: Path) -> str:
+    """Return the name of the view of a recording: that of the file, and of the topic behind it."""
+    path, topic = split_topic(path)
     name = path.resolve().stem if not path.is_dir() else path.resolve().name
+    if topic is not None:
+        name = f"{name}_{topic.strip('/').replace('/', '_')}"
     if not is_name(name) or "/" in name or "=" in name:
         raise DatasetError(
             f"{path}: the recording could not be used: found the name {describe(name)}, which is "
@@ -297,7 +289,6 @@ def _view(
     recording: Recording,
     series: Series,
     given: float | None,
-    still: float,
     progress: Report,
     *,
     one_clock: bool,
@@ -332,12 +323,12 @@ def _view(
                 "the camera is ahead, --offset SECONDS."
             ) from error
     _check_overlap(times - apart.seconds, series, start)
-    stills, kept = still_frames(times, frames_move, series.times, moves, apart, still)
+    stills, kept = still_frames(times, frames_move, series.times, moves, apart, LEAST_STILL)
     if not kept:
         found = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
         raise DatasetError(
-            f"{start} found no frame to use ({found}), needed rests of {still:g} s and more with "
-            "readings; record longer rests, or lower --still."
+            f"{start} found no frame to use ({found}), needed rests of {LEAST_STILL:g} s and more "
+            "with readings; record longer rests."
         )
     q = np.array([series.q[rows].mean(axis=0) for rows in kept])
     rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
@@ -422,8 +413,8 @@ def import_recordings(
             table = folder / _TABLE
             table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
             new = plan_new_dataset(
-                folder / _SHOTS, table, found.model, found.destination, cameras=found.cameras,
-                by="name", encoder_sigma=found.encoder_sigma,
+                folder / _SHOTS, table, found.model, found.destination,
+                SheetOptions(cameras=found.cameras, encoder_sigma=found.encoder_sigma),
             )  # fmt: skip
             return write_new_dataset(new, force=force)
     except OSError as error:

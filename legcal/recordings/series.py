@@ -57,7 +57,7 @@ class Series:
     notes: tuple[str, ...] = ()
 
 
-def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -> Series:
+def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
     """Return the readings of a CSV with a column of times, in the order of these."""
     sheet = ReadingsSheet(path, machine, "time")
     if "time" not in sheet:
@@ -66,7 +66,7 @@ def read_series(path: Path, machine: Machine, unit: str | None, lengths: bool) -
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"poses that were held. {' '.join(sheet.notes)}".rstrip()
         )
-    found = sheet.readings(unit, lengths=lengths)
+    found = sheet.readings(lengths=lengths)
     times = _seconds(sheet.text("time"), path)
     in_words = f"{found.unit}, {found.unit_from}"
     return _in_order(Series(str(path), times, found.q, sheet.taken, in_words, tuple(sheet.notes)))

@@ -9,8 +9,18 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
 from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
-from legcal.calibration.summary import NUMBERS, UNITS, residuals_in_words, sentences, tables
+from legcal.calibration.summary import (
+    NUMBERS,
+    UNITS,
+    ParameterTable,
+    brief_sentences,
+    residuals_in_words,
+    sentences,
+    tables,
+)
+from legcal.machine.parameter_id import ParameterId
 from legcal.report.render import report, table
 
 if TYPE_CHECKING:
@@ -20,23 +30,74 @@ if TYPE_CHECKING:
     from legcal.calibration.verification import Check
 
 _SAME_M, _SAME_RAD = 1e-9, 1e-9  # [m, rad]: frames that are closer are in the same place
+_LARGEST = 5  # changes of parameters that are named
 _EXPLANATIONS = 3  # that are named beside the best
 
 
 def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> RenderableType:
-    """Return tables of parameters in mm, degrees and pixels, and what they mean."""
+    """Return one screen: verdict, platform, largest changes, weakest direction, notes.
+
+    *verbose* adds all parameters in mm, degrees and pixels, and how the fit went.
+    """
+    result, good = calibration.result, calibration.verdict.trustworthy
+    verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
+    written = f"Written to {output}."
+    if not verbose:
+        return report(
+            verdict,
+            None if result.platform is None else _platform(result.platform),
+            _largest_changes(result),
+            [*brief_sentences(result), f"{written} All parameters: --verbose, or the files there."],
+        )
     shown = [
         table(
             *(f">{name}" if name in NUMBERS else name for name in found.columns),
             rows=found.cells(),
             title=title,
         )
-        for title, found in tables(calibration.result)
+        for title, found in tables(result)
     ]
-    lines = [*sentences(calibration.result, verbose=verbose), f"Written to {output}."]
-    good = calibration.verdict.trustworthy
-    verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
-    return report(*shown, [*lines, verdict])
+    return report(*shown, [*sentences(result, verbose=True), written, verdict])
+
+
+def _platform(found: PlatformBlock) -> RenderableType:
+    """Return the platform error before the calibration, and as predicted after it."""
+    after: PlatformBlock | WorkspaceAccuracy = found.workspace or found
+    where = "poses" if found.workspace is None else "workspace"
+    rows = [
+        ("nominal model, off the calibrated one", found.change_dX_m, found.change_dE_rad),
+        (f"calibrated, predicted (1 sigma, {where})", after.sigma_dX_m, after.sigma_dE_rad),
+        ("at most", after.sigma_dX_max_m, after.sigma_dE_max_rad),
+    ]
+    return table(
+        "platform error",
+        ">mm",
+        ">deg",
+        rows=[(name, f"{1e3 * dX:.3f}", f"{np.degrees(dE):.4f}") for name, dX, dE in rows],
+    )
+
+
+def _largest_changes(result: Result) -> RenderableType | None:
+    """Return the lengths and coordinates that changed most, joints in the links."""
+    rows = [
+        (f"{row['leg']}.{row['joint']}.{row['axis']}", row["change"], row["sigma"])
+        for row in ParameterTable.of_joints(result)
+        if row["sigma"] is not None
+    ]
+    rows += [
+        (row["parameter"], row["change"], row["sigma"])
+        for row in ParameterTable.of(result, joints=False)
+        if row["unit"] == "mm" and row["sigma"] is not None
+    ]
+    most = sorted(rows, key=lambda row: -abs(row[1]))[:_LARGEST]
+    if not most:
+        return None
+    return table(
+        "largest changes",
+        ">mm",
+        ">sigma",
+        rows=[(name, f"{change:+.3f}", f"{sigma:.3f}") for name, change, sigma in most],
+    )
 
 
 def check_summary(check: Check) -> RenderableType:
@@ -91,7 +152,7 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     rows = [
         (name, f"{value:z.4f}", f"{reference:z.4f}", f"{value - reference:+z.4f}")
         for name, value, reference in zip(evaluation.names, values, references, strict=True)
-        if not (name.endswith(".gain") and value == reference == 1.0)
+        if not (ParameterId.parse(name).kind == "gain" and value == reference == 1.0)
     ]
     angles = "; axes and twists in deg" * ("rad" in evaluation.units)
     columns = ("parameter", ">model", ">reference", ">difference")

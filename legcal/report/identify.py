@@ -235,7 +235,7 @@ def _remedies(report: Identifiability) -> Table:
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
-    """Return what follows."""
+    """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in report.full.weak)
     lines: list[str | RenderableType] = []
     if report.identifiable:
@@ -244,7 +244,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         if report.scale:
             lines.append(
                 "But for the scale: calibrate refuses this machine until a length or radii are "
-                "stated (--length, --prior), or a board is seen."
+                "stated (--length, --set), or a board is seen."
             )
         if not report.staged.complete:
             lines.append("The steps alone do not: calibration starts from the nominal model.")

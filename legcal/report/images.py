@@ -14,6 +14,7 @@ from rich.text import Text
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.calibration.detection import DETECTION_PAGE, Detection
+from legcal.data.reasons import reason_in_words
 from legcal.report.render import heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
@@ -88,7 +89,7 @@ def detection_table(found: Detection, output: Path) -> RenderableType:
         for name, view in views.items()
     ]
     numbers = ("images", "legs found", "outlines used", *(key for key, _, _ in shown))
-    reasons = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
+    reasons = ", ".join(f"{n} {reason_in_words(why)}" for why, n in rejected.most_common())
     return report(
         heading(
             document["mechanism"],

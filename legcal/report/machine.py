@@ -98,7 +98,6 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         more,
         table(*of_laws, rows=laws) if laws else None,
         _motors(description) if "actuators" in description else None,
-        _internal_joints(description) if "internal_joints" in description else None,
         table(*of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
@@ -106,30 +105,6 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
             *(f"note: {note}" for note in description["diagnostics"]),
         ],
     )
-
-
-def _internal_joints(description: dict[str, Any]) -> RenderableType:
-    """Return the joints inside a platform of several bodies: what moves, and how far."""
-    rows = []
-    for name, joint in description["internal_joints"].items():
-        legs = [leg["name"] for leg in description["legs"] if leg.get("internal") == name]
-        turns = joint["kind"] == "revolute"
-        scale, unit = SHOWN_IN["rad" if turns else "m"]
-        travel = "" if joint["travel"] is None else _travel(joint["travel"], turns)
-        moves = f"axis {_direction(joint['axis'])}" if turns else None
-        home = f"{scale * joint['at_home']:z.2f} {unit}"
-        rows.append(
-            (
-                name,
-                ", ".join(legs),
-                moves or f"along {_direction(joint['direction'])}",
-                travel,
-                home,
-            )
-        )
-        if turns:
-            rows.append(("", "", f"at {_points([joint['point']])[0]} mm", "", ""))
-    return table("inside", "legs", "moves", ">travel", ">at home", rows=rows)
 
 
 def _travel(limits: Sequence[float], turns: bool) -> str:

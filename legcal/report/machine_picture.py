@@ -23,6 +23,7 @@ from legcal.machine.drawing import (
     PLATFORM_COLOUR,
     around,
     motor_lines,
+    sketch_of,
 )
 from legcal.machine.model import Machine, vectors_A_to_B
 
@@ -38,7 +39,8 @@ MACHINE_PICTURE = OutputFile(
 
 def draw_machine(machine: Machine) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
-    views = machine.sketch.panels
+    sketch = sketch_of(machine)
+    views = sketch.panels
     B = machine.home.apply(machine.B_platform)
     A = B - vectors_A_to_B(machine, machine.home)
     motors = motor_lines(machine.legs, A[None])
@@ -71,7 +73,7 @@ def draw_machine(machine: Machine) -> str:
                 start, end = on_paper(part)
                 lines.append(_line(start, end, MOTOR_COLOUR, thick, opacity=0.8))
         for j, (a, b) in enumerate(zip(A, B, strict=True)):
-            thick = 2.0 * scale * machine.sketch.radii[j]
+            thick = 2.0 * scale * sketch.radii[j]
             lines.append(_line(a, b, LEG_COLOUR, max(thick, 1.5), opacity=0.7))
         for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
             lines += _joints(machine, letter, joints, colour, is_plan=panel.is_plan)

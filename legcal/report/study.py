@@ -41,7 +41,7 @@ def study_table(document: Mapping[str, Any]) -> RenderableType:
     rows.append(("paper, as printed", *[""] * 5))
     rows.append((" before", *_printed_cells(printed["initial"])))
     rows.append((" after", *_printed_cells(printed["calibrated"])))
-    notes = [*failures, *document.get("notes", ()), printed["note"], *document["readings"]]
+    notes = [*failures, printed["note"], *document["readings"]]
     return report(table(*_COLUMNS, rows=rows), [Text(f"- {note}", style="dim") for note in notes])
 
 

@@ -140,7 +140,6 @@ def simulate(
         )
     check_dataset_destination(destination)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
-    nominal.require_rigid_platform()
     _check_readings(nominal, settings)
     rngs = streams(settings.seed)
     with shown_progress(progress) as report, result_folder(destination, SIMULATED) as folder:

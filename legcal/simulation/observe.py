@@ -15,6 +15,7 @@ import numpy as np
 
 from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import USED
 from legcal.errors import NotVisible
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, IntArray
@@ -118,7 +119,7 @@ def outlines_of(
         ends=np.array(ends).reshape(n, 2, 2),
         covariance=np.repeat(np.array(covariances).reshape(-1, 2, 2), 2, axis=0),
         used=np.ones(n, dtype=np.bool_),
-        reason=("",) * n,
+        reason=(USED,) * n,
         source=("detected",) * n,
     )
 

@@ -16,7 +16,8 @@ from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
-from legcal.machine.parameters import kind_of_parameter, parametrization_of
+from legcal.machine.parameter_id import ParameterId
+from legcal.machine.parameters import parametrization_of
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.visibility import Viewpoint
@@ -140,7 +141,7 @@ KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are siz
 def kinds_of(machine: Machine) -> set[str]:
     """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
     names = parametrization_of(machine, twists=True).names
-    kinds = {ERRORS_OF[kind_of_parameter(name)] for name in names if not name.endswith(".gain")}
+    kinds = {ERRORS_OF[kind] for name in names if (kind := ParameterId.parse(name).kind) != "gain"}
     return kinds | ({"radii"} if any(leg.cylinders for leg in machine.legs) else set())
 
 

@@ -20,7 +20,7 @@ from legcal.geometry.motions import matrix_product, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
-from legcal.machine.cylinders import COAXIAL
+from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
@@ -307,11 +307,12 @@ def _leg_along(
     vectors = vectors_A_to_B(machine, machine.home)
     A = machine.home.apply(machine.B_platform) - vectors
     u = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    within = coaxial_tolerance(machine.legs)
     for j, leg in enumerate(machine.legs):
         has_it = any(
-            c.link == link and abs(c.radius - shape.radius) < COAXIAL for c in leg.cylinders
+            c.link == link and abs(c.radius - shape.radius) < within for c in leg.cylinders
         )
-        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * COAXIAL:
+        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * within:
             return j
     return None
 

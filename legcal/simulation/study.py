@@ -11,7 +11,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -81,7 +81,6 @@ class StudyHeading(SparseDocument):
     seed: int
     runs: int
     failures: dict[str, int]  # runs that failed as a whole, by kind of error
-    notes: list[str] | None = None  # left out where there are none
 
 
 @brief
@@ -95,7 +94,6 @@ class StudyResult:
     n_runs: int
     failures: dict[str, int]  # how many runs failed as a whole, by kind of error
     summary: Summary  # what the others found
-    notes: tuple[str, ...] = ()  # on workers that differ from each other
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
@@ -105,7 +103,6 @@ class StudyResult:
             seed=self.seed,
             runs=self.n_runs,
             failures=self.failures,
-            notes=list(self.notes) or None,
         )
         return self.summary.document() | heading.document()
 
@@ -158,7 +155,6 @@ def run_study(
     _check_numbers(n_runs, seed, workers)
     checkpoint, stage = _Checkpoint(output, _header(study, seed)), f"Study {study.name}"
     missing = [run for run in range(n_runs) if run not in checkpoint.lines]
-    notes = tuple[str, ...]()
     with shown_progress(progress) as report:
         done = n_runs - len(missing)
         report(stage, done, n_runs)
@@ -171,9 +167,8 @@ def run_study(
                     checkpoint.add(lines)
                     done += len(lines)
                     report(stage, done, n_runs)
-                notes = run.notes
     in_order = [checkpoint.lines[run] for run in range(n_runs)]
-    result = replace(_result(study, seed, in_order), notes=notes)
+    result = _result(study, seed, in_order)
     if output is not None:
         _write(result, output, beside)
     return result

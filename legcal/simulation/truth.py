@@ -23,9 +23,9 @@ from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import check_closes, mechanism_text, model_name, write_urdf
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
     geometries,
-    kind_of_parameter,
     moved_legs,
     parametrization_of,
     reframed,
@@ -76,10 +76,11 @@ def draw_errors(
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:
     """Return how large the error of a parameter is, by its name."""
-    kind = kind_of_parameter(name)
+    parameter = ParameterId.parse(name)
+    kind = parameter.kind
     if kind == "gain":  # of motors: readings are true
         return Spread()
-    if errors.coplanar and kind in ("base", "platform") and name.endswith(".z"):
+    if errors.coplanar and parameter.is_joint_coordinate and parameter.component == "z":
         return Spread()
     found: Spread = getattr(errors, ERRORS_OF[kind])
     return found

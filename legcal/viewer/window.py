@@ -115,7 +115,7 @@ class Window:
             time.sleep(max(0.0, 1.0 / FRAMES - (time.monotonic() - started)))
 
     def _step(self, wanted: dict[Any, Callable[[], object]], now: float) -> None:
-        """Do what is wanted, and send what is seen then."""
+        """Handle the pending requests of the browser, then send the new scene."""
         for do in wanted.values():
             do()
         if self._is_playing:

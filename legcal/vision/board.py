@@ -117,7 +117,7 @@ class FixedBoard:
         return board_name(self.link)
 
     def has(self, corner: IntArray) -> BoolArray:
-        """Say which of some numbers of corners are its own, (n,)."""
+        """Return a mask (n,) of the corner indices that belong to this board."""
         return (corner >= self.first) & (corner < self.first + self.board.n_corners)
 
 

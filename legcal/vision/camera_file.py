@@ -76,8 +76,6 @@ class PhotographsEntry(_OpenSchema):
     focus_distance_m: list[_Positive] = Field(default_factory=list)
     taken_size: list[tuple[_PixelCount, _PixelCount]] = Field(default_factory=list)
     software: list[_Text] = Field(default_factory=list)
-    lens_corrected: list[bool] = Field(default_factory=list)
-    cropped: list[bool] = Field(default_factory=list)
 
 
 class CalibratedEntry(_OpenSchema):

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
 _REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # of the package
-_EXIF = b"Exif\0\0"
 
 
 class UnreadableError(ValueError):
@@ -47,14 +46,12 @@ def heic_pixels(content: bytes) -> NDArray[np.generic]:
     return pixels[..., :3] if pixels.ndim == 3 else pixels  # without what is transparent
 
 
-def heic_blocks(content: bytes) -> tuple[bytes, bytes]:
-    """Return the blocks of EXIF and XMP, b"" where there is none, or no package."""
+def heic_exif(content: bytes) -> bytes:
+    """Return the block of EXIF, b"" where there is none, or no package."""
     try:
-        info = _opened(content).info
+        return bytes(_opened(content).info.get("exif") or b"")
     except UnreadableError:
-        return b"", b""
-    exif, xmp = (info.get(name) or b"" for name in ("exif", "xmp"))
-    return bytes(exif).removeprefix(_EXIF), bytes(xmp)
+        return b""
 
 
 def _package() -> ModuleType | None:

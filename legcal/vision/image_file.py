@@ -1,21 +1,22 @@
 """Image files: checked without decoding, read as grey levels, made larger for searches."""
 
 import os
-import re
-import struct
 import threading
-import zlib
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL.ExifTags import Base
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 
-from legcal.cluster import file_of_task
 from legcal.errors import DatasetError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
@@ -30,9 +31,12 @@ from legcal.vision.heic import (
 )
 from legcal.vision.image_facts import (
     JPEG_SIGNATURE,
+    PILLOW_ERRORS,
     PNG_SIGNATURE,
     TIFF_SIGNATURES,
     ImageFacts,
+    exif_tags,
+    quiet_pillow,
     read_facts,
 )
 
@@ -61,17 +65,12 @@ def quiet_opencv() -> Iterator[None]:
 
 
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _DEEP, _FULL = 12, 16  # bits that the data in files of 16 bits may have
-_TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
-_TIFF_TAGS = (256, 257, 258, 273, 279, 322, 323, 324, 325, 339)  # that are looked at
-_TIFF_FORMATS = {2: "signed", 3: "floating-point"}  # of samples, others than unsigned
-_TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
+_END_OF_IMAGE = b"\xff\xd9"  # of a JPEG
+_CHECKSUM = 4  # bytes, of a chunk of a PNG
 
 
 MAX_SIDE, MAX_AREA = 30_000, 100_000_000  # [px] of an image or a camera; the largest sensors
-_MOST_SCANS = 200  # of a JPEG: each is another pass over all pixels
-_MOST_TAGS, _MOST_STRIPS = 200, 100_000  # of a TIFF
 _SIDEWAYS = 5  # EXIF orientation, from which on width and height are exchanged for looking
 _STRIP = 256  # rows of an image that become grey levels at once
 
@@ -165,27 +164,72 @@ def inspect_image(path: Path, camera: Camera, where: str = "") -> tuple[ImageFac
 
 
 def image_size(content: bytes) -> ImageSize:
-    """Return the size of an image from the bytes of its file."""
+    """Return the size of an image from the bytes of its file; refuse one that is cut off."""
     if not content:
         raise BadImage("an empty file")
-    readers = {JPEG_SIGNATURE: _jpeg_size, PNG_SIGNATURE: _png_size}
-    readers |= dict.fromkeys(TIFF_SIGNATURES, _tiff_size)
-    try:
-        for signature, read in readers.items():
-            if content.startswith(signature):
-                size = read(content)
-                if problem := size_problem(size.width, size.height):
-                    raise BadImage(*problem)
-                return size
-    except (struct.error, IndexError) as error:
-        raise BadImage(f"a file cut off after {len(content)} bytes") from error
     if is_heic(content):
-        return _heic_size(content)
-    if content[4:8] == b"ftyp" and content[8:12] in _BRANDS:
+        size = _heic_size(content)
+    elif content.startswith(JPEG_SIGNATURE):
+        size = _size_read("JPEG", _jpeg_size, content)
+    elif content.startswith(PNG_SIGNATURE):
+        size = _size_read("PNG", _png_size, content)
+    elif content.startswith(TIFF_SIGNATURES):
+        size = _size_read("TIFF", _tiff_size, content)
+    elif content[4:8] == b"ftyp" and content[8:12] in _BRANDS:
         raise BadImage(
             f"a {_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
         )
-    raise BadImage("a file that is none of these")
+    else:
+        raise BadImage("a file that is none of these")
+    if problem := size_problem(size.width, size.height):
+        raise BadImage(*problem)
+    return size
+
+
+def _size_read(form: str, read: Callable[[bytes], tuple[int, int]], content: bytes) -> ImageSize:
+    """Return the size of a picture, as Pillow reads it."""
+    try:
+        with quiet_pillow():
+            return ImageSize(*read(content))
+    except BadImage:
+        raise
+    except (*PILLOW_ERRORS, UserWarning) as error:
+        raise BadImage(f"a {form} file of {len(content)} bytes, damaged or cut off") from error
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Return the size of a JPEG, whose data must come to their end."""
+    file = BytesIO(content)
+    picture = JpegImageFile(file)
+    if content.find(_END_OF_IMAGE, file.tell()) < 0:  # behind the header of the first scan
+        raise EOFError
+    return picture.size
+
+
+def _png_size(content: bytes) -> tuple[int, int]:
+    """Return the size of a PNG, whose checksums must be right."""
+    file = BytesIO(content)
+    picture = PngImageFile(file)
+    picture.verify()
+    if file.tell() + _CHECKSUM > len(content):  # behind the name of the last chunk
+        raise EOFError
+    return picture.size
+
+
+def _tiff_size(content: bytes) -> tuple[int, int]:
+    """Return the size of a TIFF, whose tags, strips and tiles must all be there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # of tags that are cut off
+        tags = exif_tags(content)
+    is_tiled = Base.TileOffsets in tags
+    starts = tags[Base.TileOffsets if is_tiled else Base.StripOffsets]
+    lengths = tags[Base.TileByteCounts if is_tiled else Base.StripByteCounts]
+    if np.max(np.add(starts, lengths)) > len(content):
+        raise EOFError
+    bits = int(np.max(tags.get(Base.BitsPerSample, 1)))
+    if bits > _FULL:
+        raise BadImage(f"a TIFF of {bits} bit pixels", _LEVELS)
+    return int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
 
 
 def _heic_size(content: bytes) -> ImageSize:
@@ -193,12 +237,9 @@ def _heic_size(content: bytes) -> ImageSize:
     if not can_read_heic():
         raise BadImage("a HEIC file, which cannot be read here", remedy=CONVERT_HEIC)
     try:
-        size = ImageSize(*heic_size(content))
+        return ImageSize(*heic_size(content))
     except UnreadableError as error:
         raise BadImage(f"a HEIC file that cannot be read ({error})") from error
-    if problem := size_problem(size.width, size.height):
-        raise BadImage(*problem)
-    return size
 
 
 def image_suffixes() -> tuple[str, ...]:
@@ -217,9 +258,7 @@ def size_problem(width: int, height: int) -> tuple[str, str] | None:
 def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
     """Return in brackets why an image has another size than its camera, "" if nothing shows."""
     causes = []
-    if facts.is_screenshot:
-        causes.append("a screenshot, as its file says")
-    elif size == ImageSize(needed.height, needed.width) and (facts.orientation or 1) >= _SIDEWAYS:
+    if size == ImageSize(needed.height, needed.width) and (facts.orientation or 1) >= _SIDEWAYS:
         causes.append(
             f"turned by a quarter turn, as programs show it by its EXIF orientation "
             f"{facts.orientation}; pixels are taken as they are stored"
@@ -243,12 +282,11 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
 
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
-    sent = file_of_task(path)
-    if sent is None and not os.path.isfile(path):
+    if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
         return b"", _problem(path, where, found, _COMPLETE, "correct the path or remove the row")
     try:
-        content = read_bytes(path, MAX_IMAGE) if sent is None else sent
+        content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
@@ -271,83 +309,6 @@ def _problem(path: Path, where: str, found: str, needed: str, remedy: str = _AGA
     """Return the sentence for an image that cannot be used."""
     prefix = f"{where}: " if where else ""
     return f"{prefix}image {path} could not be read: found {found}, needed {needed}; {remedy}."
-
-
-def _jpeg_size(content: bytes) -> ImageSize:
-    """Walk the segments of a JPEG to its end-of-image marker."""
-    size, at, n_scans = None, 2, 0
-    while True:
-        match = _JPEG_MARKER.search(content, at)
-        if match is None:
-            raise BadImage(f"a JPEG cut off after {len(content)} bytes, without its end marker")
-        marker, at = content[match.start() + 1], match.end()
-        if marker == 0xD9:
-            break
-        if marker in (0x01, 0xD8):
-            continue
-        n_scans += marker == 0xDA
-        if n_scans > _MOST_SCANS:
-            raise BadImage(f"a JPEG of more than {_MOST_SCANS} scans", "fewer")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", content, at + 3)
-            size = ImageSize(width, height)
-        at += struct.unpack_from(">H", content, at)[0]
-    if size is None:
-        raise BadImage("a JPEG without a picture")
-    return size
-
-
-def _png_size(content: bytes) -> ImageSize:
-    """Walk the chunks of a PNG to IEND, checking their checksums."""
-    width, height = struct.unpack_from(">II", content, 16)
-    at, kind = len(PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        length, kind = struct.unpack_from(">I4s", content, at)
-        if at + 12 + length > len(content):
-            raise BadImage(f"a PNG cut off after {len(content)} bytes")
-        (checksum,) = struct.unpack_from(">I", content, at + 8 + length)
-        if zlib.crc32(memoryview(content)[at + 4 : at + 8 + length]) != checksum:
-            raise BadImage(f"a PNG whose {kind.decode('latin-1')} chunk has a wrong checksum")
-        at += 12 + length
-    return ImageSize(width, height)
-
-
-def _tiff_size(content: bytes) -> ImageSize:
-    """Read the first directory of a TIFF and see that all it points to is there."""
-    order = "<" if content.startswith(b"II") else ">"
-    (at,) = struct.unpack_from(order + "I", content, 4)
-    (n_tags,) = struct.unpack_from(order + "H", content, at)
-    if n_tags > _MOST_TAGS:
-        raise BadImage(f"a TIFF of {n_tags} tags", f"at most {_MOST_TAGS}")
-    ends = [at + 2 + 12 * n_tags + 4]  # the directory, and the pointer to the next one
-    tags: dict[int, tuple[int, ...]] = {}
-    n_all = 0
-    for entry in range(at + 2, at + 2 + 12 * n_tags, 12):
-        tag, kind, count = struct.unpack_from(order + "HHI", content, entry)
-        n_bytes = count * _TIFF_BYTES.get(kind, 1)
-        (pointer,) = struct.unpack_from(order + "I", content, entry + 8)
-        start = pointer if n_bytes > 4 else entry + 8
-        ends.append(start + n_bytes)
-        n_all += n_bytes
-        if n_all > len(content):  # tags may point to the same bytes, which are read many times
-            raise BadImage(f"a TIFF cut off after {len(content)} bytes")
-        if count > _MOST_STRIPS and tag in _TIFF_TAGS:
-            raise BadImage(f"a TIFF of {count} strips", f"at most {_MOST_STRIPS}")
-        if count and tag in _TIFF_TAGS and kind in _TIFF_INTEGERS and ends[-1] <= len(content):
-            tags[tag] = struct.unpack_from(f"{order}{count}{_TIFF_INTEGERS[kind]}", content, start)
-    if max(tags.get(322, (0,))) * max(tags.get(323, (0,))) > MAX_AREA:
-        raise BadImage("a TIFF of tiles that are larger than any image")
-    starts, lengths = tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ()))
-    ends += [start + length for start, length in zip(starts, lengths, strict=False)]
-    if max(ends) > len(content):
-        raise BadImage(f"a TIFF cut off after {len(content)} bytes")
-    if not (starts and lengths and tags.get(256) and tags.get(257)):
-        raise BadImage("a TIFF without a picture")
-    bits, form = max(tags.get(258, (1,))), max(tags.get(339, (1,)))
-    if bits > _FULL or form in _TIFF_FORMATS:
-        kind = _TIFF_FORMATS.get(form, "integer")
-        raise BadImage(f"a TIFF of {bits} bit {kind} pixels", _LEVELS)
-    return ImageSize(tags[256][0], tags[257][0])
 
 
 def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:

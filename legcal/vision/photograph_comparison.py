@@ -90,14 +90,6 @@ def _processed(taken: Size, size: Size) -> str:
     return f"{start}{' and cropped' * (size[0] <= taken[0] and size[1] <= taken[1])}"
 
 
-def _corrected(value: bool, _: Size) -> str:
-    return f"{'' if value else 'not '}corrected for their lens by a program"
-
-
-def _cropped(value: bool, _: Size) -> str:
-    return f"{'' if value else 'not '}cropped by a program"
-
-
 _PROCESSING = "way of processing"
 FACTS = (
     Fact("device", "device", "camera", _plainly("taken by '{}'"), _not_equal),
@@ -113,22 +105,17 @@ FACTS = (
     Fact("taken_size", "taken_size", _PROCESSING, _processed, _not_equal),
     Fact("software", "software", _PROCESSING, _plainly("written by '{}'"), _other_program,
          where_so=True),
-    Fact("lens_corrected", "lens_corrected", _PROCESSING, _corrected, _not_equal, False, True),
-    Fact("cropped", "cropped", _PROCESSING, _cropped, _not_equal, False, True),
 )  # fmt: skip
-_RECORDED_TOO = ("form", "jpeg_quality", "orientation")
 
 
 def recorded(facts: Sequence[ImageFacts]) -> dict[str, list[Any]]:
     """Return what a camera file records of the photographs that it comes from."""
-    names = {"form": "format"} | {name: name for name in _RECORDED_TOO[1:]}
-    names |= {fact.name: fact.key for fact in FACTS}
     found = {}
-    for name, key in names.items():
-        values = sorted({x for one in facts if (x := getattr(one, name)) not in (None, "")})
+    for fact in FACTS:
+        values = sorted({x for one in facts if (x := getattr(one, fact.name)) not in (None, "")})
         if values:
             plain = [list(x) if isinstance(x, tuple) else x for x in values]
-            found[key] = plain[:_MOST_RECORDED]
+            found[fact.key] = plain[:_MOST_RECORDED]
     return found
 
 

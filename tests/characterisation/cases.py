@@ -165,20 +165,6 @@ def _models() -> Iterable[Case]:
         ),
         input="model",
     )
-    family = "new --family {} --unit mm --base-radius 300 --platform-radius 150 -o {{out}} --json"
-    options = {
-        "6-UPS": "--height 400 --base-spread 20 --platform-spread 25 --name mine",
-        "3-UPU": "--height 0.4 --tilt 10 --travel 0 0.2 --offset 0.3 --leg-radius 0.01",
-        "3-RPR": "--turn 20",
-        "6-SS": "--height 400",
-        "3-RPS": "--height 400 --turn 5",
-    }
-    for kind, words in options.items():
-        command = family.format(kind)
-        if kind == "3-UPU":  # in metres
-            command = command.replace("mm --base-radius 300 --platform-radius 150", "m"
-                                      " --base-radius 0.3 --platform-radius 0.15")  # fmt: skip
-        yield Case(f"new-{kind}", (Step(f"{command} {words}", folder="{out}"),))
     yield Case(
         "new-csv-and-force",
         (
@@ -238,11 +224,11 @@ def _calibrate() -> Iterable[Case]:
     yield case("literal-hexapod", "--criteria literal", "hexapod-axes", slow=True)
     yield case("points", "--criteria literal --transformation points", system=True)
     yield case("cross-product", "--criteria default --transformation cross_product", system=True)
-    prior = "--prior leg1.offset=231+-0.5mm --prior '*.radius.leg2_rod=8±0.1mm'"
-    yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.23075 --free 'c1.f?'")
-    yield case("contradicted", "--fix 'leg2.base.*'", "hexapod-outlines")
-    yield case("patterns", "--prior '*.base.?=0.3+-1' --free '*.radius.*'")
-    yield case("twists", "--free '*.twist'", "3-upu-axes", slow=True)
+    prior = "--set leg1.offset=231+-0.5mm --set '*.radius.leg2_rod=8±0.1mm'"
+    yield case("by-name", f"{prior} --set leg2.offset --set leg3.offset=0.23075 --set 'c1.f?=free'")
+    yield case("contradicted", "--set 'leg2.base.*'", "hexapod-outlines")
+    yield case("patterns", "--set '*.base.?=0.3+-1' --set '*.radius.*=free'")
+    yield case("twists", "--set '*.twist=free'", "3-upu-axes", slow=True)
     yield case("holdout", "--holdout 0.25")
     yield Case(
         "calibrate-text",
@@ -281,7 +267,6 @@ def _images() -> Iterable[Case]:
         (Step("detect {in}/set -o {out} --json", folder="{out}"),),
         input="repeats",
     )
-    yield Case("noise", (Step("noise {in}/set --json"), Step("noise {in}/set")), input="repeats")
     camera = "camera {in}/set/images --board {in}/set/dataset.yaml"
     yield Case(
         "camera",

@@ -269,7 +269,6 @@ def _use() -> Iterable[Refusal]:
         ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
         ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
         ("workers", "detect x -o {out} --workers 0", ("--workers", "found 0")),
-        ("noise-nowhere", "noise nowhere", ("nowhere",)),
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
@@ -307,7 +306,7 @@ def _options() -> Iterable[Refusal]:
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("criteria", "--check {in}/result --criteria literal", ("--criteria", "--check")),
         ("transformation", "--check {in}/result --transformation points", ("--transformation",)),
-        ("holdout", "--check {in}/result --holdout 0.2 --fix '*.offset'", ("--fix", "--holdout")),
+        ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
         ("significance", "-o {out} --significance 0.05", ("--significance", "--check")),
         ("no-output", "", ("--output", "-o")),
         ("significance-1", "--check {in}/result --significance 1", ("1",)),
@@ -697,15 +696,13 @@ def _tables() -> Iterable[Refusal]:
     ]  # fmt: skip
     yield from _spoiled("axes", "calibrate {in} -o {out}", "3-rpr-axes", axes)
     for name, words, named in (
-        ("radius", "--free leg1.radius.leg1_rod", ("leg1.radius.leg1_rod", "axes")),
-        ("intrinsic", "--free c1.fx", ("c1.fx", "axes")),
+        ("radius", "--set leg1.radius.leg1_rod=free", ("leg1.radius.leg1_rod", "axes")),
+        ("intrinsic", "--set c1.fx=free", ("c1.fx", "axes")),
         ("holdout", "--holdout 0.2", ("axes",)),
     ):
         command = f"calibrate {{in}} -o {{out}} {words}"
         yield Refusal(f"axes-{name}", command, named, "3-rpr-axes")
     yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
-    yield Refusal("noise-no-images", "noise {in}", ("24",), "3-rpr-axes")
-    yield Refusal("noise-no-repeats", "noise {in}", (), "3-rpr-outlines")
 
     c = "corners.csv"
     line = "view,image,corner,u,v,sigma,verdict,reason,source\n"
@@ -763,31 +760,31 @@ def _overrides() -> Iterable[Refusal]:
         ("platform-frame", "leg5.platform.z=0±0.1", ("leg5.platform.z", "R_e")),
         ("length", "leg1.length=0.3±0.1", ("leg1.length", "leg1.offset")),
         ("twist", "leg1.twist=0±0.1", ("leg1.twist", "SPU")),
-        ("two", "leg1.offset=0.35±0.1' --prior 'leg1.offset=0.36±0.1", ("leg1.offset",)),
-        ("two-patterns", "leg1.offset=0.35±0.1' --prior '*.offset=0.35±0.2", ("leg1.offset",)),
-        ("fixed", "leg1.offset=0.35±0.1' --fix '*.offset", ("leg1.offset",)),
-        ("camera", "c1.fx=79±3' --prior 'c2.fx=78±3", ("c1.fx", "c2.fx")),
+        ("two", "leg1.offset=0.35±0.1' --set 'leg1.offset=0.36±0.1", ("leg1.offset",)),
+        ("two-patterns", "leg1.offset=0.35±0.1' --set '*.offset=0.35±0.2", ("leg1.offset",)),
+        ("fixed", "leg1.offset=0.35±0.1' --set '*.offset", ("leg1.offset",)),
+        ("camera", "c1.fx=79±3' --set 'c2.fx=78±3", ("c1.fx", "c2.fx")),
     ]
     command = "calibrate {in} -o {out}"
     for name, words, named in priors:
-        yield Refusal(f"prior-{name}", f"{command} --prior '{words}'", named, "plain")
+        yield Refusal(f"prior-{name}", f"{command} --set '{words}'", named, "plain")
     others: list[tuple[str, str, tuple[str, ...]]] = [
-        ("freed", "--fix leg1.offset --free leg1.offset", ("leg1.offset",)),
-        ("values", "--fix leg1.offset=0.35 --fix leg1.offset=0.36", ("leg1.offset",)),
-        ("nan", "--fix leg1.offset=nan", ("leg1.offset",)),
-        ("unit", "--fix leg1.offset=350foot", ("leg1.offset", "foot")),
-        ("text", "--fix leg1.offset=x", ("leg1.offset",)),
-        ("all-at-once", "--fix leg9.offset --fix leg1.base.x --free c9.fx",
+        ("freed", "--set leg1.offset --set leg1.offset=free", ("leg1.offset",)),
+        ("values", "--set leg1.offset=0.35 --set leg1.offset=0.36", ("leg1.offset",)),
+        ("nan", "--set leg1.offset=nan", ("leg1.offset",)),
+        ("unit", "--set leg1.offset=350foot", ("leg1.offset", "foot")),
+        ("text", "--set leg1.offset=x", ("leg1.offset",)),
+        ("all-at-once", "--set leg9.offset --set leg1.base.x --set c9.fx=free",
          ("leg9.offset", "leg1.base.x", "c9.fx")),
-        ("everything", "--fix '*.base.?' --fix '*.platform.?' --fix '*.offset'", ()),
+        ("everything", "--set '*.base.?' --set '*.platform.?' --set '*.offset'", ()),
     ]  # fmt: skip
     for name, words, named in others:
         yield Refusal(f"fix-{name}", f"{command} {words}", named, "plain")
     planar: list[tuple[str, str, tuple[str, ...]]] = [
-        ("height", "--fix leg1.base.z", ("leg1.base.z",)),
-        ("axis", "--fix leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
-        ("contradicted", "--fix leg1.offset=0.24", ("leg1.offset", "0.24")),
-        ("contradicted-prior", "--prior leg1.offset=240+-0.1mm", ("leg1.offset", "0.24")),
+        ("height", "--set leg1.base.z", ("leg1.base.z",)),
+        ("axis", "--set leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
+        ("contradicted", "--set leg1.offset=0.24", ("leg1.offset", "0.24")),
+        ("contradicted-prior", "--set leg1.offset=240+-0.1mm", ("leg1.offset", "0.24")),
     ]
     for name, words, named in planar:
         yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-axes")
@@ -951,31 +948,8 @@ def _new() -> Iterable[Refusal]:
             f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
             (text("m.csv", content),),
         )  # fmt: skip
-    family = "--base-radius 300 --platform-radius 150"
-    families: list[tuple[str, str, tuple[str, ...]]] = [
-        ("nothing", "", ("--family",)),
-        ("sizes", "--family 6-UPS", ("--base-radius", "--platform-radius", "--height")),
-        ("name", "--family hexapod", ("'hexapod'",)),
-        ("one", "--family 1-UPS", ("'1-UPS'", "2")),
-        ("class", "--family 3-PPS", ("'3-PPS'",)),
-        ("unit", f"--family 6-UPS --unit inch {family} --height 4", ("'inch'", "mm")),
-        ("radius", "--family 6-UPS --unit mm --base-radius -3 --platform-radius 2 --height 4",
-         ("--base-radius", "-3")),
-        ("height", f"--family 3-RPR --unit mm {family} --height 4", ("--height",)),
-        ("tilt", f"--family 3-RPR --unit mm {family} --tilt 4", ("--tilt",)),
-        ("spread", f"--family 3-RPS --unit mm {family} --height 4 --base-spread 30",
-         ("--base-spread", "3")),
-        ("offset", f"--family 6-SS --unit mm {family} --height 4 --offset 3", ("--offset",)),
-        ("turn", f"--family 6-UPS --unit mm {family} --height 400 --turn 200", ("--turn", "200")),
-        ("travel", f"--family 6-UPS --unit mm {family} --height 400 --travel 2 1",
-         ("--travel", "2 1")),
-        ("path", f"--family 6-UPS --unit mm {family} --height 400 --name ../up", ("'../up'",)),
-        ("metres", f"--family 6-UPS --unit m {family} --height 400", ("m",)),
-    ]  # fmt: skip
-    yield from _worded("family", "new -o {out}", families)
     for name, words, named in (
-        ("both", "{in}/3-rps.yaml --family 6-UPS", ("--family",)),
-        ("beside", "{in}/3-rps.yaml --base-radius 3 --tilt 0", ("--base-radius", "--tilt")),
+        ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
         ("missing", "{in}/none.yaml", ("none.yaml",)),
         ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
     ):

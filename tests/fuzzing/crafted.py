@@ -7,8 +7,6 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 
-import cv2
-import numpy as np
 from characterisation.inputs import ROOT, made_input
 
 from fuzzing.running import Case
@@ -49,8 +47,6 @@ def special_files() -> Iterator[tuple[str, Case]]:
         ("small", "found/result.json", "calibrate {in} -o {in}/found"),
         ("small", "found/camera.yaml", "camera {in}/images/c1_1.png --board chessboard:5x4:20mm "
          "-o {in}/found/camera.yaml"),
-        ("settings", "found/truth/truth.json", "simulate 3-rpr --level axes --poses 4 -o "
-         "{in}/found"),
         ("small", "study/runs.jsonl", study),
         ("result", "set/observations.csv", result),
     )  # fmt: skip
@@ -222,20 +218,6 @@ def _images(n_px: int) -> Iterator[tuple[str, str, bytes, str]]:
         text = text.replace(b"width: 64", b"width: %d" % camera)
         text = text.replace(b"height: 48", b"height: %d" % camera)
         yield f"{camera} px", "small:camera_info.yaml", text, "image"
-    tiff = "pictures:images/c1_1.tiff"
-    n = 60_000
-    tags = struct.pack("<HHI", 273, 4, 270_000) + struct.pack("<I", 8)
-    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", n) + tags * n + bytes(400_000)
-    yield "60,000 tags", tiff, body, "tags"
-    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 150) + tags * 150 + bytes(1_100_000)
-    yield "tags of the same bytes", tiff, body, "TIFF"
-    empty = struct.pack("<HHI", 258, 3, 0) + bytes(4)
-    body = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 9) + empty * 9 + bytes(100)
-    yield "empty tags", tiff, body, "TIFF"
-    encoded = cv2.imencode(".jpg", np.zeros((48, 64), dtype=np.uint8))[1].tobytes()
-    at = encoded.index(b"\xff\xda")
-    scan = encoded[at:-2]
-    yield "scans", "pictures:images/c2_1.jpg", encoded[:at] + scan * 3000 + b"\xff\xd9", "scans"
 
 
 def _png(size: int, kind: bytes = b"tEXt", rows: bytes = bytes(1000)) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -218,7 +218,8 @@ def _search(board: Board, photographs: _Photographs, run: Run, progress: Report)
     """Return what every image shows of the board."""
     n, found = len(photographs.paths), list[SeenBoard]()
     progress(_STAGE, 0, n)
-    for seen in run(_CornerSearch(board, photographs), range(n)):
+    anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
+    for seen in run(_CornerSearch(board, anywhere), range(n)):
         found.append(seen)
         progress(_STAGE, len(found), n)
     return found
@@ -434,7 +435,7 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
 
 
 def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:
-    """Yield a warning for each fact that photographs of a camera must share, or that is odd."""
+    """Yield a warning for each fact that photographs of a camera must share."""
     named = list(zip([path.name for path in paths], facts, strict=True))
     for found in differences(named, (size.width, size.height), None):
         groups = " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
@@ -442,14 +443,4 @@ def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize
             f"No one camera may hold for all images: found {groups}, needed one "
             f"{found.fact.what}; leave out those that differ, and photograph the machine like the "
             "others."
-        )
-    odd: dict[str, list[str]] = {}
-    for name, one in named:
-        if one.unlike_the_lens:
-            odd.setdefault(one.unlike_the_lens, []).append(name)
-    for what, names in odd.items():
-        yield (
-            f"Corners in images {few(names)} may not lie where the lens put them: found {what}, as "
-            "their files say, needed files as the camera writes them in its plain mode; leave "
-            "these out, or take them again."
         )

@@ -497,7 +497,7 @@ class _Judge:
         )
 
     def alike(self, T_base_camera: RigidTransform) -> list[RigidTransform]:
-        """Return the cameras that see the same under mistakes that are the same."""
+        """Return the camera poses for which the suspected mistakes give the same images."""
         found = []
         for S in self.symmetries:
             T = S @ T_base_camera.as_matrix()

@@ -336,9 +336,8 @@ def _rough_notes(analysis: Analysis) -> list[str]:
     more = f" and {len(found) - 1} more" if len(found) > 1 else ""
     known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
     return [
-        f"From outlines good to 0.1 px known to no better than {known}: {words}{more}; calibrate "
-        "refuses what its own measurements leave so rough. Add images from other directions, or at "
-        "poses that differ more."
+        f"calibrate may refuse this dataset: outlines good to 0.1 px determine {words}{more} no "
+        f"better than {known}. Add images from other directions, or at poses that differ more."
     ]
 
 
@@ -361,11 +360,6 @@ def _machine_notes(machine: Machine) -> list[str]:
             "poses between home and travel were judged too, which the machine may not reach; "
             "correct legcal.home or the limits."
         )
-    if machine.internal_joints:
-        notes.append(
-            "The platform has several bodies: legcal identifies such a machine, and does not "
-            "calibrate it yet."
-        )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
     singular = singularity_note(machine)
@@ -387,7 +381,6 @@ def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[C
         passive=[j for j, has in enumerate(predicted.with_length) if not has],
         board=bool(predicted.board.all()),
         actuators=predicted.on_actuators,
-        bodies=predicted.bodies,
     )
     frame, pose = predicted.frame[predicted.view[image]], predicted.pose[image]
     moves = predicted.carried_by[leg] >= 0
@@ -479,7 +472,7 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
         f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
         f"determine {report.full.rank} of {report.full.of} at best and leave open "
         f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
-        f"{remedy}, or state what is known of them with --prior."
+        f"{remedy}, or state what is known of them with --set."
     )
 
 

@@ -39,7 +39,8 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms, pose_equations
 from legcal.machine.leg import EquationKind, LegColumns
-from legcal.machine.parameters import ARM_KINDS, is_held_by_default, kind_of_parameter, parametrize
+from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.parameters import is_held_by_default, parametrize
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -67,7 +68,7 @@ class WhitenedEquations:
     """The whitened equations of all legs at the poses of a session."""
 
     # (k, m, f): by the possible motions of the platform: turns [m at the leg's length],
-    # displacements; and by readings of actuators and internal coordinates, in metres
+    # displacements; and by readings of actuators, in metres
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
     leg: IntArray  # (m,): the leg of each row
@@ -82,7 +83,7 @@ class WhitenedEquations:
 def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
     """Return what readings and legs demand of the poses of a session."""
     actuators, n_poses = predicted.actuators, len(predicted.t)
-    q = predicted.moving if actuators else None
+    q = predicted.q if actuators else None
     equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
     # The readings that move rods are rows of their own
     read = equations.measured & (predicted.carried_by < 0)[equations.leg]
@@ -92,11 +93,11 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
     leg, kinds = equations.leg, equations.kinds
     if actuators:  # what moves joints is unknown at each pose, of actuators it is measured
-        unit, n = predicted.unit_of_moving, len(actuators)
+        unit, n = predicted.unit_of_q, len(actuators)
         first = by_pose.shape[2]
         by_pose = np.concatenate([by_pose, equations.by_q / sigma * unit], axis=2)
         rows = np.zeros((n_poses, n, by_pose.shape[2]))
-        rows[:, :, first : first + n] = np.diag(unit[:n] / predicted.sigma_of_q)
+        rows[:, :, first : first + n] = np.diag(unit / predicted.sigma_of_q)
         by_pose = np.concatenate([by_pose, rows], axis=1)
         none = np.zeros((n_poses, n, by_parameters.shape[2]))
         by_parameters = np.concatenate([by_parameters, none], axis=1)
@@ -109,8 +110,8 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
 def image_rows(predicted: PredictedObservations) -> Array:
     """Return the whitened derivatives (n_images, n_bodies, 4, f + 6 + p) of what images show.
 
-    They are derivatives by the motion of the platform and of what moves joints at A and B, that of
-    the camera, and the parameters.
+    They are derivatives by the motion of the platform, the readings of actuators, the motion of the
+    camera, and the parameters.
     """
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)
@@ -121,17 +122,15 @@ def image_rows(predicted: PredictedObservations) -> Array:
     by_pose = np.zeros_like(by_camera)
     by_pose[:, :n, 2:] = np.concatenate([turn, at_B], axis=3) * turns
     scatter = predicted.local_to_parameters
-    inside = at_B @ predicted.R[predicted.pose][:, None]
-    of_A, of_B = at_A @ scatter[:, :3], inside @ scatter[:, 3:6]
+    in_platform = at_B @ predicted.R[predicted.pose][:, None]
+    of_A, of_B = at_A @ scatter[:, :3], in_platform @ scatter[:, 3:6]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = by_pose[..., columns]
     if predicted.actuators:
         of_A = at_A @ (predicted.A_by_local @ scatter)[predicted.pose]
-        ends = zip((base, platform), predicted.ends_by_moving, strict=True)
-        by_moving = [end.gradient @ by[predicted.pose] for end, by in ends]
-        by_pose = np.concatenate([by_pose, np.concatenate(by_moving, axis=2)], axis=3)
-    if predicted.internal_joints:
-        of_B = inside @ (predicted.B_by_local @ scatter)[predicted.pose]
+        ends = zip((base, platform), predicted.ends_by_reading, strict=True)
+        by_reading = [end.gradient @ by[predicted.pose] for end, by in ends]
+        by_pose = np.concatenate([by_pose, np.concatenate(by_reading, axis=2)], axis=3)
     by_parameters = np.concatenate([of_A, of_B], axis=2)
     if predicted.arms:
         by = predicted.arms_by_local @ scatter[list(predicted.arms)][:, None]
@@ -161,7 +160,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
     """Return what is known of the parameters of a session: fixed ones, and those with priors."""
     sigma: dict[int, float] = {}
     for i, name in enumerate(predicted.parametrization.names):
-        is_arm = kind_of_parameter(name) in ARM_KINDS  # :func:`prior_of_arms` knows of it
+        is_arm = ParameterId.parse(name).kind in ARMS  # :func:`prior_of_arms` knows of it
         if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
         elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):
@@ -332,7 +331,7 @@ def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal],
         return np.concatenate([cross(at[:, None], by), by], axis=2) * turns
 
     columns, one = list(freedoms(predicted.frame_legs)), np.zeros(len(place), dtype=np.intp)
-    none = np.zeros((*by_place.shape[:2], predicted.moving.shape[1]))
+    none = np.zeros((*by_place.shape[:2], len(predicted.actuators)))
     shown = Residuals.of(
         np.zeros(by_place.shape[:2]),
         np.concatenate([moved(place, by_place), moved(y, by_y)], axis=2),

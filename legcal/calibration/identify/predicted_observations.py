@@ -39,13 +39,10 @@ from legcal.machine.rods import (
     actuator_index,
     actuators_of,
     arms_at,
-    coordinates_at,
     ends_at_poses,
     first_rods,
-    internal_index,
-    internal_joints_of,
     joints_at,
-    platform_joints_at,
+    readings_of_rods,
 )
 from legcal.machine.ties import Ties, by_step, independent, machine_ties, on_ties, ties_of
 from legcal.vision.board import Link
@@ -92,9 +89,6 @@ class PredictedObservations:
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     tied_by: Ties | None = None  # what ties these parameters; frames alone without it
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
-    # Readings of actuators and internal coordinates, (k, n) and (w, n), where poses do not say them
-    given_moving: Array | None = None
-    moving_reached: Array | None = None
     shows_arms: bool = True  # which a table of axes does not
 
     @property
@@ -153,7 +147,7 @@ class PredictedObservations:
 
     @cached_property
     def arms_by_local(self) -> Array:
-        """Derivatives of both ends of arms by numbers of their legs, (k, n_arms, 2, 3, 25).
+        """Derivatives of both ends of arms by numbers of their legs, (k, n_arms, 2, 3, 21).
 
         Those by the line of an arm (``ActuatorColumns.ARM``) are by its motions (``Line.moved``).
         """
@@ -221,26 +215,9 @@ class PredictedObservations:
         return np.array(actuator_index(self.legs), dtype=np.intp)
 
     @cached_property
-    def internal_joints(self) -> tuple[Actuator, ...]:
-        """What moves joints at B inside the platform, each once."""
-        return internal_joints_of(self.legs)
-
-    @cached_property
-    def on_body(self) -> IntArray:
-        """The body of the platform that B of each leg is on, (n_legs,): its joint, -1 for none."""
-        return np.array(internal_index(self.legs), dtype=np.intp)
-
-    @cached_property
-    def moving(self) -> Array:
-        """Readings of the actuators and then internal coordinates at every pose, (k, n)."""
-        if self.given_moving is not None:
-            return self.given_moving
-        return coordinates_at(self.legs, self.R, self.t)
-
-    @property
     def q(self) -> Array:
         """Readings of the actuators at every pose, (k, n_actuators) [m or rad]."""
-        return self.moving[:, : len(self.actuators)]
+        return readings_of_rods(self.legs, self.R, self.t)
 
     @cached_property
     def A_at(self) -> Array:
@@ -249,7 +226,7 @@ class PredictedObservations:
 
     @cached_property
     def A_by_local(self) -> Array:
-        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 25)."""
+        """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 21)."""
         found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
         found[..., LegColumns.A] = np.eye(3)
         for j, actuator, a in self._carried():
@@ -261,42 +238,26 @@ class PredictedObservations:
         return found
 
     @cached_property
-    def ends_by_moving(self) -> tuple[Array, Array]:
-        """Derivatives of both ends in R_b by :attr:`moving` in metres, (k, n_bodies, 3, n) each."""
-        shape = len(self.t), self.n_bodies, 3, self.moving.shape[1]
+    def ends_by_reading(self) -> tuple[Array, Array]:
+        """Derivatives of both ends in R_b by :attr:`q` in metres, (k, n_bodies, 3, n) each."""
+        shape = len(self.t), self.n_bodies, 3, len(self.actuators)
         of_A, of_B = np.zeros(shape), np.zeros(shape)
         for j, actuator, a in self._carried():
             by_q = actuator.motion(self.legs[j].A, self.q[:, a]).by_q
-            of_A[:, j, :, a] = by_q * self.unit_of_moving[a]
-        for j, motion, column in self._inside():
-            of_B[:, j, :, column] = self.unit_of_moving[column] * (
-                self.R @ motion.by_q[:, :, None]
-            ).squeeze(2)
+            of_A[:, j, :, a] = by_q * self.unit_of_q[a]
         for body, (j, motions) in enumerate(
             zip(self.arms, self._motions_of_arms(), strict=True), start=self.n_legs
         ):
             a = int(self.carried_by[j])
-            for by_moving, (motion, _) in zip((of_A, of_B), motions, strict=True):
-                by_moving[:, body, :, a] = motion.by_q * self.unit_of_moving[a]
+            for by_reading, (motion, _) in zip((of_A, of_B), motions, strict=True):
+                by_reading[:, body, :, a] = motion.by_q * self.unit_of_q[a]
         return of_A, of_B
 
     @cached_property
-    def unit_of_moving(self) -> Array:
-        """A metre of every one of :attr:`moving` in its own unit, (n,)."""
-        joints = (*self.actuators, *self.internal_joints)
-        turns = np.array([joint.turns for joint in joints], dtype=np.bool_)
+    def unit_of_q(self) -> Array:
+        """A metre of every reading of :attr:`q` in its own unit, (n_actuators,)."""
+        turns = np.array([actuator.turns for actuator in self.actuators], dtype=np.bool_)
         return np.where(turns, 1.0 / self.mean_length, 1.0)
-
-    @cached_property
-    def B_by_local(self) -> Array:
-        """Derivatives of B in R_e by the numbers of the legs (LegColumns), (k, n_legs, 3, 25)."""
-        found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
-        found[..., LegColumns.B] = np.eye(3)
-        for j, motion, _ in self._inside():
-            found[:, j, :, LegColumns.B] = motion.by_A
-            found[:, j, :, LegColumns.INTERNAL_AXIS] = motion.by_axis
-            found[:, j, :, LegColumns.INTERNAL_POINT] = motion.by_point
-        return found
 
     @cached_property
     def sigma_of_legs(self) -> Array:
@@ -317,19 +278,9 @@ class PredictedObservations:
         )
 
     @property
-    def bodies(self) -> tuple[tuple[int, ...], ...]:
-        """The legs on each body of a platform of several; none where it is one."""
-        if not self.internal_joints:
-            return ()
-        return tuple(
-            tuple(np.flatnonzero(self.on_body == body).tolist())
-            for body in np.unique(self.on_body).tolist()
-        )
-
-    @property
     def n_motions(self) -> int:
-        """The unknowns of a pose: freedoms of the platform, and what moves joints at A and B."""
-        return len(freedoms(self.frame_legs)) + int(self.moving.shape[1])
+        """The unknowns of a pose: freedoms of the platform, and readings of actuators."""
+        return len(freedoms(self.frame_legs)) + len(self.actuators)
 
     def _carried(self) -> list[tuple[int, Actuator, int]]:
         """Return the legs whose joint at A moves, by what, and which actuator that is."""
@@ -339,20 +290,10 @@ class PredictedObservations:
             if leg.actuator is not None
         ]
 
-    def _inside(self) -> list[tuple[int, JointMotion, int]]:
-        """Return the legs whose joint at B moves in the platform, how, and its column there."""
-        n, s = len(self.actuators), self.moving[:, len(self.actuators) :]
-        return [
-            (j, leg.internal.motion(leg.B, s[:, self.on_body[j]]), n + int(self.on_body[j]))
-            for j, leg in enumerate(self.legs)
-            if leg.internal is not None
-        ]
-
     @cached_property
     def arm(self) -> Array:
         """From the origin of R_e to B in the directions of R_b, (k, n_legs, 3) [m]."""
-        B = platform_joints_at(self.legs, self.moving[:, len(self.actuators) :])
-        return np.asarray(np.einsum("kij,knj->kni", self.R, B))
+        return np.asarray(np.einsum("kij,nj->kni", self.R, np.array([leg.B for leg in self.legs])))
 
     @cached_property
     def length(self) -> Array:
@@ -377,7 +318,7 @@ class PredictedObservations:
 
     @cached_property
     def local_to_parameters(self) -> Array:
-        """Derivative of each leg's numbers by the parameters in metres, (n_legs, 25, p)."""
+        """Derivative of each leg's numbers by the parameters in metres, (n_legs, 21, p)."""
         n = LegColumns.COUNT
         scattered = [self.parametrization.scatter(np.eye(n), j) for j in range(self.n_legs)]
         return np.array(scattered).reshape(self.n_legs, n, len(self.unit)) * self.unit
@@ -464,7 +405,7 @@ def planned_observations(
     that no symmetry by accident decides. Raises DidNotConverge if the machine cannot move.
     """
     n_poses = images * len(views)
-    (legs, length, rng), (R, t, moving) = _random_session(machine, max(n_poses, REACHED))
+    (legs, length, rng), (R, t) = _random_session(machine, max(n_poses, REACHED))
     rng, home = deepcopy(rng), machine.home_of_frames
     A, B = ends_at_pose(legs, home)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
@@ -481,8 +422,6 @@ def planned_observations(
         t=t[:n_poses],
         R_reached=R,
         t_reached=t,
-        given_moving=moving[:n_poses] if machine.internal_joints else None,
-        moving_reached=moving if machine.internal_joints else None,
         view=np.repeat(np.arange(len(views)), images),
         pose=np.arange(n_poses),
         seen=seen,
@@ -497,7 +436,7 @@ def planned_observations(
 @lru_cache(maxsize=4)
 def _random_session(
     machine: Machine, n_poses: int
-) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array, Array]]:
+) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array]]:
     """Return what :func:`machine_near` does, and random postures: one plan follows the other."""
     home = machine.home_of_frames
     legs, length, rng = machine_near(machine, home)
@@ -526,7 +465,7 @@ def recorded_observations(
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
         travel = travel_of(machine)
-        R, t, _ = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+        R, t = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show

@@ -197,7 +197,6 @@ class PlatformMotion:
                 predicted.frame_legs,
                 predicted.R_reached,
                 predicted.t_reached,
-                predicted.moving_reached,
             )
         except NotIdentifiable as error:
             self.why_not = str(error)

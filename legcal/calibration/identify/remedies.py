@@ -140,7 +140,6 @@ class _Candidates:
             passive=np.flatnonzero(~s.with_length).tolist(),
             board=bool(s.board.all()),
             actuators=s.on_actuators,
-            bodies=s.bodies,
         )
         at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
         return not any(c.fails for c in (*counts, at_once))
@@ -168,7 +167,7 @@ class _Candidates:
         return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
 
     def analyses(self, size: int) -> list[Analysis]:
-        """Return what each view of so many legs says alone."""
+        """Analyse every possible view of *size* legs by itself."""
         if size not in self.of_size:
             views = self.windows(size)
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
@@ -459,11 +458,6 @@ def _extended(predicted: PredictedObservations, legs: Sequence[int]) -> Predicte
         predicted,
         R=np.concatenate([predicted.R, predicted.R[images]]),
         t=np.concatenate([predicted.t, predicted.t[images]]),
-        given_moving=(
-            None
-            if predicted.given_moving is None
-            else np.concatenate([predicted.given_moving, predicted.given_moving[images]])
-        ),
         view=np.concatenate([predicted.view, np.full(len(images), predicted.n_views)]),
         pose=np.concatenate([predicted.pose, new]),
         seen=np.concatenate([predicted.seen, seen]),

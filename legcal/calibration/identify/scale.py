@@ -179,7 +179,7 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
     stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:
         stated += (
-            ", or radii that you know better than the model (--prior '*.radius.*=VALUE±SIGMAmm')"
+            ", or radii that you know better than the model (--set '*.radius.*=VALUE±SIGMAmm')"
         )
     return (
         f"{dataset.folder}: the parameters cannot be identified: found that {why}, so that "

@@ -193,7 +193,6 @@ def distance_rows(
         for i in np.flatnonzero(frame == f)
         for j, g in combinations(np.flatnonzero(shown[i]).tolist(), 2)
         if gaps[j, g] > _MIN_DISTANCE * predicted.mean_length
-        and predicted.on_body[j] == predicted.on_body[g]
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
@@ -236,7 +235,6 @@ def identify_platform(
         np.concatenate(
             [
                 predicted.columns(LegColumns.B, LegColumns.PLATFORM_AXIS, LegColumns.TWIST),
-                predicted.columns(LegColumns.INTERNAL),
                 predicted.columns(LegColumns.BASE_AXIS, legs=universal),
             ]
         )

@@ -23,15 +23,15 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.directions import list_in_words
 from legcal.machine.leg import Leg, radius_name
-from legcal.machine.parameters import owner_of_parameter
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
-from legcal.perception.outline import WRONG_WIDTH
 from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
@@ -122,7 +122,7 @@ def _refuse_other_size(
             f"The calibration board{which} does not fit the readings and the legs: found that it "
             f"is {size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
             f"dimensions to {1e2 * sigma:.2g} %; measure the board and correct its dimensions in "
-            f"dataset.yaml, or let the fit find them (--free {name})."
+            f"dataset.yaml, or let the fit find them (--set {name}=free)."
         )
 
 
@@ -263,19 +263,20 @@ def _values(problem: FitProblem, state: State) -> dict[str, float]:
 def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigma: float) -> Prior:
     """Return a prior around a value that holds hardly any information."""
     names, units = problem.legs.parametrization.names, problem.legs.parametrization.units
+    parameter = ParameterId.parse(name)
     if name in names:
         wide = _WIDE_SIGMA * (state.mean_length if units[names.index(name)] == "m" else 1.0)
-    elif ".radius." in name:
+    elif parameter.kind == "radius":
         wide = _WIDE_RADIUS * value
     else:
-        view, key = name.rsplit(".", 1)
-        camera = state.cameras[problem.outlines.views.index(view)]
-        wide = _WIDE_SIGMA * (camera.K[0, 0] if intrinsic_unit(key) == "px" else 1.0)
+        camera = state.cameras[problem.outlines.views.index(parameter.owner)]
+        is_px = intrinsic_unit(parameter.kind) == "px"
+        wide = _WIDE_SIGMA * (camera.K[0, 0] if is_px else 1.0)
     return Prior(value, max(float(wide), sigma))
 
 
 def _fitted(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
-    """Return the fit with what was fixed free, and what it holds."""
+    """Fit again with the fixed parameters free; return the fit and the directions it holds."""
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)
@@ -374,7 +375,7 @@ def doubted_cameras(
     block, values = problem.block("cameras"), problem.coordinates(state)
     prior, first = block.prior, int(problem.where("cameras")[0]) if block.n_unknowns else 0
     of_file = np.isin(first + prior.unknown, problem.calibrated)
-    views = np.array([block.labels[i].rsplit(".", 1)[0] for i in prior.unknown.tolist()])
+    views = np.array([ParameterId.parse(block.labels[i]).owner for i in prior.unknown.tolist()])
     found = []
     for view in dict.fromkeys(views[of_file].tolist()):
         rows = np.flatnonzero(of_file & (views == view))
@@ -389,7 +390,7 @@ def doubted_cameras(
             continue
         spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(left), _MIN_SHARE * sigma**2))
         k = int(np.argmax(np.abs(moved) / spread))
-        key = problem.named[own[k]].rsplit(".", 1)[1]
+        key = ParameterId.parse(problem.named[own[k]]).kind
         numbers = prior.mean[rows[k]], sigma[k], values[own[k]], abs(moved[k]) / spread[k]
         found.append(DoubtedCamera(view, key, *map(float, numbers)))
     return tuple(found)
@@ -413,7 +414,7 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     stated = [
         name
         for name in stated_parameters(problem)
-        if any(owner_of_parameter(end, problem.legs.names) in legs for end in name.split(":"))
+        if any(ParameterId.parse(end).owner in legs for end in name.split(":"))
     ]
     if stated:
         words += f", and at what was stated of {_listed(stated)}"
@@ -444,7 +445,7 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
     *is_arm* says which outlines of the table are of arms. Both edges of another shape, or of
     another radius, are found in most images, and those that are used pass by chance.
     """
-    is_wide = np.array([why.startswith(WRONG_WIDTH) for why in outlines.reason], dtype=np.bool_)
+    is_wide = outlines.rejected_for(Reason.WIDTH)
     found = dict[int, str]()
     for leg in np.unique(outlines.leg[is_arm & outlines.used]).tolist():
         own = is_arm & (outlines.leg == leg)
@@ -568,7 +569,7 @@ def stated_parameters(problem: FitProblem) -> list[str]:
     """Return the parameters with a stated prior or value; not twists about nominal ones."""
     legs = problem.legs
     nominal = zip(legs.parametrization.names, legs.vector(legs.nominal).tolist(), strict=True)
-    usual = {name: value for name, value in nominal if name.endswith(".twist")}
+    usual = {name: value for name, value in nominal if ParameterId.parse(name).kind == "twist"}
     priors = sorted(problem.choices.priors.items())
     return [
         *(name for name, prior in priors if usual.get(name) != prior.mean),

@@ -49,6 +49,7 @@ from legcal.calibration.joint_fit.variables import (
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, are_of_arms
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
 from legcal.estimation.solver import Minimum, information
@@ -142,7 +143,7 @@ def _without_wrong_arms(
     while True:
         if wrong:
             left_out = is_arm & np.isin(outlines.leg, list(wrong))
-            outlines = outlines.reject(left_out, "the arm is left out as a whole")
+            outlines = outlines.reject(left_out, Reason.ARM_LEFT_OUT)
             notes.append(f"Arms were left out as a whole: {wrong_arms_in_words(wrong, legs)}")
         try:
             found = fitted(outlines)

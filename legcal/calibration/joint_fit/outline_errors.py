@@ -104,10 +104,13 @@ class NoiseModel:
         added = added + self.tilt_px**2 * np.outer(_DIFFERENCE, _DIFFERENCE)
         return np.asarray(self.scale**2 * claimed + added)
 
-    def whitening(self, claimed: Array, used: BoolArray | None = None) -> Array:
-        """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px]; zero where not used."""
+    def whitening(self, claimed: Array, weight: Array | BoolArray | None = None) -> Array:
+        """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px], times the root of weights.
+
+        Weights (n,) are those of squares; an outline without weight is not used.
+        """
         T = whitener(self.covariance(claimed))
-        return np.asarray(T if used is None else T * used[:, None, None])
+        return np.asarray(T if weight is None else T * np.sqrt(weight)[:, None, None])
 
     def squared_norms(self, offsets: Array, claimed: Array) -> Array:
         """Return the squared whitened norms (n,) of offsets (n, 2) [px]."""
@@ -146,7 +149,9 @@ def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
     return _balanced(scale_of(ss, turned[0]), scale_of(dd, turned[2]), excess, offsets)
 
 
-def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseModel:
+def estimate_noise(
+    offsets: Array, explained: Array, claimed: Array, weight: Array | None = None
+) -> NoiseModel:
     """Return the noise of outlines by restricted maximum likelihood.
 
     Bias and tilt of single outlines are there only if the offsets show them.
@@ -159,22 +164,28 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
         Covariance of the predicted offsets [px^2]: the share of the errors that the fit absorbs.
     claimed : (n, 2, 2) array
         Claimed covariances [px^2].
+    weight : (n,) array, optional
+        How much outlines count that disagree with the fit; the squares of their offsets, and what
+        is explained of these, are given with this weight.
 
     Returns
     -------
     NoiseModel
     """
+    weight = np.ones(len(offsets)) if weight is None else weight
     moments = _turned(offsets[:, :, None] * offsets[:, None] + explained)
     claimed = _turned(claimed)
-    best = _fitted(moments, claimed, bias=False, tilt=False)
+    best = _fitted(moments, claimed, weight, bias=False, tilt=False)
     for _ in range(2):
         has = best.bias_px > 0.0, best.tilt_px > 0.0
         wider = [
-            best if kinds == has else _fitted(moments, claimed, bias=kinds[0], tilt=kinds[1])
+            best
+            if kinds == has
+            else _fitted(moments, claimed, weight, bias=kinds[0], tilt=kinds[1])
             for kinds in ((True, has[1]), (has[0], True))
         ]
-        gains = [_likelihood(noise, moments, claimed) for noise in wider]
-        gain = 2.0 * (max(gains) - _likelihood(best, moments, claimed))
+        gains = [_likelihood(noise, moments, claimed, weight) for noise in wider]
+        gain = 2.0 * (max(gains) - _likelihood(best, moments, claimed, weight))
         if gain <= _MIN_NOISE_GAIN:
             break
         best = wider[int(np.argmax(gains))]
@@ -190,18 +201,19 @@ def _turned(C: Array) -> Array:
     return np.stack([mean + mixed, 0.5 * (C[:, 1, 1] - C[:, 0, 0]), mean - mixed])
 
 
-def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseModel:
+def _fitted(moments: Array, claimed: Array, weight: Array, *, bias: bool, tilt: bool) -> NoiseModel:
     """Return the noise of these kinds with the largest likelihood, by Fisher's scoring.
 
-    *moments* and *claimed* are (3, n) of :func:`_turned`.
+    *moments*, with their weights (n,), and *claimed* are (3, n) of :func:`_turned`.
     """
     kinds = [True, bias, tilt]
     shapes = [s for s, is_one in zip((claimed, *_ADDED), kinds, strict=True) if is_one]
     variances, least = np.zeros(3), np.array([_MIN_SCALE**2, 0.0, 0.0])
-    share = _product(_inverted(claimed)[0], moments) / claimed.shape[1]
+    share = _product(_inverted(claimed)[0], moments) / float(weight.sum())
     variances[0] = max(0.5 * share, _MIN_SCALE**2)
     k, n = len(shapes), claimed.shape[1]
-    wanted = [_pairs(a, b) for i, a in enumerate(shapes) for b in (moments, *shapes[: i + 1])]
+    counted = [shape * weight for shape in shapes]
+    wanted = [_pairs(a, b) for i, a in enumerate(shapes) for b in (moments, *counted[: i + 1])]
     coefficients = np.stack(np.broadcast_arrays(*wanted)).reshape(len(wanted), 6 * n)
     for _ in range(_MAX_ITERATIONS if bias or tilt else 0):
         a, b, c = _inverted(_covariance(variances, claimed))[0]
@@ -254,10 +266,10 @@ def _product(X: Array, Y: Array) -> float:
     return float(np.vdot(X, Y) + np.vdot(X[1], Y[1]))
 
 
-def _likelihood(noise: NoiseModel, moments: Array, claimed: Array) -> float:
-    """Return the logarithm of the likelihood of second moments (3, n) [px^2]."""
+def _likelihood(noise: NoiseModel, moments: Array, claimed: Array, weight: Array) -> float:
+    """Return the logarithm of the likelihood of weighted second moments (3, n) [px^2]."""
     inverse, determinant = _inverted(_covariance(noise.variances, claimed))
-    return -0.5 * (float(np.sum(np.log(determinant))) + _product(inverse, moments))
+    return -0.5 * (float(weight @ np.log(determinant)) + _product(inverse, moments))
 
 
 def _balanced(

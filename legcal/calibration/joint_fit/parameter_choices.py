@@ -17,6 +17,7 @@ from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind, radius_name
 from legcal.machine.model import Machine
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
     free_coordinates,
     geometries,
@@ -197,7 +198,7 @@ def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
         least, most = -np.pi, np.pi
         if unit == "m":
             least, most = nominal - size, nominal + size
-        if name.endswith(".length"):
+        if ParameterId.parse(name).kind == "length":
             least = nominal / _RATIO
         known[name] = KnownParameter(nominal, unit, "kinematic", least, most)
     return known
@@ -427,7 +428,7 @@ def _decision(override: Override, name: str, parameter: KnownParameter) -> _Deci
     if override.stated is None:
         return _Decision(override.action)
     value = override.stated.value
-    if name.endswith(".twist"):  # an angle between lines
+    if ParameterId.parse(name).kind == "twist":  # an angle between lines
         value -= float(np.pi * np.round((value - parameter.nominal) / np.pi))
     return _Decision(override.action, value, override.stated.sigma)
 

@@ -70,6 +70,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
 from legcal.machine.leg import Leg, radius_name
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import Parametrization, is_held_by_default
 from legcal.machine.rods import readings_of_rods
 from legcal.machine.ties import wholly_tied
@@ -209,9 +210,9 @@ class FitProblem(Problem[State]):
         """Return the distances of both ends of outlines from predicted ones, (n, 2) [px]."""
         return self.outlines.offsets(self.keys, state)
 
-    def weighted(self, noise: NoiseModel, accepted: BoolArray | None = None) -> FitProblem:
-        """Return the problem with outlines of other noise, those that are not accepted left out."""
-        whitening = noise.whitening(self.outlines.covariance, accepted)
+    def weighted(self, noise: NoiseModel, weight: Array | BoolArray | None = None) -> FitProblem:
+        """Return the problem with outlines of other noise, their squares weighted (n_outlines,)."""
+        whitening = noise.whitening(self.outlines.covariance, weight)
         return self.with_factors(replace(self.factor("outlines"), whitening=whitening))
 
     def with_biases(self, biases: EdgeBiases) -> FitProblem:
@@ -533,11 +534,12 @@ def _intrinsics(
             covariance = known.covariance[np.ix_(at, at)]
             prior += GaussianPrior.of_covariance(numbers, known.mean[at], covariance)
         names += [own[k] for k in free]
-    keys = tuple(dict.fromkeys(name.rsplit(".", 1)[1] for name in names))
+    numbers_of = [ParameterId.parse(name) for name in names]
+    keys = tuple(dict.fromkeys(number.kind for number in numbers_of))
     number = {name: i for i, name in enumerate(names)}
     index = [[number.get(f"{owner}.{key}", -1) for key in keys] for owner in owners]
     unknown = np.array(index, dtype=np.intp).reshape(len(views), len(keys))
-    where = [(views.index(view), key) for view, key in (name.rsplit(".", 1) for name in names)]
+    where = [(views.index(number.owner), number.kind) for number in numbers_of]
     block = Variables(
         "cameras",
         unknown,

@@ -1,15 +1,18 @@
 """From a first minimum to the final one: outlines and corners rejected, their errors estimated.
 
-Rounds reject outliers until the set of inliers stays the same. Then the noise of outlines and the
-variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
-fitted again, until these converge. The last fit has the variances that are expected in place of
-the likeliest ones, which are too small on average.
+Rounds reject outliers until the set of inliers stays the same. They begin at the minimum that all
+outlines have together, wherever the search for it began, and outliers lose their weight smoothly
+with their distance: none stays out only because it was out before. Then the noise of outlines and
+the variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
+fitted again, until these converge. The last fit has the variances that are expected in place of the
+likeliest ones, which are too small on average.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,6 +43,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data.measurements import few
+from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
@@ -52,6 +56,8 @@ _BOARD_ROUNDS = 3
 _READING_ROUNDS = 8  # in which one reading of each pose is left out at most
 _REJECTION_TOLERANCE = 0.005  # relative, of the cost, in rounds that reject outliers
 _PASSING = 1e-6  # squared sigmas from a minimum that rounds pass through and do not end at
+_TAPER = 0.2  # of the distance from which on outlines are rejected: where their weight falls
+_ACCEPTED = 0.5  # weight at that distance
 _MIN_REDUNDANCY = 0.05  # of the equations of corners, beyond what the fit absorbs
 _MIN_SCALE = 0.1
 _MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
@@ -75,7 +81,7 @@ class Fit:
     minimum: Minimum[State]
     noise: NoiseModel
     edge_biases: EdgeBiases
-    accepted: BoolArray  # (n_outlines,)
+    weight: Array  # (n_outlines,) from 1 to 0, of outlines that agree with it and that do not
     at_places: AtPlaces | None = None  # errors shared there, None where residuals show none
     notes: tuple[str, ...] = ()  # what the last round still changed, if it did not converge
 
@@ -84,11 +90,16 @@ class Fit:
         """Where the fit ended."""
         return self.minimum.state
 
+    @cached_property
+    def accepted(self) -> BoolArray:
+        """Which outlines agree with the fit, (n_outlines,)."""
+        return np.asarray(self.weight >= _ACCEPTED)
+
     def weighted(self, noise: NoiseModel) -> Fit:
         """Return the same with outlines of another noise, those that disagree then left out."""
-        accepted = _accepted(self.problem, self.state, noise)
-        problem = self.problem.weighted(noise, accepted)
-        return replace(self, problem=problem, noise=noise, accepted=accepted)
+        weight = _weights(self.problem, self.state, noise)
+        problem = self.problem.weighted(noise, weight)
+        return replace(self, problem=problem, noise=noise, weight=weight)
 
     def with_edge_biases(self, biases: EdgeBiases) -> Fit:
         """Return the same with these common-mode edge biases in place of others."""
@@ -171,7 +182,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     none = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
-    every = np.ones(len(problem.outlines), dtype=np.bool_)
+    every = np.ones(len(problem.outlines))
     begin = Fit(problem, first, NoiseModel(), none, every).with_edge_biases(none)
     fit, changes = _with_estimated_errors(_without_outliers(begin), possible, least)
     known: Mapping[str, Residuals] | None = fit.minimum.linear.rows
@@ -197,6 +208,8 @@ def _without_outliers(fit: Fit) -> Fit:
         rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
         fit = replace(fit, problem=like_readings(given, rough), minimum=minimum).passed(tolerance)
+    # From where all outlines pull: where the first minimum began is forgotten.
+    fit = fit.passed()
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
         fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))
@@ -336,23 +349,34 @@ def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
 
 def _noise(fit: Fit) -> NoiseModel:
     """Return the noise of the accepted outlines at a fit with another noise."""
-    problem, linear, accepted = fit.problem, fit.minimum.linear, fit.accepted
-    if not accepted.any():
+    problem, linear, weight = fit.problem, fit.minimum.linear, fit.weight
+    if not fit.accepted.any():
         return fit.noise
-    claimed = problem.outlines.covariance
+    claimed, used = problem.outlines.covariance, weight > 0.0
     normal = information(problem, fit.state, linear, problem.loss)
-    L = np.linalg.cholesky(fit.noise.covariance(claimed))
-    share = explained_share(problem, linear, normal, "outlines")
-    explained = L @ share @ np.swapaxes(L, -1, -2)
-    offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r)
-    return estimate_noise(offsets[accepted], explained[accepted], claimed[accepted])
+    L = np.linalg.cholesky(fit.noise.covariance(claimed))[used]
+    share = explained_share(problem, linear, normal, "outlines")[used]
+    explained = L @ share @ np.swapaxes(L, -1, -2)  # both times the weight, as the squares are
+    offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
+    return estimate_noise(offsets, explained, claimed[used], weight[used])
 
 
-def _accepted(problem: FitProblem, state: State, noise: NoiseModel) -> BoolArray:
-    """Return which outlines agree with a fit, and are of images that have a pose of their own."""
+def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
+    """Return the weights of outlines at a fit, zero of images that have no pose of their own.
+
+    They fall smoothly about the distance from which on an outline is rejected. So nothing jumps
+    where an outline comes to be just beyond it, and none stays out only because it was out: what
+    it pulls is the same on both ways there.
+    """
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
-    accepted = np.asarray(s <= problem.settings.rejection**2)
-    return of_determined_poses(problem.weighted(noise, accepted), state, accepted)
+    begin, end = (
+        problem.settings.rejection * (1.0 - _TAPER),
+        problem.settings.rejection * (1.0 + _TAPER),
+    )
+    part = np.clip((end - np.sqrt(s)) / (end - begin), 0.0, 1.0)
+    weight = np.asarray(part**2 * (3.0 - 2.0 * part))
+    used = of_determined_poses(problem.weighted(noise, weight), state, weight > 0.0)
+    return np.asarray(np.where(used, weight, 0.0))
 
 
 def _refuse_disagreement(fit: Fit) -> None:
@@ -441,7 +465,7 @@ class Changes:
 
     @classmethod
     def of(cls, before: Fit, after: Fit) -> Changes:
-        """Return what lies between two fits to the same outlines."""
+        """Compare two successive fits to the same outlines."""
         n_changed = int(np.sum(after.accepted != before.accepted))
         return cls(_sizes(before), _sizes(after), n_changed, int(after.accepted.sum()))
 
@@ -494,25 +518,24 @@ def check_convergence(
             "outlines that are wrong."
         )
     return (
-        "The errors of the outlines have not quite converged, which leaves the uncertainty of the "
-        f"result that uncertain: {found}.",
+        "The noise of the outlines has not converged; the stated uncertainty may be wrong: "
+        f"{found}.",
     )
 
 
-DISAGREES = "disagrees with the fit"  # the beginning of a reason
 _ON_EDGE_PX = 1.5  # [px] at both ends
 _NEARER = 0.25  # of the distance from the outline that it was taken for
 
 
 def rejection_reasons(
     problem: FitProblem, state: State, rejected: IntArray, offsets: Array
-) -> list[str]:
+) -> list[Rejection]:
     """Return the reasons of rejection of outlines (m,): how far off, and which edge they lie on.
 
     *offsets* (n, 2) of all outlines are from where the fit puts them [px].
     """
     away = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
-    reasons = [f"{DISAGREES} by {distance:.1f} px" for distance in away.tolist()]
+    details = [f"{distance:.1f} px" for distance in away.tolist()]
     o, names = problem.outlines, problem.legs.names
     part = np.repeat(np.arange(len(o.parts)), len(EPSILON))
     edges = [
@@ -532,5 +555,5 @@ def rejection_reasons(
     for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
         if distances[nearest] < min(_ON_EDGE_PX, _NEARER * away[i]):
-            reasons[i] += f", lies on {edges[nearest]}"
-    return reasons
+            details[i] += f", lies on {edges[nearest]}"
+    return [Rejection(Reason.DISAGREES, detail) for detail in details]

@@ -19,7 +19,7 @@ from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.directions import list_in_words
 from legcal.machine.leg import LegColumns
-from legcal.machine.parameters import kind_of_parameter
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
 
 SCALE = "the scale, which radii alone say, by one standard deviation"
@@ -34,7 +34,9 @@ def has_length(problem: FitProblem) -> bool:
 
     A list and no rank, as ``is_scale_open`` of identify is: it must serve where a fit failed.
     """
-    stated = {kind_of_parameter(name) for name in stated_parameters(problem) if ":" not in name}
+    stated = {
+        ParameterId.parse(name).kind for name in stated_parameters(problem) if ":" not in name
+    }
     return (
         _images_have_length(problem)
         or any(":" in name for name in problem.choices.priors)
@@ -71,7 +73,7 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
                     "calibration board on the base."
                     if problem.legs.n_actuators
                     else "put a calibration board on the platform and one on the base, give a leg "
-                    "an encoder, or state measured coordinates of joints (--prior)."
+                    "an encoder, or state measured coordinates of joints (--set)."
                 ),
                 *failure.problems,
             ]
@@ -112,7 +114,7 @@ def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
     Images agree with a machine of any size: nothing else tells that another distance was measured.
     """
     priors = problem.choices.priors
-    stated = [n for n in priors if ":" in n or kind_of_parameter(n) == "length"]
+    stated = [n for n in priors if ":" in n or ParameterId.parse(n).kind == "length"]
     if not stated or _images_have_length(problem):
         return ()
     rods = [

@@ -205,7 +205,7 @@ class FocalLength(WrongIntrinsic):
             f"{given:.1f} px, {self.apart:.0f} standard deviations and {1e2 * change:+.2f} % "
             "apart; the stated uncertainty knows nothing of it; calibrate the camera again at the "
             "same focus and zoom, look for pictures that were scaled or focused anew, or let the "
-            f"fit find it (--free {self.view}.fx --free {self.view}.fy)."
+            f"fit find it (--set {self.view}.fx=free --set {self.view}.fy=free)."
         )
 
 
@@ -244,7 +244,7 @@ class PrincipalPoint(WrongIntrinsic):
             f"{self.given[1]:.1f}) px, {self.apart:.0f} standard deviations apart; the stated "
             "uncertainty knows nothing of it; look for photographs that were cropped or "
             "stabilised, calibrate the camera again at the same focus and zoom, or let the fit "
-            f"find it (--free {self.view}.cx --free {self.view}.cy)."
+            f"find it (--set {self.view}.cx=free --set {self.view}.cy=free)."
         )
 
 

@@ -46,6 +46,7 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import Order, inverse, reorder_measurements
 from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason, Rejection
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import NormalEquations, robust_cost
 from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
@@ -58,7 +59,6 @@ from legcal.machine.leg import (
     with_platform_points,
 )
 from legcal.machine.parameters import Parametrization, parametrize
-from legcal.perception.photographs import TOO_FEW_LEGS
 from legcal.vision.board import Link
 from legcal.vision.camera import Camera
 
@@ -439,7 +439,7 @@ def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
     placed = of_determined_poses(problem.weighted(fit.noise), fit.state, every)[rejected]
     for row, why, has_pose in zip(problem.outlines.index[rejected], words, placed, strict=True):
         used[row] = False
-        reason[row] = why if has_pose else TOO_FEW_LEGS
+        reason[row] = why if has_pose else Rejection(Reason.FEW_LEGS)
     return replace(outlines, used=used, reason=tuple(reason))
 
 

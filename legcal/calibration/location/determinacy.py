@@ -302,8 +302,8 @@ def _weak(
         part = OpenPart(frame, kind, (direction_of(v),))
         known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
         sentences.append(
-            f"Known badly is {part.words}: {known} (1 sigma); poses that differ more, above all in "
-            "rotations about several axes, would determine it better."
+            f"Poorly determined: {part.words}, {known} (1 sigma); poses that differ more, above "
+            "all in rotations about several axes, would determine it better."
         )
     return tuple(sentences)
 

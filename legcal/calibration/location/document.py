@@ -227,7 +227,7 @@ class _OpenPartEntry(FileSchema):
 
 
 class _Determined(FileSchema):
-    """What is determined and what was held."""
+    """The determined frames, and the directions held at their given values."""
 
     everything: bool
     tool_orientation: bool

@@ -96,7 +96,6 @@ def locate(
     """
     _check_numbers(position_sigma, angle_sigma, tool_position)
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    machine.require_rigid_platform()
     sigma_q = _sigmas_of_readings(encoder_sigma, machine)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)

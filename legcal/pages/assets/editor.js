@@ -5,9 +5,9 @@
   const dialog = document.getElementById("editor"), stage = dialog.querySelector(".stage svg");
   const list = dialog.querySelector(".rows"), form = dialog.querySelector("form"), { elements } = form;
   const said = dialog.querySelector("[role=status]"), summary = document.getElementById("edit-state");
-  const { cameras, images, file } = JSON.parse(document.getElementById("editor-images").textContent);
+  const { cameras, images, file, reasons } = JSON.parse(document.getElementById("editor-images").textContent);
   const packed = document.getElementById("editor-table").textContent.trim();
-  const REASON = "rejected by hand", MEASURED = ["contrast", "length", "residual", "gamma", "by_gamma"];
+  const REASON = "by_hand", MEASURED = ["contrast", "length", "residual", "gamma", "by_gamma"];
   const LEAST_PIECE = 0.1, SIGMAS = [1e-5, 100], POINTS = 24, CLOSE = 12; // px; CLOSE: of the screen for one of the image
   let rows = [], header = [], column = {}, at = 0, chosen = -1, drag = null, saved = true;
   const edits = new Map(), past = [], future = [];
@@ -106,6 +106,7 @@
     const { ends, h, used } = now(row), cells = [...row.cells], put = (name, value) => { if (name in column) cells[column[name]] = String(value); };
     put("verdict", used ? "used" : "rejected");
     put("reason", used ? "" : REASON);
+    put("detail", "");
     put("source", "edited");
     if (edit.ends) {
       ["a", "b", "c"].forEach((name, k) => put(name, h[k]));
@@ -172,9 +173,13 @@
   };
   const partOf = ({ leg, part }) => (part.startsWith(leg) ? part.slice(leg.length).replace(/^[_\- ]+/, "") : part);
   const nameOf = (row) => `${row.leg} ${partOf(row)}, edge ${row.edge}`;
+  const inWords = (code, detail) => {
+    const [plain, detailed] = reasons[code] ?? [code, ""];
+    return detail && detailed ? detailed.replace("{}", code === "partner" ? inWords(detail, "") : detail) : plain;
+  };
   const stateOf = (row) => {
-    const { ends, used, edited } = now(row), reason = row.cells[column.reason];
-    const why = edits.has(row.i) ? REASON : reason ? `rejected: ${reason}` : "rejected";
+    const { ends, used, edited } = now(row), reason = inWords(row.cells[column.reason], row.cells[column.detail]);
+    const why = edits.has(row.i) ? inWords(REASON, "") : reason ? `rejected: ${reason}` : "rejected";
     const word = !ends ? `not found${reason ? `: ${reason}` : ""}` : used ? "used" : why;
     return `${word}${edited ? " (edited)" : row.cells[column.source] === "edited" ? " (edited before)" : ""}`;
   };

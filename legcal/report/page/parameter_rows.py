@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from legcal.calibration.result import Calibration
 from legcal.calibration.summary import UNITS
 from legcal.geometry.types import Array
+from legcal.machine.parameter_id import ParameterId
 from legcal.pages.document import Cell, Drawing, Table, number
 from legcal.pages.svg import change_bars
 
@@ -37,6 +38,11 @@ class _Row:
     how: str
 
     @property
+    def parameter(self) -> ParameterId:
+        """What its name says."""
+        return ParameterId.parse(self.name)
+
+    @property
     def cells(self) -> list[Cell]:
         """The cells of its row."""
         scale, unit, digits = UNITS[self.unit]
@@ -61,7 +67,7 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     if not of_links:
         return [Table(columns, [row.cells for row in rows], note=_IN_FRAMES)]
     links = [block.link for block in (calibration.result.links or {}).values()]
-    others = [row for row in rows if not row.name.endswith(_COORDINATES)]
+    others = [row for row in rows if not row.parameter.is_joint_coordinate]
     machine = calibration.dataset.machine
     motors = ""
     if any(motor.turns for motor in machine.actuators):
@@ -83,7 +89,6 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     ]  # fmt: skip
 
 
-_COORDINATES = tuple(f".{side}.{axis}" for side in _JOINT for axis in "xyz")
 _IN_FRAMES = "Joints of the base in R_b, those of the platform in R_e; axes are turns from nominal."
 
 
@@ -91,10 +96,13 @@ def change_charts(calibration: Calibration) -> list[Drawing]:
     """Return the changes of the parameters as bars, a chart for each unit."""
     of_links, rows = _of_links(calibration), _parameters(calibration)
     if of_links:
-        rows = [*of_links, *(row for row in rows if not row.name.endswith(_COORDINATES))]
+        rows = [
+            *of_links,
+            *(row for row in rows if not row.parameter.is_joint_coordinate),
+        ]
     charts = []
     for of in ("m", "rad"):
-        shown = [r for r in rows if r.unit == of and r.sigma and ".radius." not in r.name]
+        shown = [r for r in rows if r.unit == of and r.sigma and r.parameter.kind != "radius"]
         if shown:
             scale, unit, _ = UNITS[of]
             svg = change_bars(

@@ -1,0 +1,73 @@
+"""Write the tables of docs/evidence.md from recorded figures: ``python benchmarks/evidence.py``.
+
+``evidence.jsonl`` beside this file has one object a line, a row of a table: ``table`` (its name in
+the page), ``title``, ``command`` and ``date`` (how and when it was recorded) and ``cells``, by
+column. A new measurement replaces the rows of its table. The page holds the text; each table stands
+between ``<!-- table: NAME -->`` and ``<!-- end -->``. ``--check`` says whether the page is what the
+records give.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+RECORDS = Path(__file__).with_suffix(".jsonl")
+PAGE = Path(__file__).parents[1] / "docs/evidence.md"
+_PLACE = re.compile(r"<!-- table: (\S+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+def records() -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each table, in the order of the file."""
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for line in RECORDS.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        tables.setdefault(row["table"], []).append(row)
+    return tables
+
+
+def table_text(rows: list[dict[str, Any]]) -> str:
+    """Return a table in Markdown, with its command and date below."""
+    columns = list(rows[0]["cells"])
+    if any(list(row["cells"]) != columns for row in rows):
+        raise ValueError(f"rows of the table {rows[0]['table']} have different columns")
+    lines = [columns, ["---"] * len(columns), *(list(row["cells"].values()) for row in rows)]
+    cells = [[str(cell).replace("|", "\\|") for cell in line] for line in lines]
+    text = "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    first = rows[0]
+    return f"**{first['title']}** (`{first['command']}`, {first['date']})\n\n{text}\n"
+
+
+def page_text(text: str) -> str:
+    """Return the text of the page with all tables written anew."""
+    tables = records()
+    used = _PLACE.findall(text)
+    if sorted(used) != sorted(tables):
+        odd = sorted(set(used) ^ set(tables))
+        raise ValueError(f"tables that are only in the page or only recorded: {', '.join(odd)}")
+
+    def written(place: re.Match[str]) -> str:
+        name = place[1]
+        return f"<!-- table: {name} -->\n{table_text(tables[name])}\n<!-- end -->"
+
+    return _PLACE.sub(written, text)
+
+
+def main() -> None:
+    """Write the page, or check it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="change nothing; exit 1 if it differs")
+    asked = parser.parse_args()
+    before = PAGE.read_text(encoding="utf-8")
+    after = page_text(before)
+    if asked.check:
+        sys.exit(after != before)
+    PAGE.write_text(after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Why an outline, a corner or an image is not used: a code, and a detail for the reader.
+
+Programs compare codes (:class:`Reason`); tables store code and detail in two columns; sentences are
+made where people read them. Tables of earlier versions hold sentences, which are read as well.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from legcal.geometry.types import BoolArray
+
+
+class Reason(StrEnum):
+    """Why an outline, a corner or an image is not used."""
+
+    NONE = ""
+    # What the camera cannot see
+    OUTSIDE = "outside"
+    HIDDEN = "hidden"
+    NARROW = "narrow"
+    SHORT = "short"
+    NOT_PLACED = "not_placed"
+    UNUSED_LEG = "unused_leg"
+    # What was not measured well enough
+    NO_PAIR = "no_pair"
+    NO_EDGE = "no_edge"
+    FAINT = "faint"
+    OVEREXPOSED = "overexposed"
+    NOT_STRAIGHT = "not_straight"
+    CONTRAST = "contrast"
+    ROUGH = "rough"
+    UNCERTAIN = "uncertain"
+    WIDTH = "width"
+    PARTNER = "partner"
+    # What contradicts other measurements
+    VIEW_DISAGREES = "view_disagrees"
+    DISAGREES = "disagrees"
+    ARM_LEFT_OUT = "arm_left_out"
+    FEW_LEGS = "few_legs"
+    NO_BOARD_POSE = "no_board_pose"
+    CORNER_OFF = "corner_off"
+    NOT_BEFORE = "not_before"
+    # What is wrong with a whole image
+    BLACK = "black"
+    OVEREXPOSED_IMAGE = "overexposed_image"
+    EMPTY = "empty"
+    BLURRED = "blurred"
+    MIRRORED = "mirrored"
+    UPSIDE_DOWN = "upside_down"
+    ZOOMED = "zoomed"
+    OTHER_READING = "other_reading"
+    OTHER_VIEW = "other_view"
+    OTHER_SCENE = "other_scene"
+    # What people decide
+    BY_HAND = "by_hand"
+    OTHER = "other"
+
+
+# In words: without a detail, and with one.
+WORDS_BY_CODE: dict[str, tuple[str, str]] = {
+    Reason.NONE: ("", ""),
+    Reason.OUTSIDE: ("outside the image", ""),
+    Reason.HIDDEN: ("hidden by another leg", "hidden by {}"),
+    Reason.NARROW: ("too narrow", "too narrow, {} px wide"),
+    Reason.SHORT: ("too short", "too short, {}"),
+    Reason.NOT_PLACED: ("the camera of its view could not be placed", ""),
+    Reason.UNUSED_LEG: ("its view does not use this leg", "view {} does not use this leg"),
+    Reason.NO_PAIR: ("no convincing pair of edges", ""),
+    Reason.NO_EDGE: ("no convincing edge", ""),
+    Reason.FAINT: ("edge hardly visible", "edge hardly visible, found on {} % of it"),
+    Reason.OVEREXPOSED: (
+        "the background is overexposed",
+        "the background is overexposed, {} px of the step are left",
+    ),
+    Reason.NOT_STRAIGHT: ("edge not straight", "edge not straight, {} % of it on one line"),
+    Reason.CONTRAST: ("low contrast", "low contrast, {} grey levels"),
+    Reason.ROUGH: ("edge too rough", "edge too rough, scatter {} px"),
+    Reason.UNCERTAIN: ("edge too uncertain", "edge too uncertain, sigma {} px"),
+    Reason.WIDTH: (
+        "width inconsistent with the radius",
+        "width inconsistent with the radius, {}",
+    ),
+    Reason.PARTNER: ("other outline fails", "its other outline: {}"),
+    Reason.VIEW_DISAGREES: ("disagrees with the other legs of its view", ""),
+    Reason.DISAGREES: ("disagrees with the fit", "disagrees with the fit by {}"),
+    Reason.ARM_LEFT_OUT: ("the arm is left out as a whole", ""),
+    Reason.FEW_LEGS: (
+        "shows too few legs to place the platform",
+        "shows too few legs to place the platform, {}",
+    ),
+    Reason.NO_BOARD_POSE: ("no pose of the board explains it", ""),
+    Reason.CORNER_OFF: (
+        "far from where the other corners put it",
+        "{} px from where the other corners put it",
+    ),
+    Reason.NOT_BEFORE: ("not used before", ""),
+    Reason.BLACK: ("the image is black", "the image is black, at most {} of 255 grey levels"),
+    Reason.OVEREXPOSED_IMAGE: (
+        "the image is overexposed",
+        "the image is overexposed, at least {} of 255 grey levels",
+    ),
+    Reason.EMPTY: (
+        "the image shows nothing",
+        "the image shows nothing, all of it within {} of 255 grey levels",
+    ),
+    Reason.BLURRED: ("the image is blurred", "the image is blurred by {}"),
+    Reason.MIRRORED: ("the image is mirrored", ""),
+    Reason.UPSIDE_DOWN: ("the image is upside down", ""),
+    Reason.ZOOMED: (
+        "it shows the legs in another size: zoom, or a crop scaled",
+        "it shows the legs about {} times as large as the others: zoom, or a crop scaled",
+    ),
+    Reason.OTHER_READING: ("it shows another reading", "{}"),
+    Reason.OTHER_VIEW: ("it was taken by another camera", "{}"),
+    Reason.OTHER_SCENE: ("it does not show the legs where its reading has them", ""),
+    Reason.BY_HAND: ("rejected by hand", ""),
+    Reason.OTHER: ("no reason given", "{}"),
+}
+_PARTNER = "its other outline: "
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """Why something is not used; false for what is used.
+
+    Attributes
+    ----------
+    reason : Reason
+        The code.
+    detail : str
+        A name or figures for the reader; of ``PARTNER``, the code of the other outline.
+    """
+
+    reason: Reason = Reason.NONE
+    detail: str = ""
+
+    def __bool__(self) -> bool:
+        return self.reason is not Reason.NONE
+
+    @property
+    def summary(self) -> str:
+        """The reason in words, without figures and names."""
+        return WORDS_BY_CODE[self.reason][0]
+
+    def __str__(self) -> str:
+        plain, detailed = WORDS_BY_CODE[self.reason]
+        if not self.detail or not detailed:
+            return plain
+        detail = self.detail
+        if self.reason is Reason.PARTNER:
+            detail = str(read_rejection(detail, ""))
+        return detailed.format(detail)
+
+
+USED = Rejection()  # not rejected
+
+
+def have_reason(rejections: Sequence[Rejection], *reasons: Reason) -> BoolArray:
+    """Return a mask (n,) of the rejections for one of some reasons."""
+    return np.array([rejection.reason in reasons for rejection in rejections], dtype=np.bool_)
+
+
+def reason_in_words(code: str) -> str:
+    """Return a code of a document (``result.json``) in words, without figures and names."""
+    return read_rejection(code, "").summary
+
+
+_CODES = frozenset(map(str, Reason))
+_SENTENCES = [  # of versions that stored sentences; the ones with a detail first
+    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), Reason(code))
+    for k in (1, 0)
+    for code, both in WORDS_BY_CODE.items()
+    if (words := both[k]) not in ("", "{}")
+]
+
+
+def read_rejection(code: str, detail: str) -> Rejection:
+    """Return the rejection of the columns ``reason`` and ``detail`` of a table.
+
+    A sentence in place of a code, as earlier versions wrote, is recognised; another text is what
+    somebody noted (``OTHER``).
+    """
+    if code in _CODES:
+        return Rejection(Reason(code), detail)
+    if code.startswith(_PARTNER):
+        partner = read_rejection(code.removeprefix(_PARTNER), "")
+        return Rejection(Reason.PARTNER, str(partner.reason))
+    for pattern, reason in _SENTENCES:
+        if match := pattern.fullmatch(code):
+            return Rejection(reason, match[1] if match.groups() else "")
+    return Rejection(Reason.OTHER, code)

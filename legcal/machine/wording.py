@@ -1,0 +1,47 @@
+"""What a file calls what a mechanism YAML states, and how it is mended there, for messages.
+
+A mechanism YAML with a block ``legcal`` names home, base, platform and legs; without the block they
+follow from its tree and the pose that this draws. MJCF files and URDFs with loops of their own have
+no place for a block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class Wording:
+    """Nouns for parts of a file, and the clauses of remedies."""
+
+    closures: str = "closed_loop"
+    root: str = "the root of the URDF"
+    home: str = "legcal.home"
+    no_home: str = "legcal.home is not given"
+    state_home: str = "write legcal.home"
+    correct_home: str = "correct legcal.home"
+    state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
+    state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
+    correct_ends: str = "correct legcal.base or legcal.platform"
+
+
+BLOCK = Wording()
+NO_BLOCK = Wording(
+    home="the pose that the file draws",
+    no_home="the file draws no closed pose",
+    state_home="add a block legcal with home",
+    correct_home="add a block legcal with another home",
+    state_readings="add a block legcal with home and home_readings",
+    state_ends="add a block legcal with base, platform and legs",
+    correct_ends="add a block legcal with another base or platform",
+)
+_DRAWING = replace(
+    NO_BLOCK,
+    state_home="draw the machine nearer to closed",
+    correct_home="correct the pose that the file draws",
+    state_readings="draw the machine closed",
+    state_ends="write it as a URDF with a mechanism YAML that names base, platform and legs",
+    correct_ends="see that the root of the tree is the base",
+)
+URDF_LOOPS = replace(_DRAWING, closures="<loop_joint> or <constraint>")
+MJCF = replace(_DRAWING, closures="<equality>", root="<worldbody>")

@@ -1,0 +1,46 @@
+"""The result of a calibration does not depend on where its search began."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from start_dependence import (
+    TOLERANCE,
+    Session,
+    calibrated,
+    difference,
+    session_folder,
+    with_other_model,
+)
+
+from legcal.simulation.settings import Level
+
+OUTLINES = {
+    "hexapod": Session("hexapod", Level.OUTLINES, 8, 3, 6),
+    "tricept": Session("tricept", Level.OUTLINES, 9, 3, 6),
+    "linear-delta": Session("linear-delta", Level.OUTLINES, 10, 3, 6),
+    "3-rpr": Session("3-rpr", Level.OUTLINES, 11, 3, 6),
+}
+
+
+@pytest.mark.parametrize("name", OUTLINES)
+def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> None:
+    folder = session_folder(name, OUTLINES[name], tmp_path)
+    first = calibrated(folder, "nominal", steps=False)
+    assert not first.solution.outlines.used.all()  # a tenth of them are wrong
+    other = calibrated(folder, "staged")
+    moved = calibrated(with_other_model(folder, tmp_path, 0), "nominal", steps=False)
+    for end in (other, moved):
+        assert difference(first, end)[0] < TOLERANCE
+        assert end.solution.outlines.used_keys() == first.solution.outlines.used_keys()
+
+
+def test_photographs_give_one_result_with_and_without_the_four_steps(tmp_path: Path) -> None:
+    folder = session_folder("hexapod", Session("hexapod", Level.PHOTOGRAPHS, 1), tmp_path)
+    first = calibrated(folder, "nominal", steps=False)
+    other = calibrated(folder, "staged")
+    assert difference(first, other)[0] < TOLERANCE
+    assert other.solution.outlines.used_keys() == first.solution.outlines.used_keys()
