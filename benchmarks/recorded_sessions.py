@@ -9,10 +9,10 @@ with the file. Write it anew only where the new answers are better, and say why 
 The record of a command has its exit code; ``facts``, which must be equal (status, counts, ranks,
 kind of an error); ``sizes``, which agree within SIZE_TOLERANCE (predicted errors of the platform,
 sums of squares, places of cameras); and ``estimates``, the value and standard deviation of each
-parameter, which agree within VALUE_TOLERANCE standard deviations and SIZE_TOLERANCE. The keys of
-``--json`` are recorded for each command: those of all its documents, and for each other key the
-sessions that have it. Keys that the data choose (names of legs, views) are written as ``*``.
-Sentences are not recorded.
+parameter, which agree within VALUE_TOLERANCE standard deviations and SIZE_TOLERANCE (for a weak
+parameter the standard deviation is that of the platform). The keys of ``--json`` are recorded for
+each command: those of all its documents, and for each other key the sessions that have it. Keys
+that the data choose (names of legs, views) are written as ``*``. Sentences are not recorded.
 
 The datasets are files in tests/data/recorded, so that they do not change with the simulation.
 """
@@ -311,7 +311,11 @@ def estimates_of(name: str, document: dict[str, Any]) -> dict[str, list[float]]:
     """Return value and standard deviation of the estimates of a command, by name."""
     pairs: list[tuple[str, float, float | None]] = []
     if name == "calibrate":
-        pairs = [(p["name"], p["value"], p["sigma"]) for p in document["parameters"]]
+        at_platform = document["platform"]
+        of_weak = {"m": at_platform["sigma_dX_m"], "rad": at_platform["sigma_dE_rad"]}
+        for p in document["parameters"]:
+            sigma = of_weak.get(p["unit"]) if p["status"] == "weak" else p["sigma"]
+            pairs.append((p["name"], p["value"], sigma))
     if name in ("calibrate", "check"):
         platform, change = document["platform"], "change_" if name == "calibrate" else ""
         for size in ("dX_m", "dE_rad"):

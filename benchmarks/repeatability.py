@@ -45,7 +45,7 @@ def readings(n_repeats: int) -> str:
 def photographed(folder: Path, n_repeats: int, seed: int) -> Path:
     """Render the photographs and return the folder of their dataset."""
     (folder / "poses.csv").write_text(readings(n_repeats))
-    options = ["--poses", folder / "poses.csv", "--seed", str(seed), "-o", folder / "set"]
+    options = ["--poses", str(folder / "poses.csv"), "--seed", str(seed), "-o", str(folder / "set")]
     command = [sys.executable, "-m", "legcal", "simulate", "hexapod", "--quiet", *options]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return folder / "set"

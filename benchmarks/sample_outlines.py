@@ -9,6 +9,7 @@ the inside of the leg. The truth is read here and in tests only.
 
 import json
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -105,8 +106,8 @@ def show(title: str, outlines: Outlines, error: Array, visible: Array, seconds: 
         print(f"  edge {edge}: median {np.median(middle[outlines.edge[used] == edge]):+.3f} px")
     rms = np.sqrt(np.mean(pull**2))
     print(f"  error over claimed sigma, ends: robust {spread(pull, 0.0):.2f}, rms {rms:.2f}")
-    for reason in sorted({r for r in outlines.reason if r}):
-        print(f"  rejected: {reason} ({outlines.reason.count(reason) // 2})")
+    for reason, n in Counter(str(why) for why in outlines.reason if why).most_common():
+        print(f"  rejected: {reason} ({n // 2})")
 
 
 def spread(values: Array, centre: float | None = None) -> float:

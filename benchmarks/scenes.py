@@ -129,7 +129,9 @@ def offsets(given: Given, truth: Truth, outlines: Outlines) -> Array:
 def _reason(outlines: Outlines, row: int, leg: int) -> str:
     """Return why a leg was not found in an image."""
     of_leg = np.flatnonzero((outlines.row == row) & (outlines.leg == leg))
-    return "; ".join(dict.fromkeys(outlines.reason[i] for i in of_leg.tolist())) or "not searched"
+    return (
+        "; ".join(dict.fromkeys(str(outlines.reason[i]) for i in of_leg.tolist())) or "not searched"
+    )
 
 
 def _same(one: RigidTransform, two: RigidTransform) -> bool:

@@ -43,7 +43,9 @@ def test_commands_know_that_joints_at_A_move(
         assert float(sigma) == 0.1
         assert 0.0 < abs(float(value) - 1e3 * distance) < 0.5
     known = ["--set", f"leg1.length={truth.legs[0].q0!r}+-0.00005"] * (name == "delta")
-    assert "where their motors read 0" in said("calibrate", session, "-o", out, "-q", *known)
+    assert "where their motors read 0" in said(
+        "calibrate", session, "-o", out, "-q", "--verbose", *known
+    )
     compared = said("evaluate", f"{out}/calibrated.yaml", name)
     assert "where their motors read 0" in " ".join(compared.split())
     scene = (tmp_path / "out" / "report.html").read_text()

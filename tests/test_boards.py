@@ -494,7 +494,10 @@ def test_of_photographs_by_hand_some_but_not_most_may_miss_the_board() -> None:
     )
 
     def observed(images: list[Any]) -> Any:
-        dataset = SimpleNamespace(boards=(FixedBoard(board, "base"),), corners=None, yaml_path=PATH)
+        machine = SimpleNamespace(size=0.4)
+        dataset = SimpleNamespace(
+            boards=(FixedBoard(board, "base"),), corners=None, yaml_path=PATH, machine=machine
+        )
         photographs = SimpleNamespace(load=images.__getitem__)
         data: Any = SimpleNamespace(
             dataset=dataset, measurements=measurements, photographs=photographs,

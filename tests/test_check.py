@@ -185,7 +185,7 @@ def test_notes_on_images_are_passed_on_once(
     assert set(found.document()["notes"]) >= {left_out, outlier, *found.solution.notes}
 
 
-# Results that are read back. More refusals are in characterisation/refusals.py.
+# Results that are read back. More refusals are in refusal_table.py.
 
 
 def test_a_result_is_read_back_as_it_was_written(result: Path) -> None:

@@ -148,8 +148,8 @@ def test_a_calibration_on_a_cluster_is_that_of_this_process_byte_for_byte(
     words = ("calibrate", "data", "--fresh", "--no-report")
     code = run_command(monkeypatch, *words, "-o", "here", "--workers", "1")
     with local_cluster(tmp_path / "cluster", 2) as local:
-        words = (*words, "--cluster", local.address)
-        assert run_command(monkeypatch, *words, "-o", "there") == code
+        there = (*words, "--cluster", local.address, "-o", "there")
+        assert run_command(monkeypatch, *there) == code
     assert files_of(Path("there")) == files_of(Path("here"))
     assert "result.json" in files_of(Path("there"))
 

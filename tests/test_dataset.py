@@ -1,6 +1,6 @@
 """The dataset folder: dataset.yaml, measurements.csv and image files, read and refused.
 
-Refusals of single cells and keys are in the table of tests/characterisation; here are those that
+Refusals of single cells and keys are in tests/refusal_table.py; here are those that
 Python alone shows, and every kind and every fault of an image file.
 """
 
@@ -30,7 +30,13 @@ from legcal.errors import DatasetError, LegcalError, ModelError
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import BadImage, decode_image, image_size, inspect_image, read_image
+from legcal.vision.image_file import (
+    BadImage,
+    decode_image,
+    image_size,
+    inspect_image,
+    read_image,
+)
 
 __all__ = ["folder"]
 

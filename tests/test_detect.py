@@ -22,7 +22,7 @@ from legcal import detect, load_dataset
 from legcal.calibration.detection import Detection, _caption, _page
 from legcal.data.corners import found_corners
 from legcal.data.image_tables import canonical_order
-from legcal.data.outlines import QUALITY, Outlines, read_observations
+from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
@@ -353,6 +353,7 @@ def outlines(cam: Camera) -> Outlines:
         used=np.ones(2, dtype=np.bool_),
         reason=(USED, USED),
         source=("detected",) * 2,
+        **unmeasured(2),
     )
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from characterisation.running import fits_schema
 from command_line import run
+from command_outcomes import fits_schema
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg, undecodable_png

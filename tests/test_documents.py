@@ -13,6 +13,7 @@ import pytest
 import typer
 from command_line import run
 from csv_rows import read_rows
+from evidence import records
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from pydantic import BaseModel
 
@@ -146,36 +147,17 @@ def test_options_of_benchmarks_that_a_page_names_exist() -> None:
     assert lost == []
 
 
-MEASURED = re.compile(r"`(?:python )?benchmarks/|`legcal ")
 DAY = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 
 
-def test_every_table_of_the_evidence_states_its_command_and_its_day() -> None:
-    found = 0
-    for name in ("accuracy", "bound", "classes"):
-        page = (ROOT / f"docs/{name}.md").read_text(encoding="utf-8")
-        top, *sections = re.split(r"^## ", page, flags=re.MULTILINE)
-        for section in sections:
-            before = top if name != "accuracy" else ""
-            for text, _ in re.findall(r"((?:(?!^\|).*\n)+)((?:\|.*\n)+)", section, re.MULTILINE):
-                before += text
-                assert MEASURED.search(before), f"{name}: {section.splitlines()[0]}"
-                assert DAY.search(before), text[-80:]
-                found += 1
-    assert found > 12
-
-
-def test_the_evidence_names_every_benchmark() -> None:
-    index = (ROOT / "docs/evidence.md").read_text(encoding="utf-8")
-    programs = {
-        path.name
-        for path in (ROOT / "benchmarks").glob("*.py")
-        if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
-    }
-    assert {name for name in programs if f"benchmarks/{name}" not in index} == set()
-    rows = re.findall(r"^\| (?!what is measured).*", index, re.MULTILINE)
-    assert len(rows) > 25
-    assert all(MEASURED.search(row) and DAY.search(row) for row in rows)
+def test_every_recorded_figure_states_its_command_and_its_day() -> None:
+    rows = [row for table in records().values() for row in table]
+    assert len(rows) > 100
+    for row in rows:
+        assert DAY.fullmatch(row["date"]), row
+        programs = re.findall(r"benchmarks/\w+\.py", row["command"])
+        assert programs or "legcal" in row["command"] or "the same" in row["command"], row
+        assert all((ROOT / program).exists() for program in programs), row
 
 
 def test_every_yaml_of_a_page_is_what_reading_takes() -> None:

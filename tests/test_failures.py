@@ -253,7 +253,7 @@ def test_a_failure_is_json_where_stdout_takes_it(monkeypatch: pytest.MonkeyPatch
     assert json.loads(out.getvalue())["error"]["kind"] == "ModelError"
 
 
-# Values that no other test is about; more refusals are in characterisation/refusals.py.
+# Values that no other test is about; more refusals are in refusal_table.py.
 
 
 @pytest.mark.parametrize("name", ["", "c\n1", "\x1b[31m"])

@@ -1,6 +1,6 @@
 """What is wrong with a model is refused by file, place and amount, all problems at once.
 
-These are the refusals beside those of the command line (characterisation/refusals.py).
+These are the refusals beside those of the command line (refusal_table.py).
 """
 
 from collections.abc import Callable, Sequence

@@ -539,7 +539,8 @@ def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
     session: HexapodSession,
 ) -> None:
     outlines, start = encoded(session, log_gamma=0.0), disturbed_start(session)
-    bare = replace(outlines, gamma=np.zeros(0), by_gamma=np.zeros(0))
+    unknown = np.full(len(outlines), np.nan)
+    bare = replace(outlines, gamma=unknown, by_gamma=unknown)
     given = refine(session.legs, session.measurements, outlines, start)
     for measurements in (session.measurements, without_gamma(session.measurements)):
         found = refine(session.legs, measurements, bare, start)

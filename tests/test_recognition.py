@@ -13,7 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.reasons import USED
 from legcal.geometry.types import Array, Image
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import inverse_kinematics
@@ -631,8 +632,8 @@ def _outlines(search: Search, T: RigidTransform, A: Array, B: Array, noise: Arra
     ends = ends + noise[row, leg, edge][..., None] * normal[:, None]
     return Outlines(
         row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), ends,
-        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), ("",) * n,
-        ("detected",) * n,
+        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), (USED,) * n,
+        ("detected",) * n, **unmeasured(n),
     )  # fmt: skip
 
 

@@ -87,7 +87,7 @@ def test_what_is_written_names_a_schema_beside_it_that_it_fits(
 def test_printed_documents_fit_their_schemas(
     example_run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those of other commands are held against theirs in ``characterisation/running.py``."""
+    """Those of other commands are held against theirs in ``command_outcomes.py``."""
     _check("result", json.loads((example_run.output / "result.json").read_text()))
     assert run(monkeypatch, "evaluate", "hexapod", "hexapod", "--json") == 0
     document = json.loads(capsys.readouterr().out)

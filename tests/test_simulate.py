@@ -1,6 +1,6 @@
 """Simulated datasets: of the spread that they claim, reproducible, whole or not there at all.
 
-What options of the command give and how wrong ones are refused is in tests/characterisation.
+What options of the command give and how wrong ones are refused is in tests/refusal_table.py.
 """
 
 import io

@@ -267,7 +267,7 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
 
 
 def test_malformed_files_of_poses_are_refused(tmp_path: Path) -> None:
-    """Others are among the refusals of tests/characterisation."""
+    """Others are among those of tests/refusal_table.py."""
     path = tmp_path / "poses.csv"
     path.write_text("leg1_prismatic,leg2_prismatic,leg3_prismatic\n0,0,0\n0,0\n")
     machine = load_mechanism("3-rps")

@@ -1,6 +1,6 @@
 """observations.csv and axes.csv: written, read back exactly, corrected by hand, and refused.
 
-Refusals of single cells are in the table of tests/characterisation; here are those that need more
+Refusals of single cells are in tests/refusal_table.py; here are those that need more
 than one cell of a table that a simulation wrote.
 """
 

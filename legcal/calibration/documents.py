@@ -33,7 +33,6 @@ from legcal.files.schema import (
     Version,
     content_of,
     describe,
-    refuse_too_large,
     validate,
 )
 from legcal.machine.actuator import Actuator
@@ -470,7 +469,6 @@ class Result(Legs, Heading, SparseDocument):
         if not isinstance(found, dict) or "legcal_result" not in found:
             what = "another document" if isinstance(found, dict) else describe(found)
             raise unreadable(path, what, "one with 'legcal_result: 1'")
-        refuse_too_large(found, path)
         return validate(cls, found, path)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,17 +72,13 @@ OUTLINE_COLUMNS = (
 )  # fmt: skip
 
 
-def _unknown() -> Array:
-    return np.zeros(0)
-
-
 @brief
 @dataclass(frozen=True, eq=False)
 class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
 
-    How well an outline was seen and how it depends on the gamma may be left out; it is
-    NaN where nothing was found and for outlines that were given or edited.
+    How well an outline was seen and how it depends on the gamma are NaN where nothing was found
+    and for outlines that were given or edited (:func:`unmeasured`).
     """
 
     leg: IntArray  # (n,) of the mechanism
@@ -94,16 +90,11 @@ class Outlines(ImageTable):
     used: BoolArray  # (n,)
     reason: tuple[Rejection, ...]  # why an outline was rejected; false for used ones
     source: tuple[str, ...]  # detected or edited
-    contrast: Array = field(default_factory=_unknown)  # median step to the leg [grey levels]
-    length: Array = field(default_factory=_unknown)  # seen on the line, without gaps [px]
-    residual: Array = field(default_factory=_unknown)  # robust std of the edge about it [px]
-    gamma: Array = field(default_factory=_unknown)  # of the camera, with which it was measured
-    by_gamma: Array = field(default_factory=_unknown)  # shift inwards with log gamma [px]
-
-    def __post_init__(self) -> None:
-        for name in (*QUALITY, *ENCODING):
-            if len(getattr(self, name)) == 0:
-                object.__setattr__(self, name, np.full(len(self.row), np.nan))
+    contrast: Array  # (n,) median step to the leg [grey levels]
+    length: Array  # (n,) seen on the line, without gaps [px]
+    residual: Array  # (n,) robust standard deviation of the edge about it [px]
+    gamma: Array  # (n,) of the camera, with which it was measured
+    by_gamma: Array  # (n,) shift inwards with log gamma [px]
 
     def row_keys(self) -> list[tuple[int, int, str, int]]:
         """Return image row, leg, part and edge of each outline."""
@@ -114,6 +105,11 @@ class Outlines(ImageTable):
         """Return image row, leg, part and edge of the used outlines."""
         pairs = zip(self.row_keys(), self.used.tolist(), strict=True)
         return {key for key, is_used in pairs if is_used}
+
+
+def unmeasured(n: int) -> dict[str, Array]:
+    """Return what is known of how well n outlines were seen that nobody measured: nothing."""
+    return {name: np.full(n, np.nan) for name in (*QUALITY, *ENCODING)}
 
 
 def through_cameras(
@@ -160,6 +156,7 @@ def no_outlines() -> Outlines:
         used=np.zeros(0, dtype=np.bool_),
         reason=(),
         source=(),
+        **unmeasured(0),
     )
 
 

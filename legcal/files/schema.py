@@ -26,12 +26,8 @@ from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
 from legcal.errors import DatasetError
-from legcal.files.reading import MAX_TEXT, MAX_YAML, NotRegular, TooLarge, read_bytes
+from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
-MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
-MAX_DEPTH = 100
-MAX_PROBLEMS = 1000  # of one file that are looked into
-_MAX_WHOLE = 10**308  # whole numbers of files have any length; floats end here
 _MOST_NAMES = 10  # that a hint lists
 _LONGEST_WORD = 100  # for which one that is like it is looked for
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -147,34 +143,7 @@ class SparseDocument(Document):
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is not.
-
-    Values are counted while they are read: merge keys and lists can name more than memory holds.
-    """
-
-    def __init__(self, stream: Any) -> None:
-        super().__init__(stream)
-        self._n_nodes = self._n_merged = self._depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        self._n_nodes += 1
-        self._depth += 1
-        if self._n_nodes > MAX_NODES:
-            raise _TooMuch(f"more than {MAX_NODES} values", "fewer; split the file")
-        if self._depth > MAX_DEPTH:
-            raise _TooMuch(f"more than {MAX_DEPTH} levels", "fewer; write it without nesting")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
-
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        super().flatten_mapping(node)
-        self._n_merged += len(node.value)
-        if self._n_merged > MAX_NODES:
-            raise _TooMuch(
-                f"more than {MAX_NODES} values, some repeated through merge keys",
-                "fewer; write it without them",
-            )
+    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is not."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -215,63 +184,42 @@ class _QuickLoader(_Loader):
             setattr(self, name, getattr(parser, name))
 
 
-class _TooMuch(yaml.YAMLError):
-    """What is too much in a file: found and needed, as parts of a sentence."""
-
-    def __init__(self, found: str, needed: str) -> None:
-        super().__init__(found)
-        self.needed = needed
-
-
 def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
     """Return a YAML error at the place of a node."""
     return yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark)
 
 
-def content_of(path: Path, what: str, most: int = MAX_TEXT) -> bytes:
+def content_of(path: Path, what: str) -> bytes:
     """Return the bytes of a file, or refuse it in a sentence."""
     remedy = f"check the path of the {what}"
-    if not os.path.exists(path):  # unlike that of a Path, False where a name is too long
+    if not os.path.isfile(path):  # unlike that of a Path, False where a name is too long
+        found = "a folder" if os.path.isdir(path) else "no such file"
         raise DatasetError(
-            f"{path}: the {what} could not be read: found no such file, needed one; {remedy}."
+            f"{path}: the {what} could not be read: found {found}, needed a file; {remedy}."
         )
     try:
-        return read_bytes(path, most)
-    except NotRegular as error:
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {error.strerror}, needed a file; "
-            f"{remedy}."
-        ) from error
+        return read_bytes(path, MAX_TEXT)
     except TooLarge as error:
         raise DatasetError(
-            f"{path}: the {what} could not be read: found {error.n_bytes} bytes, needed at most "
-            f"{most}; {remedy}."
+            f"{path}: the {what} could not be read: found {error.strerror}, needed at most "
+            f"{MAX_TEXT}; {remedy}."
         ) from error
     except OSError as error:
         raise DatasetError(
             f"{path}: the {what} could not be read: found '{error.strerror}', needed a readable "
-            "file; check its permissions."
+            f"file; {remedy} and its permissions."
         ) from error
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that a YAML file holds, with its keys as text."""
-    return parse_yaml(content_of(path, what, MAX_YAML), path, what)
+    return parse_yaml(content_of(path, what), path, what)
 
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
-    if len(content) > MAX_YAML:
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {len(content)} bytes of YAML, needed at "
-            f"most {MAX_YAML}; check the path of the {what}."
-        )
     try:
         found = _loaded(content)
-    except _TooMuch as error:
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {error}, needed {error.needed}."
-        ) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -289,12 +237,6 @@ def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
             f"{path}: the {what} could not be read: found {_kind_of(found)}, needed 'key: value' "
             "lines; write the file again."
         )
-    if b"*" in content and _exceeds(found, MAX_NODES):  # only aliases repeat what was counted
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found more than {MAX_NODES} values, some "
-            "repeated through aliases, needed fewer; write it without aliases."
-        )
-    refuse_too_large(found, path)
     return typing.cast("dict[str, Any]", found)
 
 
@@ -320,44 +262,6 @@ def _kind_of(value: object) -> str:
     return kinds.get(type(value), "one value")
 
 
-def _exceeds(value: object, limit: int) -> bool:
-    """Say whether a tree of lists and mappings has more values than a limit."""
-    pending, count = [value], 0
-    while pending:
-        node = pending.pop()
-        children: Iterable[object] = ()
-        if isinstance(node, dict):
-            children = node.values()
-        elif isinstance(node, list):
-            children = node
-        count += 1
-        if count + len(pending) > limit:
-            return True
-        pending.extend(children)
-    return False
-
-
-def refuse_too_large(found: object, path: Path) -> None:
-    """Refuse whole numbers of YAML or JSON that no float can hold, by their keys."""
-    pending, places = [("", found)], []
-    while pending:
-        place, value = pending.pop()
-        if isinstance(value, dict | list):
-            inside = value.items() if isinstance(value, dict) else enumerate(value)
-            children = [(f"{place}.{key}" if place else str(key), child) for key, child in inside]
-            pending.extend(reversed(children))
-        elif isinstance(value, int) and abs(value) > _MAX_WHOLE:
-            places.append(place)
-    if places:
-        raise DatasetError(
-            [
-                f"{path}: {place} could not be read: found a whole number beyond 1e308, needed a "
-                "smaller one; correct the value."
-                for place in places[:MAX_PROBLEMS]
-            ]
-        )
-
-
 def validate(
     schema: type[_Schema], found: Mapping[str, Any], path: Path, prefix: str = ""
 ) -> _Schema:
@@ -365,12 +269,7 @@ def validate(
     try:
         return schema.model_validate(dict(found))
     except ValidationError as error:
-        found_wrong = error.errors(include_url=False)
-        sentences = [_sentence(schema, e, path, prefix) for e in found_wrong[:MAX_PROBLEMS]]
-        if len(found_wrong) > MAX_PROBLEMS:
-            sentences.append(
-                f"{path}: {len(found_wrong) - MAX_PROBLEMS} more values could not be used."
-            )
+        sentences = [_sentence(schema, e, path, prefix) for e in error.errors(include_url=False)]
         raise DatasetError(sentences) from error
 
 

@@ -24,9 +24,7 @@ import numpy as np
 
 from legcal.errors import DatasetError
 from legcal.files.quantity import LENGTH
-from legcal.files.reading import MAX_TABLE
 from legcal.files.schema import (
-    MAX_PROBLEMS,
     NAME_NEEDED,
     closest,
     content_of,
@@ -37,8 +35,6 @@ from legcal.files.schema import (
 from legcal.geometry.types import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-MAX_ROWS = 50_000
-MAX_COLUMNS = 300
 _MAX_NAMED = 10  # columns that a sentence names
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # of Windows-1252, without what is rare
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
@@ -177,11 +173,7 @@ class Table:
         """Raise DatasetError with everything that is wrong, by line."""
         if self._problems:
             self._problems.sort(key=lambda problem: problem[0])
-            sentences = [_sentence(problem) for _, problem in self._problems[:MAX_PROBLEMS]]
-            more = len(self._problems) - MAX_PROBLEMS
-            if more > 0:
-                sentences.append(f"{self.path}: {more} more cells or rows could not be used.")
-            raise DatasetError(sentences)
+            raise DatasetError([_sentence(problem) for _, problem in self._problems])
 
     def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
         """Take the lines below the header; those that are not complete are refused."""
@@ -340,14 +332,6 @@ def place_in(where: str) -> str:
     return where.rsplit(", ", 1)[-1]
 
 
-def _too_large(path: Path, what: str) -> DatasetError:
-    """Return the refusal of a table that takes too long to check."""
-    return DatasetError(
-        f"{path}: the {what} could not be read: found more than {MAX_ROWS} rows or {MAX_COLUMNS} "
-        "columns, needed fewer; check the path, or split the file."
-    )
-
-
 @cache
 def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
     """Return the pattern of headings with one of some units behind them."""
@@ -372,7 +356,7 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
     A byte-order mark and either kind of line end are accepted; if ``loose``, also what programs
     for tables write in other countries.
     """
-    content = content_of(path, what, MAX_TABLE)
+    content = content_of(path, what)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
         raise DatasetError(
@@ -392,8 +376,6 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
         )
         lines: Lines = []
         for cells in reader:
-            if len(lines) > MAX_ROWS or len(cells) > MAX_COLUMNS:
-                raise _too_large(path, what)
             cells = [cell.strip() for cell in cells]
             if delimiter != ",":
                 cells = [_with_point(cell) for cell in cells]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -120,6 +120,7 @@ class Seen:
             used=np.ones(2 * n, dtype=np.bool_),
             reason=(USED,) * (2 * n),
             source=("detected",) * (2 * n),
+            **unmeasured(2 * n),
         )
 
     def only(self, image: int) -> Seen:

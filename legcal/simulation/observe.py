@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legcal.data.corners import Corners, found_corners, join_corners
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.errors import NotVisible
 from legcal.geometry.lines import cross
@@ -121,6 +121,7 @@ def outlines_of(
         used=np.ones(n, dtype=np.bool_),
         reason=(USED,) * n,
         source=("detected",) * n,
+        **unmeasured(n),
     )
 
 

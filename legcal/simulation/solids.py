@@ -14,7 +14,6 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.files.reading import MAX_MESH, open_regular
 from legcal.geometry.lines import cross, distance_to_line
 from legcal.geometry.motions import matrix_product, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -128,8 +127,6 @@ def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
 
     name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
-        if (path := _found(urdf_path, name)) is not None:
-            open_regular(path, MAX_MESH).close()
         scene: Any = URDF.load(
             io.BytesIO(_alone(visual)),
             filename_handler=lambda fname: str(_found(urdf_path, fname)),

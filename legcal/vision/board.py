@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -134,7 +134,6 @@ DICTIONARIES = tuple(
 APRIL_TAGS = "DICT_APRILTAG_36h11"
 
 
-@lru_cache(maxsize=8)
 def dictionary(name: str) -> cv2.aruco.Dictionary:
     """Return a dictionary of OpenCV by its name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))

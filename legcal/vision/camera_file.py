@@ -120,8 +120,6 @@ class KalibrEntry(_OpenSchema):
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
-_OPENINGS = re.compile(rb"[\[{<]|-\s")  # of what may be nested
-_MOST_OPENINGS = 10_000
 _OPENCV_KEYS = {
     "image_width": ("image_width", "image_Width"),
     "image_height": ("image_height", "image_Height"),
@@ -280,11 +278,6 @@ def _from_kalibr(found: Mapping[str, Any], cameras: Sequence[str], path: Path) -
 def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
     """Return the entries of an OpenCV FileStorage that describe a camera."""
     reason = "a storage that OpenCV cannot parse"
-    if sum(1 for _ in _OPENINGS.finditer(content)) > _MOST_OPENINGS:  # its stack would overflow
-        raise DatasetError(
-            f"{path}: the camera file could not be read: found more than {_MOST_OPENINGS} lists, "
-            "mappings or tags, needed those of one camera; leave out the others."
-        )
     try:
         with quiet_opencv():
             storage = cv2.FileStorage(

@@ -28,8 +28,8 @@ from unittest.mock import patch
 
 import numpy as np
 import yaml
-from characterisation.inputs import made_input
-from characterisation.running import Outcome, run, words_of
+from command_outcomes import Outcome, run, words_of
+from made_inputs import made_input
 
 from fuzzing.mutations import mutate
 from fuzzing.subjects import SUBJECTS, Subject
@@ -58,7 +58,6 @@ class Case:
     subject: Subject
     seed: int = 0
     made: bytes | None = None  # the content, if it is not drawn
-    special: str = ""  # "pipe", "folder" or the target of a link, if it is no file
 
     @property
     def name(self) -> str:
@@ -74,17 +73,10 @@ class Case:
         return mutate(valid, self.subject.kind, np.random.default_rng(seeds))
 
     def put(self, path: Path) -> None:
-        """Put the damaged file, or what is none, at a place."""
+        """Put the damaged file at a place."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
-        if self.special == "pipe":
-            os.mkfifo(path)
-        elif self.special == "folder":
-            path.mkdir()
-        elif self.special:
-            path.symlink_to(self.special)
-        else:
-            path.write_bytes(self.content())
+        path.write_bytes(self.content())
 
 
 @dataclass(frozen=True)

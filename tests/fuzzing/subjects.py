@@ -8,13 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from characterisation.inputs import MAKERS, made_input
+from made_inputs import MAKERS, made_input
 from photograph_files import exif, jpeg, tiff
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A file of an input of the characterisation, and a command that reads it.
+    """A file of a made input, and a command that reads it.
 
     ``command`` holds the words after ``legcal``; ``{in}`` is the folder with the damaged file,
     ``{out}`` a place where nothing is.

@@ -208,8 +208,6 @@ def _without_outliers(fit: Fit) -> Fit:
         rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
         fit = replace(fit, problem=like_readings(given, rough), minimum=minimum).passed(tolerance)
-    # From where all outlines pull: where the first minimum began is forgotten.
-    fit = fit.passed()
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
         fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))

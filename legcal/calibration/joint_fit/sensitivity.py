@@ -384,6 +384,8 @@ class CameraResiduals:
                 view = views[int(seen[k])]
                 given = intrinsic_of(problem.first_cameras[view], "fx")
                 name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
+                if not sigma > 0.0:  # of measurements without noise
+                    continue
                 zoom = apart * error * (np.arange(len(error)) == view)[:, None]
                 there = np.array([given]), np.array([apart]), np.array([sigma])
                 tests.append(ZoomedView(name, *there, abs(apart) / sigma, zoom, owner))

@@ -14,31 +14,37 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from command_outcomes import run
 from scipy.spatial.transform import Rotation
+from simulated import simulated as before_cameras
 
-from characterisation.running import run
-from legcal.files.motions import MotionEntry
-from legcal.simulation.cameras import mild_lens, read_lens
-from legcal.simulation.dataset import simulate, summary_document
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
-from legcal.simulation.visibility import Viewpoint
 
-ROOT = Path(__file__).resolve().parents[2]
-MACHINES = sorted(  # those that were shipped when this was recorded
-    path.stem.removeprefix("model-")
-    for path in (Path(__file__).parent / "expected").glob("model-*.json")
-)
+ROOT = Path(__file__).resolve().parents[1]
+MACHINES = [
+    "3-rpr",
+    "3-rps",
+    "3-spr",
+    "3-upu",
+    "3-upu-tilted",
+    "6-sps",
+    "hexapod",
+    "hexapod-rod",
+    "hexapod-strut",
+    "nategh-agheli",
+    "tricept",
+]
 LEVELS = ("axes", "outlines", "photographs")
-PLACES = Path(__file__).parent / "expected" / "places.json"  # of cameras, by machine and view
-SEED = "3"
-POSES = {"axes": "8", "outlines": "8", "photographs": "6"}
+SEED = 3
+POSES = {"axes": 8, "outlines": 8, "photographs": 6}
 JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
 SIZE = (64, 48)  # of pictures that nobody looks at
 
 
 @cache
 def _top() -> Path:
-    return Path(tempfile.mkdtemp(prefix="legcal-characterisation-"))
+    return Path(tempfile.mkdtemp(prefix="legcal-inputs-"))
 
 
 def remove_inputs() -> None:
@@ -65,18 +71,15 @@ def camera_file(path: Path, width: int, height: int) -> Path:
 
 
 @cache
-def simulated(machine: str, level: str) -> tuple[Path, dict[str, Any]]:
+def simulated(machine: str, level: str) -> Path:
     """Simulate a small dataset of a machine, whose cameras stand at recorded places."""
-    folder = _top() / f"{machine}-{level}"
-    camera = mild_lens()
+    folder, camera = _top() / f"{machine}-{level}", None
     if level == "photographs":
-        camera = read_lens(camera_file(_top() / "camera.yaml", 512, 384))
-    views = [
-        Viewpoint(name, camera, MotionEntry(**place["T_base_camera"]).motion())
-        for name, place in json.loads(PLACES.read_text())[machine].items()
-    ]
-    settings = SimulationSettings(level=level, seed=int(SEED), poses=int(POSES[level]), views=views)
-    return folder, summary_document(simulate(machine, folder, settings))
+        camera = camera_file(_top() / "camera.yaml", 512, 384)
+    before_cameras(
+        folder, machine, views=3, camera=camera, level=level, seed=SEED, poses=POSES[level]
+    )
+    return folder
 
 
 @cache
@@ -84,7 +87,7 @@ def made_input(name: str) -> Path:
     """Return the folder of an input; nobody may change it: take a copy."""
     machine, _, level = name.rpartition("-")
     if machine in MACHINES and level in LEVELS:
-        return simulated(machine, level)[0]
+        return simulated(machine, level)
     folder = _top() / name
     folder.mkdir()
     MAKERS[name](folder)
@@ -149,7 +152,7 @@ def _repeats(folder: Path) -> None:
     (folder / "poses.csv").write_text(header + "".join(_row(row) for row in rows))
     camera = camera_file(folder / "camera.yaml", 512, 384)
     settings = SimulationSettings(
-        seed=int(SEED), images=3, poses=folder / "poses.csv", views=1, camera=camera
+        seed=SEED, images=3, poses=folder / "poses.csv", views=1, camera=camera
     )
     simulate("3-rpr", folder / "set", settings)
 
@@ -169,7 +172,7 @@ def _boards(folder: Path) -> None:
     """Photograph a board beside a 3-RPR from five places."""
     camera = camera_file(folder / "camera.yaml", 512, 384)
     settings = SimulationSettings(
-        seed=int(SEED), poses=5, views=1, board="charuco", hand_held=True, camera=camera
+        seed=SEED, poses=5, views=1, board="charuco", hand_held=True, camera=camera
     )
     simulate("3-rpr", folder / "set", settings)
 

@@ -23,7 +23,7 @@ import typer.main
 
 from legcal import cli
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 
 _SCHEMAS = {"calibrate": "result", "camera": "camera-calibration"}
 
