@@ -73,7 +73,9 @@ def with_wrong_outlines(outlines: Outlines, folder: Path, rng: np.random.Generat
     """Return outlines of a dataset some of which are off, at both ends alike or not."""
     read = load_dataset(folder)
     n = len(outlines)
-    sizes = np.exp(rng.uniform(*map(math.log, WRONG_PX), (n, 1))) * rng.choice([-1.0, 1.0], (n, 1))
+    sizes = np.exp(rng.uniform(math.log(WRONG_PX[0]), math.log(WRONG_PX[1]), (n, 1))) * rng.choice(
+        [-1.0, 1.0], (n, 1)
+    )
     offsets = sizes * np.stack([np.ones(n), rng.uniform(-1.0, 1.0, n)], axis=1)
     offsets[rng.random(n) >= WRONG_SHARE] = 0.0
     return moved_outlines(outlines, read.measurements.views[0].camera, offsets)

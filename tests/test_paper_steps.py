@@ -16,14 +16,16 @@ from staged_sessions import (
     exact_session,
     five_millimetres_away,
     noisy_session,
+    planned,
     shipped,
     staged,
 )
 from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import planned_observations
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs
 from legcal.machine.loader import load_mechanism
@@ -32,7 +34,7 @@ from legcal.paper.criteria import Criteria, Transformation
 from legcal.paper.four_steps import run_base_steps
 from legcal.paper.joints_in_base import build_rigid_base as build_base
 from legcal.paper.joints_in_base import build_scalar_products
-from legcal.paper.least_squares import LeastSquares
+from legcal.paper.least_squares import IpoptSolution, LeastSquares
 from legcal.paper.leg_directions import directions_through_joints, observed_directions
 from legcal.paper.offsets import build_consecutive, build_constant_distances, leg_ends
 from legcal.paper.platform import RigidProblem, build_rigid_platform
@@ -56,7 +58,8 @@ TRANSFORMATIONS: tuple[Transformation, ...] = ("points", "cross_product")
 def open_space(observed: Observed, name: str) -> Array:
     """Return an orthonormal basis (w, p) of what the staged ranks leave open, turns as metres."""
     machine = load_mechanism(name)
-    ranks = Analysis(planned_observations(machine, [tuple(range(machine.n_legs))] * 3, 6)).full
+    ranks = Analysis(planned_observations(machine, [tuple(range(machine.n_legs))] * 3, 6)).staged
+    assert ranks.complete
     nominal = observed.nominal
     names = parametrize(nominal.leg_names, observed.true_legs, nominal.frame_legs).names
     rows = np.zeros((len(ranks.weak), len(names)))
@@ -142,14 +145,20 @@ def test_literal_steps_are_exact_where_their_equations_have_full_rank(
     assert np.abs(error - basis.T @ (basis @ error)).max() < 1e-8
 
 
-def test_offsets_are_exact_where_the_printed_9_leaves_joints_open() -> None:
-    for name in EVEN:
-        # 3 mm in z, or 1 degree in the axes, are not seen by even equations
-        observed = shipped(name)
-        found = observed.run("literal")
-        q0 = np.array([leg.q0 for leg in observed.true_legs])
-        assert np.nanmax(np.abs(found.machine.offsets - q0)) < 1e-8
-        assert np.abs(found.base.A_Rb - observed.A_Rb).max() > 1e-7
+def test_ranks_of_9_tell_where_it_is_exact_and_offsets_are_so_everywhere() -> None:
+    for name in (*FULL_RANK, *EVEN):
+        machine = load_mechanism(name)
+        ranks = Analysis(
+            planned_observations(machine, [tuple(range(machine.n_legs))], 4)
+        ).step_ranks
+        (rank,) = [r for r in ranks if (r.name, r.criteria) == ("base_joints", "literal")]
+        assert (rank.rank == rank.of) == (name in FULL_RANK)
+        if name in EVEN:  # 3 mm in z, or 1 degree in the axes, are not seen by even equations
+            observed = shipped(name)
+            found = observed.run("literal")
+            q0 = np.array([leg.q0 for leg in observed.true_legs])
+            assert np.nanmax(np.abs(found.machine.offsets - q0)) < 1e-8
+            assert np.abs(found.base.A_Rb - observed.A_Rb).max() > 1e-7
 
 
 def test_literal_steps_find_a_passive_leg_where_base_and_platform_are_known() -> None:
@@ -237,6 +246,50 @@ VIEWS = [
     ("tricept", ((0, 1, 2), (1, 2, 3))),
     ("tricept", ((0, 1, 2, 3),)),
 ]
+
+
+@pytest.mark.parametrize(("name", "views"), VIEWS)
+def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
+    name: str, views: tuple[tuple[int, ...], ...]
+) -> None:
+    machine = load_mechanism(name)
+    session = planned_observations(machine, views, 8)
+    analysis, observed = Analysis(session), planned(session)
+    full = {r.name: r.rank == r.of for r in analysis.step_ranks if r.criteria == "default"}
+    assert full["joints_in_cameras"]
+    if full["base_joints"]:
+        base = observed.run_base()
+        assert np.abs(base.A_Rb - observed.A_Rb).max() < 1e-8
+        revolute = observed.nominal.revolute
+        assert np.abs(np.cross(base.base_axes, observed.v_Rb)[revolute]).max(initial=0.0) < 1e-7
+    else:
+        with pytest.raises(NotIdentifiable, match="could not be tied together"):
+            observed.run_base()
+    if analysis.staged.complete:
+        assert np.abs(observed.errors(observed.run().legs)).max() < 1e-7
+    else:
+        with pytest.raises(NotIdentifiable):
+            observed.run()
+
+
+@pytest.mark.parametrize("name", ["3-rpr", "3-spr", "3-upu", "3-upu-tilted", "tricept"])
+def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
+    machine = load_mechanism(name)
+    session = planned_observations(machine, [tuple(range(machine.n_legs))], 8)
+    (rank,) = [
+        r
+        for r in Analysis(session).step_ranks
+        if (r.name, r.criteria) == ("platform_joints", "default")
+    ]
+    observed = planned(session)
+    rigid = rigid_problem(observed)
+    problem = build_rigid_platform(rigid)
+    J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
+    information = IpoptSolution(problem.start, residuals, J, len(rigid.unknowns), "").information()
+    kept = [i for i, name in enumerate(rigid.unknowns.names) if "offset" not in name]
+    metre = np.where(rigid.unknowns.is_angle, 1.0 / session.mean_length, 1.0)
+    assert len(kept) == rank.of
+    assert determined(session, (information * metre)[:, kept]) == rank.rank
 
 
 def rigid_problem(observed: Observed) -> RigidProblem:
