@@ -204,6 +204,7 @@ def test_options_without_sense_are_refused_by_name(
         (("simulate", "hexapod", "-o", "x", "--level", "axes"), ["--level axes", 'level="axes"']),
         (("simulate", "hexapod", "-o", "x", "--level=axes"), ["--level axes", 'level="axes"']),
         (("simulate", "hexapod", "-o", "x", "--force"), ["--force", "empty folder"]),
+        (("study", "bound", "--runs", "3"), ["study bound", "python benchmarks/bound.py"]),
         (("study", "paper", "--part", "1/3"), ["--part of legcal study", "--cluster"]),
         (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
         (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),

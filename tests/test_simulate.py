@@ -151,6 +151,16 @@ def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path
     assert dataset.image_reader([0])(0).shape == (150, 200)
 
 
+def test_photographs_show_the_machine_whatever_is_said_of_occlusion(tmp_path: Path) -> None:
+    few = replace(FEW, level=Level.PHOTOGRAPHS, camera=small_camera(tmp_path))
+    solid, clear = (
+        simulate("3-rps", tmp_path / str(occlusion), replace(few, occlusion=occlusion)).folder
+        for occlusion in (True, False)
+    )
+    (name,) = load_dataset(solid).measurements.image
+    assert (solid / name).read_bytes() == (clear / name).read_bytes()
+
+
 def _few_photographs(folder: Path, workers: int) -> SimulatedDataset:
     """Photograph one pose twice."""
     look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
@@ -251,6 +261,9 @@ def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points()
 # --- settings
 
 
+VIEW = _from_the_side("side", None, 0.93)
+
+
 def test_options_that_are_not_given_are_the_defaults_of_the_settings() -> None:
     assert requested(load_mechanism("hexapod")) == SimulationSettings()
 
@@ -325,7 +338,13 @@ def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
         ({"seed": -1}, "seed, needed 0 or more"),
         ({"poses": 1000, "views": 100, "images": 2}, "200000 images"),
         ({"board": "charuco", "hand_held": True, "images": 2}, "2 images of each pose"),
+        ({"board": "charuco", "hand_held": True, "views": [VIEW]}, "and places of cameras"),
+        ({"board_pose": True}, "the pose of a board without a board"),
         ({"views": "cameras.yaml"}, "views, needed a whole number or Viewpoints"),
+        ({"views": []}, "0 as views, needed 1 to 100000"),
+        ({"views": [VIEW, "c2"]}, "'c2' as view 1, needed a Viewpoint"),
+        ({"views": [VIEW, VIEW]}, "views named 'side', 'side', needed different names"),
+        ({"views": [replace(VIEW, name="../side")]}, "views named '../side'"),
         ({"board": 3}, "3 as board, needed a Board"),
     ],
 )
@@ -354,6 +373,22 @@ def test_numbers_of_numpy_and_names_of_choices_count(tmp_path: Path) -> None:
     )
     with pytest.raises(UsageError, match="found 0 workers, needed 1 or more"):
         simulate("hexapod", tmp_path / "set", found, workers=0)
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "named"),
+    [
+        ("hexapod", {"readings": Spread(1.0)}, "readings .* needed .* 29.6 mm"),
+        ("delta", {"lengths": {"leg1.base:leg2.platform": 5e-5}}, "length 'leg1.base:leg2.platfo"),
+        ("hexapod", {"views": [replace(VIEW, legs=("leg7",))]}, "view side: .* found leg7, which"),
+    ],
+)
+def test_settings_without_sense_for_a_machine_are_refused(
+    model: str, changes: dict[str, object], named: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=named):
+        simulate(model, tmp_path / "set", settings(poses=1, **changes))
+    assert files_of(tmp_path) == {}
 
 
 def test_cameras_of_too_many_pixels_are_refused(tmp_path: Path) -> None:

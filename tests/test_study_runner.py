@@ -110,11 +110,22 @@ def test_a_full_disk_is_told_and_the_study_goes_on_when_there_is_room(
     assert run_study(Draws(), 100, output=tmp_path).document() == run_study(Draws(), 100).document()
 
 
+def test_figures_that_cannot_be_written_are_told_and_no_run_is_lost(tmp_path: Path) -> None:
+    run_study(Draws(), 1, output=tmp_path)
+    (tmp_path / "total.txt").unlink()
+    (tmp_path / "total.txt").mkdir()
+    (tmp_path / "total.txt" / "mine").touch()
+    with pytest.raises(UsageError, match=r"result of the study.*total.txt, which is a folder"):
+        run_study(Draws(), 3, output=tmp_path)
+    assert len(_lines(tmp_path)) == 4
+
+
 @pytest.mark.parametrize(
     ("kept", "rest"),
     [
         (12, b'{"run":11,"rec'),
         (12, b'{"run":11,"record":{"x":1.0}}'),
+        (12, b"\0\0\0\0\n"),
         (0, b""),
         (0, b'{"legcal_study":'),  # half of the first line
     ],
@@ -135,23 +146,30 @@ def test_a_half_written_last_line_is_done_again(tmp_path: Path, kept: int, rest:
     "damaged",
     [
         b'{"run":1,\n',
+        b"[" * 100_000 + b"\n",
         b"[1]\n",
         b'{"run":1}\n',
         b'{"record":{"x":1.0}}\n',
+        b'{"run":-1,"record":{"x":1.0}}\n',
+        b'{"run":true,"record":{"x":1.0}}\n',
+        b'{"run":1,"record":null}\n',
+        b'{"run":1,"failure":"x"}\n',
+        b'{"run":1,"failure":{"kind":1,"message":"x"}}\n',
     ],
-    ids=range(4),
+    ids=range(10),
 )
 def test_a_damaged_line_is_refused(tmp_path: Path, damaged: bytes) -> None:
     run_study(Draws(), 5, output=tmp_path)
     before = _lines(tmp_path)
-    lines = [*before[:2], damaged, *before[3:]]
+    # As the last line, half of one may be what a killed run left.
+    lines = [*before[:2], damaged, *before[3 : 3 + (not damaged.endswith(b"}\n"))]]
     (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
     with pytest.raises(UsageError, match="found line 3 damaged"):
         run_study(Draws(), 5, output=tmp_path)
     assert _lines(tmp_path) == lines
 
 
-NO_CHECKPOINT = "no checkpoint of legcal"
+NO_CHECKPOINT, DEEP = "no checkpoint of legcal", "[" * 100_000 + "\n"
 LONG = "long" * 100
 
 
@@ -159,13 +177,15 @@ LONG = "long" * 100
     ("there", "output", "message"),
     [
         ({"notes.txt": "mine"}, "", "a folder with other files"),
+        ({CHECKPOINT_NAME: "", DOCUMENT_NAME: "mine"}, "", "a folder with other files"),
         ({"notes.txt": "mine"}, "notes.txt", "a file of that name"),
         ({"notes.txt": "mine"}, "notes.txt/below", "needed a path that can be created"),
         ({}, LONG, "needed a path that can be created"),
         ({CHECKPOINT_NAME: "mine\n", "notes.txt": "mine"}, "", NO_CHECKPOINT),
         ({CHECKPOINT_NAME: "mine"}, "", NO_CHECKPOINT),
+        ({CHECKPOINT_NAME: DEEP}, "", NO_CHECKPOINT),
     ],
-    ids=range(6),
+    ids=range(8),
 )
 def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(
     tmp_path: Path, there: dict[str, str], output: str, message: str
@@ -202,6 +222,7 @@ def test_a_checkpoint_of_another_study_is_refused_and_kept(
 def test_numbers_that_make_no_sense_are_refused() -> None:
     for n_runs, seed, workers, message in (
         (0, 0, 1, "runs = 0, needed 1 or more"),
+        (10**9, 0, 1, "runs = 1000000000, needed 1000000 at most"),
         (1, -1, 1, "seed = -1, needed 0 or more"),
         (1, 0, 0, "workers = 0, needed 1 or more"),
     ):

@@ -6,9 +6,18 @@ from collections.abc import Mapping, Sequence
 
 from legcal.errors import UsageError
 
+
+def _benchmark(program: str) -> str:
+    """Return where a study is that was a command."""
+    return f"run python benchmarks/{program} of the source tree"
+
+
 COMMANDS = {
     "noise": "calibrate writes the noise of its outlines into its result, and legcal plan --noise "
     "RESULT reads it there",
+    "study bound": _benchmark("bound.py"),
+    "study convergence": _benchmark("convergence.py"),
+    "study classes": _benchmark("classes_study.py"),
 }
 _DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
 _TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
@@ -104,8 +113,9 @@ def refuse_retired(words: Sequence[str]) -> None:
         The command line without the name of the program.
     """
     command = words[0] if words else ""
-    if command in COMMANDS:
-        raise UsageError(f"legcal {command} is gone: {COMMANDS[command]}.")
+    for name in (command, " ".join(words[:2])):
+        if name in COMMANDS:
+            raise UsageError(f"legcal {name} is gone: {COMMANDS[name]}.")
     instead = OPTIONS.get(command, {})
     given = dict[str, None]()
     for word, following in zip(words[1:], [*words[2:], ""], strict=False):

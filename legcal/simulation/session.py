@@ -132,7 +132,16 @@ class _Simulator:
     def given_views(self) -> tuple[Viewpoint, ...]:
         """Where cameras stand, if settings give that."""
         views = self.settings.views
-        return tuple(views) if isinstance(views, Sequence) else ()
+        if not isinstance(views, Sequence):
+            return ()
+        for view in views:
+            if others := set(view.legs or ()) - set(self.truth.leg_names):
+                raise UsageError(
+                    f"view {view.name}: its legs could not be simulated: found "
+                    f"{', '.join(sorted(others))}, which '{self.truth.name}' lacks, needed some of "
+                    f"{', '.join(self.truth.leg_names)}; correct the name."
+                )
+        return tuple(views)
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
@@ -175,7 +184,8 @@ class _Simulator:
         """Return boards and cameras around the machine: where plan and settings have them."""
         # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
-        solids = dressed(replace(self.truth, urdf=urdf)) if self.settings.occlusion else ()
+        is_solid = self.settings.occlusion or self.settings.level == Level.PHOTOGRAPHS
+        solids = dressed(replace(self.truth, urdf=urdf)) if is_solid else ()
         posed = pose_machine(self.truth, solids, poses)
         on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from legcal.calibration.joint_fit.parameter_choices import joints_of_length
 from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
+from legcal.files.schema import is_plain_name
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameter_id import ParameterId
@@ -301,6 +302,8 @@ class SimulationSettings:
             needed |= {f"errors.{k}": (getattr(self.errors, k), Spread, "Spread") for k in KINDS}
         if isinstance(self.table, TableNoise):
             needed |= {f"table.{k}": (x, Real, "number") for k, x in vars(self.table).items()}
+        if isinstance(self.views, list | tuple):
+            needed |= {f"view {k}": (x, Viewpoint, "Viewpoint") for k, x in enumerate(self.views)}
         for name, (value, kind, what) in needed.items():
             if isinstance(value, bool) or not isinstance(value, kind):
                 yield f"found {value!r} as {name}, needed a {what}; correct it."
@@ -343,6 +346,13 @@ class SimulationSettings:
             yield "found a camera in the hand without a board on the base; choose a board."
         if self.board_pose and self.board is None and self.platform_board is None:
             yield "found the pose of a board without a board; choose a board."
+        if isinstance(self.views, Sequence):
+            names = [view.name for view in self.views]
+            if len(set(names)) < len(names) or not all(map(is_plain_name, names)):
+                yield (
+                    f"found views named {', '.join(map(repr, names))}, needed different names that "
+                    "can be those of files; rename some."
+                )
         if self.hand_held and isinstance(self.views, Sequence):
             yield (
                 "found a camera in the hand and places of cameras, needed a number of views; "

@@ -32,6 +32,7 @@ CHECKPOINT_NAME = "runs.jsonl"
 DOCUMENT_NAME = "study.json"
 _STUDY = OutputKind("result of the study", "", "")  # beside the checkpoint and other files
 _KEY, _VERSION = "legcal_study", 1
+_MOST_RUNS = 1_000_000
 _LARGEST_CHUNK = 10  # runs between two writes to the checkpoint
 _PROCESSES = 4  # for each core; more only wait for each other
 _MANY = 64  # workers that a cluster may have
@@ -201,6 +202,11 @@ def _write(
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
     """Refuse numbers that make no sense."""
+    if n_runs > _MOST_RUNS:
+        raise UsageError(
+            f"The study could not be run: found runs = {n_runs}, needed {_MOST_RUNS} at most; give "
+            "another number."
+        )
     processes = workers if is_number(workers) else 1
     for name, number, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", processes, 1)):
         if number < least:
@@ -236,15 +242,17 @@ class _Checkpoint:
     def _read(self, path: Path, first: Record) -> None:
         """Read the lines that are there, and drop half of a line at the end; or begin the file."""
         content = path.read_bytes() if path.exists() else b""
-        whole, end, rest = content.rpartition(b"\n")
-        if not end and _encoded(first).startswith(rest):  # new, or killed while it was begun
+        heading, end, body = content.partition(b"\n")
+        if not end and _encoded(first).startswith(heading):  # new, or killed while it was begun
             path.write_bytes(_encoded(first))
             return
-        heading, *runs = whole.split(b"\n")
         _check_header(path, heading, first)
+        *runs, rest = body.split(b"\n")
+        if runs and not rest and not _parsed(runs[-1]):  # zeros, after a power cut
+            rest = runs.pop()
         for number, line in enumerate(runs, 2):
             found = _parsed(line)
-            if not (isinstance(found.get("run"), int) and found.keys() & {"record", "failure"}):
+            if not _is_run(found):
                 raise UsageError(
                     f"{path}: the study could not be continued: found line {number} damaged, "
                     "needed a complete JSON object of a run on every line; remove that line, or "
@@ -252,13 +260,17 @@ class _Checkpoint:
                 )
             self.lines.setdefault(found["run"], found)
         if rest:
-            path.write_bytes(whole + end)
+            path.write_bytes(b"".join(line + b"\n" for line in (heading, *runs)))
 
 
 def _prepare_folder(output: Path) -> None:
     """Make the output folder; refuse one that holds something else than a study."""
     check_path(output, _STUDY)
-    if output.is_dir() and holds_files(output) and not (output / CHECKPOINT_NAME).is_file():
+    checkpoint = output / CHECKPOINT_NAME
+    is_begun = checkpoint.is_file() and (
+        checkpoint.stat().st_size > 0 or list(output.iterdir()) == [checkpoint]
+    )
+    if output.is_dir() and holds_files(output) and not is_begun:
         raise UsageError(
             f"{output}: the study could not be written: found a folder with other files and no "
             f"{CHECKPOINT_NAME} of a study, needed a new or empty folder or that of the same "
@@ -304,6 +316,21 @@ def _check_header(path: Path, line: bytes, expected: Record) -> None:
         f"{path}: the study could not be continued: found the runs of another command ({told}), "
         "needed those of the same; give another output folder, or this one the command that began "
         "it."
+    )
+
+
+def _is_run(found: Record) -> bool:
+    """Return whether a line has what a run found, or how it failed."""
+    run, failure = found.get("run"), found.get("failure")
+    if type(run) is not int or not 0 <= run < _MOST_RUNS:
+        return False
+    if found.keys() == {"run", "record"}:
+        return isinstance(found["record"], dict)
+    return (
+        found.keys() == {"run", "failure"}
+        and isinstance(failure, dict)
+        and failure.keys() == {"kind", "message"}
+        and all(isinstance(text, str) for text in failure.values())
     )
 
 
