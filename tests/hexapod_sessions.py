@@ -27,11 +27,13 @@ from legcal.simulation.observe import (
     outlines_of,
 )
 from legcal.simulation.paper import PAPER_VIEWS, paper_cameras
+from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import simulate_session, streams
 from legcal.simulation.settings import (
     Distribution,
     Level,
     ParameterErrors,
+    Sampling,
     SimulationSettings,
     Spread,
 )
@@ -90,6 +92,12 @@ def moved(machine: Machine, step: np.ndarray) -> NominalMachine:
     parameters = from_vector(vector, machine.n_legs, machine.frame_legs)
     legs = point_like_legs(parameters)
     return NominalMachine(machine.leg_names, legs, machine.frame_legs)
+
+
+def extreme_poses(machine: Machine, n_poses: int, seed: int) -> RigidTransform:
+    """Return poses T_Rb_Re with every motor near an end of its travel."""
+    drawn = draw_poses(machine, n_poses, np.random.default_rng(seed), Sampling.EXTREME).poses
+    return RigidTransform.concatenate(list(platforms_in_base(machine, drawn)))
 
 
 def paper_session(
