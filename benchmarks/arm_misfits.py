@@ -54,8 +54,7 @@ from legcal.machine.rods import arms_at
 from legcal.perception.outline import WIDTH_TOLERANCE
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines, noisy_outlines
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 
 LENGTH_SIGMA = 5e-5  # [m] of a length measured by hand
 

@@ -44,8 +44,7 @@ from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
 from legcal.planning.poses import surely_reached
 from legcal.planning.session import write_session
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution, SimulationSettings, Spread
+from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 from legcal.vision.camera import sample_camera
 
 LENGTH_SIGMA = 5e-5  # [m] of a length measured by hand
