@@ -42,7 +42,7 @@ class PixelSums:
     weight: Array  # (n, 3, m) of 1, o, and o^2
     light: Array  # (n, 2, m) of the light, and of the light times o
     power: Array  # (n, m) of its square
-    count: Array  # (n, m) how many pixels, whatever their weights
+    count: Array  # (n, m) how many pixels, by their windows alone
 
     def of_blocks(self, blocks: BoolArray) -> "PixelSums":
         """Return the sums of some blocks (n,)."""
@@ -55,6 +55,12 @@ class PixelSums:
             return self
         of_pixels = self.weight, self.light, self.power, self.count
         return PixelSums(self.grid, *(np.add.reduceat(sums, first, axis=0) for sums in of_pixels))
+
+    def shared(self, share: Array) -> "PixelSums":
+        """Return the sums of blocks that count as so many (n,)."""
+        part, parts = share[:, None], share[:, None, None]
+        of_pixels = self.weight * parts, self.light * parts, self.power * part, self.count * part
+        return PixelSums(self.grid, *of_pixels)
 
     def weighted(self, share: Array) -> "PixelSums":
         """Return the sums with squared weights times shares (n, m) for each bin."""
@@ -110,11 +116,16 @@ class PixelBins:
 
     @classmethod
     def of(
-        cls, d: Samples, weight: Samples, blur: float, block: IntArray | None = None
+        cls,
+        d: Samples,
+        weight: Samples,
+        blur: float,
+        block: IntArray | None = None,
+        window: Samples | None = None,
     ) -> "PixelBins":
         """Return bins that suit a blur [px]; pixels (n_rows, k) of no weight do not count.
 
-        Rows of pixels are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
+        Weights are by the noise of pixels and by a window (n_rows, k), 1 by default. Rows of pixels are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
         """
         used = weight > 0.0
         per_px = np.float32(BINS_PER_BLUR / blur)
@@ -130,7 +141,7 @@ class PixelBins:
         square = weight * weight
         moment = square * offset
         sums = _binned(entry, n, size, (square, moment, moment * offset))
-        count = _binned(entry, n, size, (used,))[:, 0]
+        count = _binned(entry, n, size, (used if window is None else window * window,))[:, 0]
         grid = np.arange(first, last + 1) / float(per_px)
         return cls(grid, entry, square, moment, sums, count)
 
