@@ -20,10 +20,11 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few
-from legcal.data.outlines import Outlines, no_outlines, through_cameras
+from legcal.data.outlines import Outlines, join_outlines, no_outlines, through_cameras
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.geometry.types import Array
 from legcal.geometry.motions import components
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
@@ -38,6 +39,8 @@ from legcal.perception.photographs import (
 from legcal.perception.placement import Placement, placed_arms
 
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
+ROUNDS = 5  # of measuring near the last fit, at most
+MOVED_PX = 0.02  # of a leg since its image was measured, from which on it is measured again
 
 
 def measure_again(
@@ -58,13 +61,20 @@ def measure_again(
     rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
-    first = best = search.fitted(estimate, {})
+    measured = search.measured(estimate, {})
+    first = search.fitted(estimate, measured)
+    for _ in range(ROUNDS - 1):
+        again = search.measured(first, {}, earlier=measured)
+        if again is measured:
+            break
+        measured, first = again, search.fitted(first, again)
+    best = first
     trials = GammaTrials.begun(
         first.solution, known_gammas(photographs.keep, photographs.measurements)
     )
     while gammas := trials.next():
         try:
-            there = search.fitted(best, gammas, like=first.outlines)
+            there = search.fitted(best, search.measured(best, gammas, may_have_other_radii=False), like=first.outlines)
         except (DidNotConverge, NotIdentifiable, NotVisible):
             trials = trials.tried(gammas, None)
             continue
@@ -73,7 +83,7 @@ def measure_again(
             best = there
     last, refused = first, trials.found()
     if refused:
-        found = search.fitted(best, refused)
+        found = search.fitted(best, search.measured(best, refused))
         if not loses_outlines(first.outlines, found.outlines):
             last, refused = found, {}
     measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
@@ -101,17 +111,33 @@ class _SearchNearFit:
         every = replace(self.data, seen_poses=here.seen_poses)
         return photographs, _fitted_placement(every, near.solution, self.seen)
 
-    def fitted(
-        self, near: Estimate, gammas: Mapping[str, float], *, like: Outlines | None = None
-    ) -> Estimate:
-        """Measure near a fit and fit again, with the same outlines used as in *like*, if given."""
+    def measured(
+        self,
+        near: Estimate,
+        gammas: Mapping[str, float],
+        *,
+        earlier: _Measured | None = None,
+        may_have_other_radii: bool = True,
+    ) -> _Measured:
+        """Measure near a fit; of what was measured earlier, images whose legs have moved since."""
         photographs, placement = self.at(near, gammas)
+        pixels = _pixels_of_legs(photographs, placement)
+        if earlier is not None:
+            change = np.linalg.norm(pixels - earlier.pixels, axis=-1).max(axis=(1, 2))
+            rows = photographs.detect[change[photographs.detect] > MOVED_PX]
+            if not len(rows):
+                return earlier
+            photographs = replace(photographs, detect=rows)
+            kept = ~np.isin(np.arange(len(pixels)), rows)
+            pixels = np.where(kept[:, None, None, None], earlier.pixels, pixels)
         stage = "Measuring outlines near the fit"
         if gammas:
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
         search, progress = replace(photographs, keep=no_outlines()), self.data.progress
         outlines = measure_photographs(search, placement, progress, stage=stage)
-        other = None if like is not None else with_measured_radii(search, placement, outlines)
+        other = None
+        if may_have_other_radii and earlier is None:
+            other = with_measured_radii(search, placement, outlines)
         if other is not None:
             stage += " with other radii"
             with_other = measure_photographs(other, placement, progress, stage=stage)
@@ -120,13 +146,45 @@ class _SearchNearFit:
         both, view = (photographs, self.photographs), self.data.measurements.view
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
+        if earlier is not None:
+            outlines = join_outlines([earlier.outlines.choose(kept[earlier.outlines.row]), outlines])
+        return _Measured(placement, outlines, pixels)
+
+    def fitted(
+        self, near: Estimate, measured: _Measured, *, like: Outlines | None = None
+    ) -> Estimate:
+        """Fit what was measured near a fit, with the same outlines used as in *like*, if given."""
+        outlines = measured.outlines
         still = hardly_shown(outlines, self.seen.unlike)
         outlines = reject_images(outlines, dict.fromkeys(still, Rejection(Reason.OTHER_SCENE)))
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        return fit_outlines(here, outlines, placement, self.board, self.options)
+        return fit_outlines(here, outlines, measured.placement, self.board, self.options)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Outlines that were measured near a fit."""
+
+    placement: Placement  # where it had the legs
+    outlines: Outlines  # by the cameras of the files
+    pixels: Array  # (n_rows, n_legs, 2, 2) joint centres when their image was measured [px]
+
+
+def _pixels_of_legs(photographs: Photographs, placement: Placement) -> Array:
+    """Return where images have both joint centres of legs, (n_rows, n_legs, 2, 2) [px]."""
+    m = photographs.measurements
+    pixels = np.full((*placement.A_base.shape[:2], 2, 2), np.nan)
+    for row, view in enumerate(m.view.tolist()):
+        T = placement.T_base_camera[view]
+        if T is None:
+            continue
+        ends = np.stack([placement.A_base[row], placement.B_base[row]], axis=1)
+        X = T.inv().apply(ends.reshape(-1, 3))
+        pixels[row] = m.views[view].camera.distort(X[:, :2] / X[:, 2:]).reshape(-1, 2, 2)
+    return pixels
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:

@@ -407,7 +407,7 @@ def fit_lines(
 
     From positions (n,) as fractions of the length, shifts [px], and their variances by noise
     [px^2] of all blocks, one outline after the other; those of variance ``largest`` or more are
-    left out. None where fewer than ``MIN_BLOCKS`` blocks agree.
+    left out, and those of more than half of it count less. None where fewer than ``MIN_BLOCKS`` blocks agree.
     """
     counts = np.diff(bounds)
     filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
@@ -418,7 +418,8 @@ def fit_lines(
         return table
 
     along, moved, noise = (padded(values) for values in (position, shift, variance))
-    usable = filled & (noise < largest)
+    gate = np.clip(2.0 - 2.0 * noise / largest, 0.0, 1.0) * filled
+    usable = gate > 0.0
     n_usable = np.count_nonzero(usable, axis=1)
     fits = n_usable >= MIN_BLOCKS
     along, moved = np.where(usable, along, 0.0), np.where(usable, moved, 0.0)
@@ -427,7 +428,7 @@ def fit_lines(
     ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
     factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
     moving = fits.copy()
-    sigma, share = np.sqrt(floored), usable / floored
+    sigma, share = np.sqrt(floored), gate / floored
     products = share * np.stack(
         [(1.0 - along) ** 2, (1.0 - along) * along, along**2, (1.0 - along) * moved, along * moved]
     )
@@ -452,13 +453,13 @@ def fit_lines(
             break
     on_line = robust > 0.0
     within = 1.0 - np.sqrt(1.0 - np.sqrt(robust))  # 1 on the line, 0 where a block has no weight
-    share = np.minimum(within / DOUBTFUL, 1.0)
+    count = gate * np.minimum(within / DOUBTFUL, 1.0)
     residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
     scaled = floored * factor[:, None] ** 2
     return [
         BlockLine(
             ends[i],
-            share[i, : counts[i]],
+            count[i, : counts[i]],
             float(np.count_nonzero(on_line[i]) / n_usable[i]),
             along[i, on_line[i]],
             residual[i, on_line[i]],

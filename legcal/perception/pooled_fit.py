@@ -5,7 +5,6 @@ nearly that of the whole image; each block adds a little of its own, which is el
 Gauss-Newton needs no pixel (:mod:`legcal.perception.pixel_sums`) as long as lines turn little.
 """
 
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -42,14 +41,14 @@ N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
 ROUGHNESS = 0.02  # displacement of single blocks [px]
-START_SIGMA = (0.02*float(os.environ.get("SS","1")), 0.35*float(os.environ.get("SS","1")))
+START_SIGMA = (0.1, 1.75)  # standard deviation of the lines that it starts from: [px] and in blurs
 BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
-MM = float(os.environ.get("MM","1")); MAX_MOVE_OF_SUMS = (1.0*MM, 0.08*MM)
-MX = float(os.environ.get("MX","1")); MAX_MOVE = (0.4*MX, 0.15*MX)
-CC = float(os.environ.get("CC","1")); CONVERGED = (0.02*CC, 0.06*CC)
+MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
+MAX_MOVE = (0.1, 0.04)  # of a line [blurs] and of the logarithm of the blur, to which equations do
+CONVERGED = (0.005, 0.015)  # steps of lines [px] and log blurs, below which the last round follows
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
@@ -61,7 +60,7 @@ COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about th
 # freedom.
 DEGREES, EXPECTED_ODDITY = 5.0, 4.0  # and the sum of squared pulls of outlines where all is well
 BLUR_PULL = 0.01  # of the logarithm of the blur of an outline, where all is well
-ROUNDS, ALL_ROUNDS = int(os.environ.get("RR","10")), 2
+ROUNDS, ALL_ROUNDS = 10, 2  # at most; and before those that have converged are left out
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
