@@ -1,8 +1,9 @@
-"""Photographs measured again close to a fit, and fitted again.
+"""Photographs measured again close to a fit, and fitted again, until the fit stays where it is.
 
-What is measured there depends little on where the search for the fit began: fits that agree give
-the same outlines, others give edges that light leaves open at one or another place. Where the
-outlines show the gamma of a camera that is not given, all is done again with that.
+What is measured changes smoothly with where the legs are predicted, and by much less than that
+does: rounds forget where the search for the fit began, but for edges that light leaves open at one
+or another place. Where the outlines show the gamma of a camera that is not given, all is done again
+with that.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from legcal.data.outlines import Outlines, join_outlines, no_outlines, through_c
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.geometry.types import Array
 from legcal.geometry.motions import components
+from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
@@ -61,20 +62,15 @@ def measure_again(
     rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
-    measured = search.measured(estimate, {})
-    first = search.fitted(estimate, measured)
-    for _ in range(ROUNDS - 1):
-        again = search.measured(first, {}, earlier=measured)
-        if again is measured:
-            break
-        measured, first = again, search.fitted(first, again)
-    best = first
+    first = best = search.converged(estimate)
     trials = GammaTrials.begun(
         first.solution, known_gammas(photographs.keep, photographs.measurements)
     )
     while gammas := trials.next():
         try:
-            there = search.fitted(best, search.measured(best, gammas, may_have_other_radii=False), like=first.outlines)
+            there = search.fitted(
+                best, search.measured(best, gammas, may_have_other_radii=False), like=first.outlines
+            )
         except (DidNotConverge, NotIdentifiable, NotVisible):
             trials = trials.tried(gammas, None)
             continue
@@ -110,6 +106,17 @@ class _SearchNearFit:
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         every = replace(self.data, seen_poses=here.seen_poses)
         return photographs, _fitted_placement(every, near.solution, self.seen)
+
+    def converged(self, near: Estimate) -> Estimate:
+        """Measure near a fit and fit again, until no leg moves any more."""
+        measured = self.measured(near, {})
+        near = self.fitted(near, measured)
+        for _ in range(ROUNDS - 1):
+            again = self.measured(near, {}, earlier=measured)
+            if again is measured:
+                break
+            measured, near = again, self.fitted(near, again)
+        return near
 
     def measured(
         self,
@@ -147,7 +154,9 @@ class _SearchNearFit:
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
         if earlier is not None:
-            outlines = join_outlines([earlier.outlines.choose(kept[earlier.outlines.row]), outlines])
+            outlines = join_outlines(
+                [earlier.outlines.choose(kept[earlier.outlines.row]), outlines]
+            )
         return _Measured(placement, outlines, pixels)
 
     def fitted(

@@ -407,7 +407,8 @@ def fit_lines(
 
     From positions (n,) as fractions of the length, shifts [px], and their variances by noise
     [px^2] of all blocks, one outline after the other; those of variance ``largest`` or more are
-    left out, and those of more than half of it count less. None where fewer than ``MIN_BLOCKS`` blocks agree.
+    left out, and those of more than half of it count less. None where fewer than ``MIN_BLOCKS``
+    blocks agree.
     """
     counts = np.diff(bounds)
     filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)

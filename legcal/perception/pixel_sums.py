@@ -125,7 +125,8 @@ class PixelBins:
     ) -> "PixelBins":
         """Return bins that suit a blur [px]; pixels (n_rows, k) of no weight do not count.
 
-        Weights are by the noise of pixels and by a window (n_rows, k), 1 by default. Rows of pixels are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
+        Weights are by the noise of pixels and by a window (n_rows, k), 1 by default. Rows of pixels
+        are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
         """
         used = weight > 0.0
         per_px = np.float32(BINS_PER_BLUR / blur)

@@ -41,7 +41,8 @@ N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
 ROUGHNESS = 0.02  # displacement of single blocks [px]
-START_SIGMA = (0.1, 1.75)  # standard deviation of the lines that it starts from: [px] and in blurs
+# Standard deviation of the lines that it starts from: [px] and in blurs.
+START_SIGMA = (0.1, 1.75)
 BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
@@ -94,7 +95,8 @@ class _Equations(NamedTuple):
 def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> PooledLines:
     """Fit the blocks that lie on the lines of their edges, of each outline together.
 
-    Each counts by its share (n,), from a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].
+    Each counts by its share (n,), from a rough blur [px]; ``depth`` is the distance from the
+    outlines at which blocks end [px].
     """
     pool = _Pool.of(blocks, share, blur, depth)
     n = len(pool.half_width)
