@@ -1,9 +1,9 @@
-"""Photographs measured again close to a fit, and fitted again, until the fit stays where it is.
+"""Photographs measured again close to a fit, and fitted again: in brief, then with all care.
 
 What is measured changes smoothly with where the legs are predicted, and by much less than that
-does: rounds forget where the search for the fit began, but for edges that light leaves open at one
-or another place. Where the outlines show the gamma of a camera that is not given, all is done again
-with that.
+does: each round forgets most of where the search for the fit began, but for edges that light leaves
+open at one or another place. Where the outlines show the gamma of a camera that is not given, all
+is done again with that.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few
-from legcal.data.outlines import Outlines, join_outlines, no_outlines, through_cameras
+from legcal.data.outlines import Outlines, no_outlines, through_cameras
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.motions import components
-from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import used_as_before
+from legcal.perception.outline import Method, measure, measure_in_brief, used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
@@ -40,8 +39,6 @@ from legcal.perception.photographs import (
 from legcal.perception.placement import Placement, placed_arms
 
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
-ROUNDS = 5  # of measuring near the last fit, at most
-MOVED_PX = 0.02  # of a leg since its image was measured, from which on it is measured again
 
 
 def measure_again(
@@ -62,15 +59,14 @@ def measure_again(
     rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
-    first = best = search.converged(estimate)
+    near = search.fitted(estimate, {}, method=measure_in_brief)
+    first = best = search.fitted(near, {})
     trials = GammaTrials.begun(
         first.solution, known_gammas(photographs.keep, photographs.measurements)
     )
     while gammas := trials.next():
         try:
-            there = search.fitted(
-                best, search.measured(best, gammas, may_have_other_radii=False), like=first.outlines
-            )
+            there = search.fitted(best, gammas, like=first.outlines)
         except (DidNotConverge, NotIdentifiable, NotVisible):
             trials = trials.tried(gammas, None)
             continue
@@ -79,7 +75,7 @@ def measure_again(
             best = there
     last, refused = first, trials.found()
     if refused:
-        found = search.fitted(best, search.measured(best, refused))
+        found = search.fitted(best, refused)
         if not loses_outlines(first.outlines, found.outlines):
             last, refused = found, {}
     measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
@@ -107,93 +103,39 @@ class _SearchNearFit:
         every = replace(self.data, seen_poses=here.seen_poses)
         return photographs, _fitted_placement(every, near.solution, self.seen)
 
-    def converged(self, near: Estimate) -> Estimate:
-        """Measure near a fit and fit again, until no leg moves any more."""
-        measured = self.measured(near, {})
-        near = self.fitted(near, measured)
-        for _ in range(ROUNDS - 1):
-            again = self.measured(near, {}, earlier=measured)
-            if again is measured:
-                break
-            measured, near = again, self.fitted(near, again)
-        return near
-
-    def measured(
+    def fitted(
         self,
         near: Estimate,
         gammas: Mapping[str, float],
         *,
-        earlier: _Measured | None = None,
-        may_have_other_radii: bool = True,
-    ) -> _Measured:
-        """Measure near a fit; of what was measured earlier, images whose legs have moved since."""
+        like: Outlines | None = None,
+        method: Method = measure,
+    ) -> Estimate:
+        """Measure near a fit and fit again, with the same outlines used as in *like*, if given."""
         photographs, placement = self.at(near, gammas)
-        pixels = _pixels_of_legs(photographs, placement)
-        if earlier is not None:
-            change = np.linalg.norm(pixels - earlier.pixels, axis=-1).max(axis=(1, 2))
-            rows = photographs.detect[change[photographs.detect] > MOVED_PX]
-            if not len(rows):
-                return earlier
-            photographs = replace(photographs, detect=rows)
-            kept = ~np.isin(np.arange(len(pixels)), rows)
-            pixels = np.where(kept[:, None, None, None], earlier.pixels, pixels)
         stage = "Measuring outlines near the fit"
         if gammas:
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
         search, progress = replace(photographs, keep=no_outlines()), self.data.progress
-        outlines = measure_photographs(search, placement, progress, stage=stage)
-        other = None
-        if may_have_other_radii and earlier is None:
-            other = with_measured_radii(search, placement, outlines)
+        outlines = measure_photographs(search, placement, progress, method=method, stage=stage)
+        other = None if like is not None else with_measured_radii(search, placement, outlines)
         if other is not None:
             stage += " with other radii"
-            with_other = measure_photographs(other, placement, progress, stage=stage)
+            with_other = measure_photographs(
+                other, placement, progress, method=method, stage=stage
+            )
             outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
         # The table and the next fit have the cameras of the files.
         both, view = (photographs, self.photographs), self.data.measurements.view
         lenses = [[one.camera for one in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
-        if earlier is not None:
-            outlines = join_outlines(
-                [earlier.outlines.choose(kept[earlier.outlines.row]), outlines]
-            )
-        return _Measured(placement, outlines, pixels)
-
-    def fitted(
-        self, near: Estimate, measured: _Measured, *, like: Outlines | None = None
-    ) -> Estimate:
-        """Fit what was measured near a fit, with the same outlines used as in *like*, if given."""
-        outlines = measured.outlines
         still = hardly_shown(outlines, self.seen.unlike)
         outlines = reject_images(outlines, dict.fromkeys(still, Rejection(Reason.OTHER_SCENE)))
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        return fit_outlines(here, outlines, measured.placement, self.board, self.options)
-
-
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """Outlines that were measured near a fit."""
-
-    placement: Placement  # where it had the legs
-    outlines: Outlines  # by the cameras of the files
-    pixels: Array  # (n_rows, n_legs, 2, 2) joint centres when their image was measured [px]
-
-
-def _pixels_of_legs(photographs: Photographs, placement: Placement) -> Array:
-    """Return where images have both joint centres of legs, (n_rows, n_legs, 2, 2) [px]."""
-    m = photographs.measurements
-    pixels = np.full((*placement.A_base.shape[:2], 2, 2), np.nan)
-    for row, view in enumerate(m.view.tolist()):
-        T = placement.T_base_camera[view]
-        if T is None:
-            continue
-        ends = np.stack([placement.A_base[row], placement.B_base[row]], axis=1)
-        X = T.inv().apply(ends.reshape(-1, 3))
-        pixels[row] = m.views[view].camera.distort(X[:, :2] / X[:, 2:]).reshape(-1, 2, 2)
-    return pixels
+        return fit_outlines(here, outlines, placement, self.board, self.options)
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
