@@ -1,9 +1,8 @@
-"""Photographs measured again close to a fit, and fitted again: in brief, then with all care.
+"""Photographs measured again close to a fit, and fitted again.
 
-What is measured changes smoothly with where the legs are predicted, and by much less than that
-does: each round forgets most of where the search for the fit began, but for edges that light leaves
-open at one or another place. Where the outlines show the gamma of a camera that is not given, all
-is done again with that.
+What is measured there depends little on where the search for the fit began: fits that agree give
+the same outlines, others give edges that light leaves open at one or another place. Where the
+outlines show the gamma of a camera that is not given, all is done again with that.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from legcal.geometry.motions import components
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import Method, measure, measure_in_brief, used_as_before
+from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
@@ -59,8 +58,7 @@ def measure_again(
     rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
-    near = search.fitted(estimate, {}, method=measure_in_brief)
-    first = best = search.fitted(near, {})
+    first = best = search.fitted(estimate, {})
     trials = GammaTrials.begun(
         first.solution, known_gammas(photographs.keep, photographs.measurements)
     )
@@ -104,12 +102,7 @@ class _SearchNearFit:
         return photographs, _fitted_placement(every, near.solution, self.seen)
 
     def fitted(
-        self,
-        near: Estimate,
-        gammas: Mapping[str, float],
-        *,
-        like: Outlines | None = None,
-        method: Method = measure,
+        self, near: Estimate, gammas: Mapping[str, float], *, like: Outlines | None = None
     ) -> Estimate:
         """Measure near a fit and fit again, with the same outlines used as in *like*, if given."""
         photographs, placement = self.at(near, gammas)
@@ -117,13 +110,11 @@ class _SearchNearFit:
         if gammas:
             stage += f", gamma {few(sorted({f'{gamma:.2f}' for gamma in gammas.values()}))}"
         search, progress = replace(photographs, keep=no_outlines()), self.data.progress
-        outlines = measure_photographs(search, placement, progress, method=method, stage=stage)
+        outlines = measure_photographs(search, placement, progress, stage=stage)
         other = None if like is not None else with_measured_radii(search, placement, outlines)
         if other is not None:
             stage += " with other radii"
-            with_other = measure_photographs(
-                other, placement, progress, method=method, stage=stage
-            )
+            with_other = measure_photographs(other, placement, progress, stage=stage)
             outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
         # The table and the next fit have the cameras of the files.
         both, view = (photographs, self.photographs), self.data.measurements.view

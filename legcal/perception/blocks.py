@@ -419,7 +419,8 @@ def fit_lines(
         return table
 
     along, moved, noise = (padded(values) for values in (position, shift, variance))
-    gate = np.clip(2.0 - 2.0 * noise / largest, 0.0, 1.0) * filled
+    part = np.divide(noise, largest, out=np.ones_like(noise), where=filled & (noise < largest))
+    gate = np.clip(2.0 - 2.0 * part, 0.0, 1.0)
     usable = gate > 0.0
     n_usable = np.count_nonzero(usable, axis=1)
     fits = n_usable >= MIN_BLOCKS

@@ -184,11 +184,10 @@ def noise_ratios(sums: PixelSums, bounds: IntArray, share: Array, blur: float) -
         counts = share * np.clip((count - first) / (enough - first), 0.0, 1.0)
         level = counts * np.log(np.maximum(variance, MIN_NOISE**2))
         n_known = np.bincount(edge, counts, n_edges)
-        # A side of few blocks is drawn to that of the other one.
         sides.append((np.bincount(edge, level, n_edges) / np.maximum(n_known, 1e-9), n_known))
     (outer, n_outer), (inner, n_inner) = sides
-    known = np.minimum(n_outer, n_inner)
-    ratio = np.exp((inner - outer) * known / (known + MIN_BLOCKS))
+    known = np.minimum(n_outer, n_inner) ** 2  # sides of few blocks are taken to be alike
+    ratio = np.exp((inner - outer) * known / (known + MIN_BLOCKS**2))
     return np.asarray(np.clip(ratio, MAX_NOISE_RATIO**-2, MAX_NOISE_RATIO**2))
 
 
