@@ -27,6 +27,8 @@ from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, lea
 
 WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
+NEAR_DOUBT = (0.6, 1.0)  # of the tolerance of widths near a fit, from where on outlines count less
+LEAST_DOUBTED = 0.05  # root of the weight that an outline has at least if it is used
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +277,12 @@ def _with_verdict(
             round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4), edge.by_gamma
         )  # fmt: skip
         lines.append(
-            OutlineLine(edge.v, (line.first, line.last), edge.covariance + judged.bias**2, quality)
+            OutlineLine(
+                edge.v,
+                (line.first, line.last),
+                edge.covariance / judged.weight + judged.bias**2,
+                quality,
+            )
         )
     return PartLines(part.leg.leg, part.segment.link, judged.reasons, lines, part.band)
 
@@ -285,6 +292,7 @@ class PartVerdict(NamedTuple):
 
     reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
     bias: float = 0.0  # how far used ones may be off besides their covariance [px]
+    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
 
 
 def verdict(
@@ -343,7 +351,13 @@ def _by_width(
         near = 0.2 + 3.0 * math.hypot(sigma_one, sigma_two)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
-    if mismatch.max() <= 1.0:
+    if near_fit:
+        # A width near its limit may be within it by another fit: weights change with it smoothly.
+        begin, end = NEAR_DOUBT
+        share = float((end - mismatch.max()) / (end - begin))
+        if share > LEAST_DOUBTED:
+            return PartVerdict((USED, USED), weight=min(share, 1.0) ** 2)
+    elif mismatch.max() <= 1.0:
         return PartVerdict((USED, USED))
     i = int(np.argmax(mismatch))
     reason = Rejection(Reason.WIDTH, f"{widths[i]:.1f} px for {expected[i]:.1f} px")
