@@ -28,7 +28,7 @@ def jacobians(problem: Problem[Any], linear: Linearization) -> dict[str, Array]:
     """Return the derivatives (n, size) of each factor's residuals by all unknowns, and priors'."""
     found = {}
     for factor in problem.factors:
-        rows, index = linear[factor.name], problem.places[factor.name].index
+        rows, index = linear[factor.name], problem.sparsity[factor.name].index
         n, q, _ = rows.J.shape
         wide = np.zeros((n, q, problem.size + 1))
         kept = np.where(index < problem.n_kept, index, problem.size)

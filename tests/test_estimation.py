@@ -90,7 +90,7 @@ def test_exact_measurements_are_explained_exactly(loss: PseudoHuber | Huber) -> 
 def test_elimination_gives_the_covariance_of_the_whole_system(n_open: int) -> None:
     problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.1, n_open)
     linear = linearize(problem, AWAY)
-    rows, where = linear["values"], problem.places["values"]
+    rows, where = linear["values"], problem.sparsity["values"]
     J = np.zeros((len(rows.r), problem.size))
     J[:, :N_SHARED] = rows.J[:, 0]
     for i, k in enumerate(np.repeat(np.arange(N_ELEMENTS), N_EACH).tolist()):
@@ -120,7 +120,7 @@ def test_a_correlated_prior_adds_the_inverse_of_its_covariance(turned: bool) -> 
     if turned:
         read = replace(block, jacobian=lambda _: by_x, coordinates=lambda v: by_x @ v[:, 0])
         problem = replace(problem, variables=(read,))
-    known = _with_prior(problem, single + GaussianPrior.of_covariance(which, mean, C))
+    known = _with_prior(problem, single + GaussianPrior.from_covariance(which, mean, C))
     without = _with_prior(problem, GaussianPrior(which[:0], mean[:0], mean[:0]))
     K = np.zeros((3, 3))
     K[np.ix_(which, which)], K[1, 1] = np.linalg.inv(C), 4.0
@@ -138,7 +138,7 @@ def test_what_a_covariance_says_exactly_stays() -> None:
     problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.5)
     mean, which = np.array([0.3, 0.5]), np.array([0, 2], dtype=np.intp)
     C = 0.09 * np.array([[1.0, -2.0], [-2.0, 4.0]])  # the second moves by minus two of the first
-    found = minimise(_with_prior(problem, GaussianPrior.of_covariance(which, mean, C)), AWAY)
+    found = minimise(_with_prior(problem, GaussianPrior.from_covariance(which, mean, C)), AWAY)
     first, second = found.state.phase[which, 0] - mean
     assert abs(first) > 1e-3
     assert second == pytest.approx(-2.0 * first, rel=1e-4)
@@ -286,7 +286,7 @@ def test_scores_of_a_fit_far_from_its_minimum_give_finite_variances() -> None:
     v = np.random.default_rng(4).normal(size=6)
     effects = Effects(1e12 * v, 1e22 * np.outer(v, v), np.zeros(6, dtype=np.intp))
     with pytest.raises(np.linalg.LinAlgError):
-        effects.at(np.ones(1))  # the rounding of K exceeds one
+        effects.with_variances(np.ones(1))  # the rounding of K exceeds one
     variances, _ = estimate_variances(effects, LEAST_GAIN, np.ones(1))
     assert np.isfinite(variances).all()
 

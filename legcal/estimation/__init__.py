@@ -5,36 +5,37 @@ images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
 
 **State** A dataclass of the client with one field for each block of variables, of any type.
 
-**Variables** A block: elements of one manifold. ``unknown`` (n, d) says which unknown moves each of
-the d numbers of each element: -1 is fixed (gauge, or by choice), equal numbers move
-together (views that share a lens). ``retract`` applies changes (a sum, ``Frames.moved``, or
-the client's own). ``labels`` and ``units`` name unknowns that are reported, ``coordinates`` and
-``jacobian`` map x to reported values where these differ, ``prior`` is a Gaussian on them, with
-correlations where these are known.
+**Variables** A block: elements of one manifold. ``unknown`` (n, d) is the index of the unknown that
+moves each of the d coordinates of each element: -1 is fixed (gauge, or by choice), equal indices
+share one unknown (views that share a lens). ``retract`` applies a tangent step (a sum,
+``Frames.moved``, or a function of the client). ``labels`` and ``units`` name the unknowns that are
+reported, ``coordinates`` and ``jacobian`` map x to the reported values where these differ,
+``prior`` is a Gaussian on them, correlated or not.
 
-**Factor** Measurements of one kind: ``rows(state)`` returns residuals of all of them at once with
-their derivatives by the blocks that ``touches`` names, in that order, and by the eliminated
-``element``; ``whitening`` makes them unit Gaussians, ``robust`` puts the loss on them.
+**Factor** Measurements of one kind: ``rows(state)`` returns the residuals of all measurements with
+their derivatives by the blocks named in ``touches``, in that order, and by the eliminated
+``element``; ``whitening`` makes them unit Gaussians, ``robust`` applies the loss to them.
 
-**Problem** Kept variables, one block of eliminated ones (platform poses, boards in images: each
-measurement touches one of them at most, and the Schur complement removes them), factors, an exact
-``constraint`` on the eliminated elements, and ``held_directions`` that may not move.
+**Problem** Kept variables, one block of eliminated variables (platform poses, board poses: each
+measurement touches at most one of them, and the Schur complement removes them), factors, an exact
+``constraint`` on the eliminated elements, and ``held_directions`` of the kept unknowns that are
+fixed.
 
 ::
 
     problem = Problem((camera,), board_poses, (corners,))
-    found = minimise(problem, state, Huber(3.0))  # Levenberg-Marquardt, loss narrowed on the way
-    normal = information(problem, found.state, found.linear)
-    covariance = named_covariance(problem, found.state, normal.kept_covariance())
+    minimum = minimise(problem, state, Huber(3.0))  # Levenberg-Marquardt, loss narrowed on the way
+    normal = information(problem, minimum.state, minimum.linear)
+    covariance = named_covariance(problem, minimum.state, normal.kept_covariance())
 
-A client writes a state, a function of rows for each kind of measurement (derivatives written out;
-one test of finite differences checks them all), and the blocks. At predicted observations the same
-:func:`information` is the Cramer-Rao bound and says what is identifiable; it is additive over
-eliminated elements, so that candidate images are low-rank updates of it
-(``NormalEquations.contributions``). Where ranks are decided, :func:`information_rows` keeps its
-square root. The response to errors of what is fixed (:func:`response`),
-what eliminated elements that share errors disagree by (:class:`Clusters`),
-score tests of columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the
-covariance of predictions (:func:`explained_share`) come from the same matrix. Variances of random
-effects are estimated by restricted maximum likelihood (:class:`Effects`).
+A client writes a state, a function of residual rows for each kind of measurement (analytic
+derivatives; one finite-difference test checks them all), and the blocks. At predicted observations
+the same :func:`information` gives the Cramer-Rao bound and the identifiable parameters; it is
+additive over eliminated elements, so that candidate images are low-rank updates of it
+(``NormalEquations.contributions``). Rank decisions use its square root, :func:`information_rows`.
+The same matrix gives the response to errors of fixed quantities (:func:`response`), the
+disagreement between eliminated elements with common errors (:class:`Clusters`), score tests of
+columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the covariance of
+predictions (:func:`explained_share`). Variances of random effects are estimated by restricted
+maximum likelihood (:class:`Effects`).
 """

@@ -1,17 +1,17 @@
-"""What each eliminated element says of the kept unknowns, and a covariance that believes these.
+"""Cluster-robust covariance: eliminated elements as clusters of measurements with common errors.
 
 Measurements of one element (the corners of an image) share errors that their residuals do not show:
-what bends paper, sharpening, compression. They do show where elements disagree. Element i has a
-score s_i = J^T r and an information A_i of the kept unknowns, itself following; N is the sum of all
-A_i and of the priors. If errors were as claimed, s_i would have the covariance
-V_i = A_i - A_i N^-1 A_i at the minimum. They are larger by one factor, Birge's ratio between
-elements, with each weighted as it moves the unknowns by N^-1 s_i::
+bent paper, sharpening, compression. Such errors show as disagreement between elements. Element i
+has a score s_i = J^T r and an information A_i of the kept unknowns, its own unknowns marginalised
+out; N is the sum of all A_i and the information of the priors. With the claimed errors, s_i would
+have the covariance V_i = A_i - A_i N^-1 A_i at the minimum. The actual errors are larger by a
+common factor, Birge's ratio between elements, weighted by the shift N^-1 s_i of the unknowns::
 
     f = sum_i s_i^T N^-1 s_i / sum_i trace(N^-1 V_i)
 
-Few elements determine it, having many numbers each, where a sandwich of their scores is singular
-or far too small. The covariance is N^-1 (f sum_i A_i + priors) N^-1, with f times v / (v - 2) where
-f is known with v degrees of freedom: that of Student's distribution.
+A few elements determine f, since each has many scores; the sandwich estimator would be singular or
+far too small. The covariance is N^-1 (f sum_i A_i + priors) N^-1, with f scaled by v / (v - 2) for
+v degrees of freedom of f: the variance of Student's distribution.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from legcal.estimation.problem import Linearization, Problem, S
 from legcal.estimation.solver import NormalEquations, inverse_on_range
 from legcal.geometry.types import Array, BoolArray, IntArray
 
-_RANGE = 1e-9  # of an information: what is smaller is rounding
-_MIN_DOF = 4.0  # of a ratio that is believed
+_RANGE = 1e-9  # relative to the trace of a covariance: added against rounding
+_MIN_DOF = 4.0  # degrees of freedom, below which the ratio is not estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Scores and information of each eliminated element at a state, and those of the priors."""
+    """Scores and information of each eliminated element and of the priors, at a state."""
 
     score: Array  # (n, k) gradient of the cost
-    information: Array  # (n, k, k) the element following
+    information: Array  # (n, k, k) the element marginalised out
     prior: Array  # (k, k)
     prior_score: Array  # (k,)
 
     def choose(self, which: IntArray | BoolArray) -> Clusters:
-        """Return some of the elements."""
+        """Select elements by index or mask."""
         return replace(self, score=self.score[which], information=self.information[which])
 
     def best(self) -> Array:
-        """Return the step (k,) of the kept unknowns to the minimum of the elements and priors."""
+        """Step (k,) of the kept unknowns to the minimum of elements and priors."""
         return np.asarray(-self.normal_inverse @ (self.score.sum(axis=0) + self.prior_score))
 
     def moved(self, step: Array) -> Clusters:
-        """Return the same after a step (k,) of the kept unknowns, to first order."""
+        """Update the scores for a step (k,) of the kept unknowns, to first order."""
         return replace(
             self,
             score=self.score + self.information @ step,
@@ -56,28 +56,29 @@ class Clusters:
         )
 
     def freed(self, direction: Array) -> tuple[Clusters, Array, Array]:
-        """Return the same with a change along *direction* (k,) free in each element.
+        """Free a shift along *direction* (k,) in each element and move to the new minimum.
 
-        Beside it, at the minimum of what is left, that change and its information, (n,) each.
+        Also return the shift of each element at that minimum and its information, (n,) each.
         """
         pull = self.information @ direction
-        own = np.maximum(pull @ direction, 1e-300)
-        left = replace(
+        information = np.maximum(pull @ direction, 1e-300)
+        eliminated = replace(
             self,
-            score=self.score - pull * (self.score @ direction / own)[:, None],
-            information=self.information - pull[:, :, None] * pull[:, None, :] / own[:, None, None],
+            score=self.score - pull * (self.score @ direction / information)[:, None],
+            information=self.information
+            - pull[:, :, None] * pull[:, None, :] / information[:, None, None],
         )
-        step = left.best()
-        change = -(self.moved(step).score @ direction) / own
-        return left.moved(step), change, own
+        step = eliminated.best()
+        change = -(self.moved(step).score @ direction) / information
+        return eliminated.moved(step), change, information
 
     def contradiction(
         self, which: BoolArray, ratio: float, directions: Array | None = None
     ) -> Array:
-        """Return how far each element contradicts the others of a group, in squared sigmas (n,).
+        """Squared Mahalanobis distance (n,) of each element from the minimum of a group.
 
-        At the minimum of the group *which*, for errors of a ratio f; along unit changes
-        *directions* (k, c) of the kept unknowns alone where these are given.
+        The group is *which*, *ratio* is f. With *directions* (k, c), only the components of the
+        scores along these unit changes of the kept unknowns are tested.
         """
         A = self.information
         N = inverse_on_range(A[which].sum(axis=0) + self.prior)
@@ -93,24 +94,24 @@ class Clusters:
 
     @cached_property
     def normal_inverse(self) -> Array:
-        """The covariance if errors were as claimed, (k, k)."""
+        """Covariance (k, k) of the kept unknowns for the claimed errors."""
         return inverse_on_range(self.information.sum(axis=0) + self.prior)
 
     def ratio(self) -> float:
-        """Return f with what its own error adds; 1 where elements cannot disagree."""
+        """Birge ratio f with its correction v / (v - 2); 1 where v is too small."""
         N = self.normal_inverse
-        by_score = self.information @ N
-        by_score = by_score - by_score @ by_score  # V_i N^-1
-        expected = float(np.trace(by_score, axis1=1, axis2=2).sum())
-        squares = float(np.einsum("nij,nji->", by_score, by_score))
-        dof = expected**2 / max(squares, 1e-300)
+        leverage = self.information @ N
+        leverage = leverage - leverage @ leverage  # V_i N^-1
+        expected = float(np.trace(leverage, axis1=1, axis2=2).sum())
+        squared_leverage = float(np.einsum("nij,nji->", leverage, leverage))
+        dof = expected**2 / max(squared_leverage, 1e-300)
         if not (expected > 0.0 and dof > _MIN_DOF):
             return 1.0
-        found = float(np.einsum("nk,kl,nl->", self.score, N, self.score))
-        return found / expected * dof / (dof - 2.0)
+        squared_score = float(np.einsum("nk,kl,nl->", self.score, N, self.score))
+        return squared_score / expected * dof / (dof - 2.0)
 
     def covariance(self, ratio: float) -> Array:
-        """Return the covariance (k, k) of the kept unknowns for a ratio f."""
+        """Covariance (k, k) of the kept unknowns for a ratio f."""
         C = self.normal_inverse
         return np.asarray(C @ (ratio * self.information.sum(axis=0) + self.prior) @ C)
 
@@ -121,30 +122,30 @@ def clustered(
     normal: NormalEquations,
     loss: Loss = LEAST_SQUARES,
 ) -> Clusters:
-    """Return what each eliminated element says of the kept unknowns.
+    """Compute the score and the information that each eliminated element has of the kept unknowns.
 
     Parameters
     ----------
     problem, linear
-        At a state where all elements are at their minimum.
+        Linearised where every element is at its minimum.
     normal : NormalEquations
-        Of the same problem, state and loss.
+        For the same problem, state and loss.
     loss : Loss
-        On the factors that are robust.
+        Loss of the robust factors.
     """
     n, k = problem.n_elements, problem.n_kept
     score, U = np.zeros((n, k + 1)), np.zeros((n, k + 1, k + 1))
     for factor in problem.factors:
-        rows, at = linear[factor.name], factor.element
-        if at is None:
+        rows, element = linear[factor.name], factor.element
+        if element is None:
             continue
         r, J = rows.r, rows.J
         if factor.robust and np.isfinite(loss.width):
             r, J = loss.softened(r, J)
         index = problem.places[factor.name].index
-        np.add.at(score, (at[:, None], index), np.einsum("nqk,nq->nk", J, r))
-        where = at[:, None, None], index[:, :, None], index[:, None, :]
-        np.add.at(U, where, np.swapaxes(J, 1, 2) @ J)
+        np.add.at(score, (element[:, None], index), np.einsum("nqk,nq->nk", J, r))
+        cells = element[:, None, None], index[:, :, None], index[:, None, :]
+        np.add.at(U, cells, np.swapaxes(J, 1, 2) @ J)
     prior_J = linear.prior_J
     return Clusters(
         score[:, :k],

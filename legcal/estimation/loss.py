@@ -1,8 +1,8 @@
 """Robust losses of whitened residuals, by their squared norms s.
 
-The pseudo-Huber loss of width k^-1/2 costs s / (1 + sqrt(1 + k s)): s / 2 for small s, linear in
-the distance far out, convex, and plain least squares for k = 0. Huber's turns all at once. With
-either no residual, however wrong, pulls with more than the width.
+The pseudo-Huber loss of width k^-1/2 is s / (1 + sqrt(1 + k s)): s / 2 for small s, linear in the
+residual norm for large s, convex, and least squares for k = 0. Huber's loss switches at the width.
+In both, the influence of a residual is bounded by the width.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from legcal.geometry.types import Array
 
 
 class Loss(Protocol):
-    """What a whitened residual of squared norm s costs."""
+    """A robust loss of whitened residuals with squared norms s."""
 
     @property
     def width(self) -> float:
-        """Norm at which it turns from quadratic to linear."""
+        """Norm at which the loss turns from quadratic to linear."""
 
     def cost(self, s: Array) -> float:
-        """Return the loss of all measurements."""
+        """Return the total loss of measurements with squared norms s (n,)."""
 
     def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
-        """Return r (n, q), slope (n, q, l) whose squares have its gradient and curvature."""
+        """Return rows (n, q), (n, q, l) whose squares have the gradient and curvature of the loss."""
 
     def efficiency(self, m: int) -> float:
-        """Return the information that it keeps of m Gaussian residuals."""
+        """Return the efficiency of the M-estimator for m Gaussian residuals."""
 
 
 @dataclass(frozen=True)
 class PseudoHuber:
-    """The pseudo-Huber loss; plain least squares without a width."""
+    """The pseudo-Huber loss; least squares for an infinite width."""
 
     width: float = np.inf
 
@@ -46,7 +46,7 @@ class PseudoHuber:
         return 1.0 / (self.width * self.width)
 
     def cost(self, s: Array) -> float:
-        """Return the loss of all measurements."""
+        """Return the total loss of measurements with squared norms s (n,)."""
         if self.k == 0.0:
             return 0.5 * float(s.sum())
         return float((s / (1.0 + np.sqrt(1.0 + self.k * s))).sum())
@@ -78,7 +78,7 @@ class Huber:
     width: float
 
     def cost(self, s: Array) -> float:
-        """Return the loss of all measurements."""
+        """Return the total loss of measurements with squared norms s (n,)."""
         size = np.sqrt(s)
         far = self.width * (size - 0.5 * self.width)
         return float(np.where(size > self.width, far, 0.5 * s).sum())
@@ -90,7 +90,7 @@ class Huber:
         return root[:, None] * r, root[:, None, None] * slope
 
     def efficiency(self, m: int) -> float:
-        """Return one: its weights are in the rows already."""
+        """Return one: the weights are in the rows already."""
         return 1.0
 
 

@@ -1,10 +1,10 @@
 """One estimation problem: blocks of variables, factors that touch them, and exact constraints.
 
-The unknowns x of a problem are small changes of a state: those of the kept variables first, block
-by block, then those of the eliminated ones (platform poses, say), one element after the other. A
-measurement touches few kept variables and one eliminated element at most, so that measurements
-which touch the same variables are summed by one matrix product, and what couples them to
-eliminated elements by constant sparse matrices that are built once.
+The unknowns x of a problem are a tangent step of a state: kept variables first, block by block,
+then the eliminated variables (platform poses, say), element by element. A measurement touches few
+kept variables and at most one eliminated element: the normal equations of measurements that touch
+the same variables are summed by one matrix product, and the coupling to eliminated elements by
+constant sparse matrices that are built once.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ S = TypeVar("S")  # the state: a dataclass with one field for each block of vari
 
 
 def _added(value: Array, change: Array) -> Array:
-    """Return numbers after a change, whatever shape their elements have."""
+    """Default retraction: a sum, for elements of any shape."""
     return np.asarray(value + change.reshape(value.shape))
 
 
 class Frames(NamedTuple):
     """Rigid motions T_to_from as rotations and translations.
 
-    They move by six numbers each: a rotation vector from the left (Cayley's map) [rad], then a
-    displacement [m].
+    The tangent step of each has six coordinates: a rotation vector, applied from the left by
+    Cayley's map [rad], then a displacement [m].
     """
 
     R: Array  # (n, 3, 3)
@@ -44,41 +44,43 @@ class Frames(NamedTuple):
 
     @classmethod
     def of(cls, motions: Sequence[RigidTransform]) -> Frames:
-        """Return the frames of rigid motions."""
+        """Convert from ``RigidTransform`` objects."""
         return cls(*components(motions))
 
     @property
     def motions(self) -> tuple[RigidTransform, ...]:
-        """The same as rigid motions."""
+        """As ``RigidTransform`` objects."""
         return motions_of(self.R, self.t)
 
     def moved(self, change: Array) -> Frames:
-        """Return frames after changes (n, 6)."""
+        """Apply tangent steps (n, 6)."""
         return Frames(turned(self.R, change[:, :3]), self.t + change[:, 3:])
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """Gaussian knowledge of coordinates of a block of variables."""
+    """A Gaussian prior on coordinates of a block of variables."""
 
-    unknown: IntArray  # (n,) which of the block's unknowns
+    unknown: IntArray  # (n,) indices of the block's unknowns
     mean: Array  # (n,)
     sigma: Array  # (n,)
-    # (n, n) T with T C T^T = 1 of their correlations C; None where they are independent
+    # (n, n) T with T C T^T = 1 for the correlations C; None where they are independent
     whitening: Array | None = None
 
     @classmethod
-    def of_covariance(cls, unknown: IntArray, mean: Array, covariance: Array) -> GaussianPrior:
-        """Return the prior of a covariance (n, n) of positive variances.
+    def from_covariance(cls, unknown: IntArray, mean: Array, covariance: Array) -> GaussianPrior:
+        """Build a prior from a covariance (n, n) with positive variances.
 
-        Combinations without any variance are known to a hundred-thousandth of their parts.
+        The covariance may be singular: eigenvalues of the correlations have a floor of 1e-10.
         """
         sigma = np.sqrt(np.diagonal(covariance))
-        value, vector = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-        return cls(unknown, mean, sigma, (vector / np.sqrt(np.maximum(value, _EXACT**2))).T)
+        eigenvalue, eigenvector = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+        return cls(
+            unknown, mean, sigma, (eigenvector / np.sqrt(np.maximum(eigenvalue, _EXACT**2))).T
+        )
 
     def whitened(self, errors: Array) -> Array:
-        """Return errors (n,) or (n, c) of these coordinates with unit covariance."""
+        """Whiten errors (n,) or (n, c) of these coordinates."""
         over_sigma = (errors.T / self.sigma).T
         return over_sigma if self.whitening is None else self.whitening @ over_sigma
 
@@ -96,29 +98,29 @@ class GaussianPrior:
         )
 
 
-_EXACT = 1e-5  # least standard deviation along an eigenvector of correlations
-_MAX_KEY = 2**40  # of numbers of groups: above, they are counted anew
+_EXACT = 1e-5  # floor of the standard deviation along an eigenvector of correlations
+_MAX_KEY = 2**40  # largest group key; above, keys are renumbered against overflow
 NO_PRIOR = GaussianPrior(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Variables:
-    """A block of variables: elements of one manifold, each moved by d numbers.
+    """A block of variables: elements of one manifold with d tangent coordinates each.
 
-    Its value is the field ``name`` of the state, whatever its type. Coordinates are what people
-    read of it, one number for each unknown; their derivative by x is one unless ``jacobian`` says
-    otherwise.
+    The value of the block is the field ``name`` of the state, of any type. Coordinates are the
+    values that are reported, one for each unknown; their derivative by x is the identity unless
+    ``jacobian`` is given.
     """
 
     name: str
-    unknown: IntArray  # (n, d) the unknown that moves each number; -1 fixed, equal ones move as one
+    unknown: IntArray  # (n, d) index of the unknown of each coordinate; -1 fixed, equal: shared
     retract: Callable[[Any, Array], Any] = _added  # (value, change (n, d)) -> value
-    labels: tuple[str, ...] = ()  # of the unknowns; blocks with labels come first
+    labels: tuple[str, ...] = ()  # names of the unknowns; blocks with labels come first
     units: tuple[str, ...] = ()
     coordinates: Callable[[Any], Array] | None = None  # value -> (n_unknowns,)
     jacobian: Callable[[Any], Array] | None = None  # value -> (n_unknowns, n_unknowns)
     prior: GaussianPrior = NO_PRIOR
-    max_step: tuple[float, ...] = ()  # (d,) of each number
+    max_step: tuple[float, ...] = ()  # (d,) step limit of each coordinate
 
     @cached_property
     def n_unknowns(self) -> int:
@@ -126,7 +128,7 @@ class Variables:
         return int(self.unknown.max(initial=-1)) + 1
 
     def read(self, value: Any) -> Array:
-        """Return the coordinates (n_unknowns,) of a value."""
+        """Return the coordinates (n_unknowns,) of the block's value."""
         if self.coordinates is not None:
             return self.coordinates(value)
         unknown, first = np.unique(self.unknown, return_index=True)
@@ -134,39 +136,42 @@ class Variables:
 
 
 def all_free(n: int, d: int) -> IntArray:
-    """Return the unknowns (n, d) of elements that all move freely."""
+    """Return ``unknown`` (n, d) of a block without fixed or shared coordinates."""
     return np.arange(n * d, dtype=np.intp).reshape(n, d)
 
 
 def fixed_at_start(n: int, d: int) -> IntArray:
-    """Return the unknowns (n, d) of elements that do not move."""
+    """Return ``unknown`` (n, d) of a fixed block."""
     return np.full((n, d), -1, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals r (n, q) of n measurements, and slopes (n, q, l) by what they depend on directly.
+    """Residuals r (n, q) of n measurements with derivatives (n, q, l) by intermediate quantities.
 
-    ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is called
-    only where these are needed. All is fastest where measurements lie next to each other in memory.
+    ``chain`` applies the chain rule: it turns these slopes into derivatives by kept and by
+    eliminated variables, and is called only when they are needed. Arrays are fastest with the
+    measurements contiguous in memory.
     """
 
     r: Array
-    unwhitened: Array  # slopes before ``whitening``, which is applied where they are needed
+    unwhitened: Array  # slopes before ``whitening``, which is applied lazily
     chain: Callable[[Array], tuple[Array, Array]]
     whitening: Array | None = None  # (q, q, n)
 
     @classmethod
     def of(cls, r: Array, J: Array, J_element: Array | None = None) -> Residuals:
-        """Return rows whose derivatives by kept and by eliminated variables are known."""
-        own, m = np.zeros((*r.shape, 0)) if J_element is None else J_element, J.shape[-1]
+        """Build from derivatives by the kept and by the eliminated variables."""
+        by_element, m = np.zeros((*r.shape, 0)) if J_element is None else J_element, J.shape[-1]
         return cls(
-            r, np.concatenate([J, own], axis=-1), lambda slope: (slope[..., :m], slope[..., m:])
+            r,
+            np.concatenate([J, by_element], axis=-1),
+            lambda slope: (slope[..., :m], slope[..., m:]),
         )
 
     @cached_property
     def slope(self) -> Array:
-        """Slopes (n, q, l) of these residuals."""
+        """Whitened slopes (n, q, l)."""
         if self.whitening is None:
             return self.unwhitened
         return np.asarray(np.einsum("ijn,ljn->lin", self.whitening, self.unwhitened.T).T)
@@ -177,12 +182,12 @@ class Residuals:
 
     @property
     def J(self) -> Array:
-        """Derivatives by the kept variables in the order of ``Factor.touches``, (n, q, m)."""
+        """Derivatives (n, q, m) by the kept variables in the order of ``Factor.touches``."""
         return self._derivatives[0]
 
     @property
     def J_element(self) -> Array:
-        """Derivatives by the eliminated element of each measurement, (n, q, d)."""
+        """Derivatives (n, q, d) by the eliminated element of each measurement."""
         return self._derivatives[1]
 
     @cached_property
@@ -191,7 +196,7 @@ class Residuals:
         return np.asarray(np.einsum("nq,nq->n", self.r, self.r))
 
     def whitened(self, T: Array) -> Residuals:
-        """Return the rows times T (n, q, q), or (n, 1, 1), or one number."""
+        """Multiply the rows by T (n, q, q), (n, 1, 1) or a scalar."""
         if T.ndim == 0:
             return Residuals(float(T) * self.r, float(T) * self.slope, self.chain)
         if T.shape[1:] == (1, 1):
@@ -201,7 +206,7 @@ class Residuals:
         return Residuals(r.T, self.slope, self.chain, by_row)
 
     def stacked(self, order: IntArray | None) -> Array:
-        """Return [J, r, J_element] of each measurement (n, q, m + 1 + d), in an order."""
+        """Return [J, r, J_element] of each measurement (n, q, m + 1 + d), reordered."""
         J, J_element = self._derivatives
         m = J.shape[-1]
         rows = np.empty((*self.r.shape, m + 1 + J_element.shape[-1]))
@@ -209,52 +214,54 @@ class Residuals:
         return rows if order is None else rows[order]
 
 
-Touch = tuple[str, IntArray, slice]  # block, element(s) of each measurement, numbers of these
+Touch = tuple[str, IntArray, slice]  # block, element(s) of each measurement, their coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Factor(Generic[S]):
-    """Measurements of one kind: residuals of the variables that they touch."""
+    """Measurements of one kind, as residuals of the variables that they touch."""
 
     name: str
     rows: Callable[[S], Residuals]  # residuals with derivatives, not whitened
-    touches: tuple[Touch, ...]  # kept variables, in the order of the columns of J
+    touches: tuple[Touch, ...]  # kept variables, in the column order of J
     n: int  # measurements
     n_rows: int  # residuals of each
-    element: IntArray | None = None  # (n,) the eliminated element of each; None where there is none
-    whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero leaves one out
-    robust: bool = False  # whether the loss is on it, or plain squares
-    _nothing: list[Residuals] = field(default_factory=list, repr=False)  # rows without any
+    element: IntArray | None = None  # (n,) eliminated element of each measurement, if any
+    whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero: rejected
+    robust: bool = False  # under the robust loss, or plain squares
+    _empty_rows: list[Residuals] = field(default_factory=list, repr=False)  # cached if n = 0
 
     def linearize(self, state: S) -> Residuals:
-        """Return whitened rows at a state."""
-        if self._nothing:
-            return self._nothing[0]
+        """Return whitened residuals and derivatives at a state."""
+        if self._empty_rows:
+            return self._empty_rows[0]
         rows = self.rows(state).whitened(np.asarray(self.whitening))
         if self.n == 0:
-            self._nothing.append(rows)
+            self._empty_rows.append(rows)
         return rows
 
 
 @dataclass(frozen=True, eq=False)
 class _Groups:
-    """Measurements of a factor that touch the same kept variables, and cells of these.
+    """Groups of measurements that touch the same kept variables, and cells of the groups.
 
-    A cell has the measurements of a group that touch the same eliminated element; all cells
-    of a factor are of one size, of single measurements where they would not be.
+    A cell holds the measurements of a group that touch the same eliminated element. All cells of
+    a factor have one size; where sizes differ, each measurement is a cell.
     """
 
-    order: IntArray | None  # (n,) measurements sorted by group and element; None if they are
-    group: IntArray  # (n,) of each
-    first: IntArray  # (n_groups,) a measurement of each group
-    bounds: tuple[tuple[int, int], ...]  # of each group in that order
+    order: IntArray | None  # (n,) sort by group and element; None if sorted already
+    group: IntArray  # (n,) group of each measurement
+    first: IntArray  # (n_groups,) one measurement of each group
+    bounds: tuple[tuple[int, int], ...]  # slice of each group in the sorted order
     cell: int  # measurements in each cell
 
     @classmethod
-    def of(cls, touched: Sequence[IntArray], element: IntArray | None, n: int) -> _Groups:
-        """Return the groups of measurements with the elements of blocks that each touches."""
+    def of(cls, touched_elements: Sequence[IntArray], element: IntArray | None, n: int) -> _Groups:
+        """Group n measurements by the elements of the blocks that they touch."""
         key = np.zeros(n, dtype=np.intp)
-        for column in (c for part in touched for c in part.reshape(n, part.size // max(n, 1)).T):
+        for column in (
+            c for part in touched_elements for c in part.reshape(n, part.size // max(n, 1)).T
+        ):
             key = key * (int(column.max(initial=0)) + 1) + column
             if key.max(initial=0) > _MAX_KEY:
                 key = np.unique(key, return_inverse=True)[1].ravel()
@@ -266,34 +273,38 @@ class _Groups:
         if element is not None and n:
             starts = np.ones(n, dtype=np.bool_)
             starts[1:] = (np.diff(group[order]) != 0) | (np.diff(element[order]) != 0)
-            found = np.flatnonzero(starts)
-            cell = int(found[1]) if len(found) > 1 else n
-            cell = cell if np.array_equal(found, np.arange(0, n, cell)) and n % cell == 0 else 1
+            starts_of_cells = np.flatnonzero(starts)
+            cell = int(starts_of_cells[1]) if len(starts_of_cells) > 1 else n
+            cell = (
+                cell
+                if np.array_equal(starts_of_cells, np.arange(0, n, cell)) and n % cell == 0
+                else 1
+            )
         is_sorted = np.array_equal(order, np.arange(n))
         bounds = tuple(pairwise([0, *ends]))
         return cls(None if is_sorted else order, group, first, bounds, cell)
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """Which unknowns the measurements of a factor depend on, and the matrix that sums them up."""
+class Sparsity:
+    """Jacobian columns of the measurements of a factor, and the matrix that sums their products."""
 
     groups: _Groups
-    columns: IntArray  # (n_groups, m) positions in x; n_kept for what is no unknown
+    columns: IntArray  # (n_groups, m) columns in x; n_kept for fixed coordinates
     element: IntArray | None  # (n,)
     n_kept: int
     # ((n_kept + 2 + d) * n_elements, n_cells * (m + 1 + d)) adds [J, r, J_element]^T J_element of
-    # cells to rows of kept unknowns, of no unknown, of the gradient, and of elements
+    # cells to the rows of kept unknowns, of fixed coordinates, of the gradient, and of elements
     to_elements: csc_array | None
 
     @cached_property
     def index(self) -> IntArray:
-        """Positions in x of each measurement, (n, m)."""
+        """Columns in x of each measurement, (n, m)."""
         return np.asarray(self.columns[self.groups.group])
 
     @property
     def members(self) -> list[tuple[IntArray | slice, IntArray]]:
-        """The measurements of each group and its unknowns."""
+        """Measurements and columns in x of each group."""
         order = self.groups.order
         spans = [slice(start, end) for start, end in self.groups.bounds]
         return list(
@@ -301,34 +312,36 @@ class Places:
         )
 
 
-def _places(
+def _sparsity(
     groups: _Groups,
     columns: IntArray,
     element: IntArray | None,
     n_kept: int,
-    sizes: tuple[int, int],  # number of elements, and of the unknowns of each
-) -> Places:
-    """Return the places of measurements."""
+    sizes: tuple[int, int],  # number of elements and of unknowns of each
+) -> Sparsity:
+    """Build the matrix that sums the products of cells."""
     if element is None:
-        return Places(groups, columns, None, n_kept, None)
+        return Sparsity(groups, columns, None, n_kept, None)
     (n_elements, d), n_groups = sizes, len(columns)
-    of_cell = slice(None, None, groups.cell)
+    first_of_cell = slice(None, None, groups.cell)
     order = slice(None) if groups.order is None else groups.order
-    group, cell = groups.group[order][of_cell], element[order][of_cell]
-    following = np.broadcast_to(n_kept + 1 + np.arange(1 + d), (n_groups, 1 + d))
-    row = np.concatenate([columns, following], axis=1)[group] * n_elements + cell[:, None]
-    n = row.size
-    shape = ((n_kept + 2 + d) * n_elements, n)
-    added = csc_array((np.ones(n), row.ravel(), np.arange(n + 1)), shape=shape)
-    return Places(groups, columns, element, n_kept, added)
+    group, cell = groups.group[order][first_of_cell], element[order][first_of_cell]
+    element_rows = np.broadcast_to(n_kept + 1 + np.arange(1 + d), (n_groups, 1 + d))
+    target = np.concatenate([columns, element_rows], axis=1)[group] * n_elements + cell[:, None]
+    n_products = target.size
+    shape = ((n_kept + 2 + d) * n_elements, n_products)
+    summing = csc_array(
+        (np.ones(n_products), target.ravel(), np.arange(n_products + 1)), shape=shape
+    )
+    return Sparsity(groups, columns, element, n_kept, summing)
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """The motions of eliminated elements that exact constraints leave."""
+    """Tangent space of the eliminated elements under exact constraints."""
 
-    Z: Array  # (n_elements, d, f) basis with kept variables fixed, zero columns where fewer
-    Q: Array  # (n_kept, n_elements, d) motion with each kept unknown
+    Z: Array  # (n_elements, d, f) basis at fixed kept variables, padded with zero columns
+    Q: Array  # (n_kept, n_elements, d) derivative by each kept unknown
     ties: Array = field(  # (w, n_kept) directions of the kept unknowns that constraints forbid
         default_factory=lambda: np.zeros((0, 0))
     )
@@ -338,22 +351,22 @@ class Constraint(Protocol[S]):
     """Equations of eliminated elements that hold exactly."""
 
     def project(self, state: S) -> S:
-        """Return the state with every element put back; DidNotConverge where that fails."""
+        """Project every element onto its constraint; DidNotConverge where that fails."""
 
     def tangent(self, problem: Any, state: S) -> Tangent | None:
-        """Return the motions that are left; None where all elements are free."""
+        """Return the tangent space; None where all elements are free."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Where unknowns stand in x, for the variables and touches that it was made for."""
+    """Columns of the unknowns in x, for the variables and touches that it was built from."""
 
     variables: tuple[Variables, ...]
     eliminated: Variables | None
     touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...]
-    place: Mapping[str, IntArray]  # (n, d) positions in x of each kept block; n_kept for none
+    columns: Mapping[str, IntArray]  # (n, d) columns in x of each kept block; n_kept if fixed
     n_kept: int
-    places: tuple[Places, ...]
+    sparsity: tuple[Sparsity, ...]  # of each factor
 
     def is_of(
         self,
@@ -361,27 +374,27 @@ class _Layout:
         eliminated: Variables | None,
         touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...],
     ) -> bool:
-        """Say whether it was made for these very objects."""
+        """Whether the layout was built from these very objects."""
         return (
             self.eliminated is eliminated
             and len(self.variables) == len(variables)
             and len(self.touches) == len(touches)
             and all(a is b for a, b in zip(self.variables, variables, strict=True))
             and all(
-                a is b and one is other
-                for (a, one), (b, other) in zip(self.touches, touches, strict=True)
+                a is b and element is other_element
+                for (a, element), (b, other_element) in zip(self.touches, touches, strict=True)
             )
         )
 
 
-def _same_unknowns(old: _Layout, problem: Problem[Any]) -> bool:
-    """Say whether the unknowns of a problem stand where those of a layout do."""
+def _same_unknowns(layout: _Layout, problem: Problem[Any]) -> bool:
+    """Whether a problem has the unknowns of a layout, in the same columns."""
     return (
-        old.eliminated is problem.eliminated
-        and len(old.variables) == len(problem.variables)
+        layout.eliminated is problem.eliminated
+        and len(layout.variables) == len(problem.variables)
         and all(
             a is b or (a.name == b.name and np.array_equal(a.unknown, b.unknown))
-            for a, b in zip(old.variables, problem.variables, strict=True)
+            for a, b in zip(layout.variables, problem.variables, strict=True)
         )
     )
 
@@ -389,7 +402,7 @@ def _same_unknowns(old: _Layout, problem: Problem[Any]) -> bool:
 def _same_touches(
     factor: Factor[Any], touches: tuple[Touch, ...], element: IntArray | None
 ) -> bool:
-    """Say whether the measurements of a factor touch what others did."""
+    """Whether the measurements of a factor touch the same elements as before."""
     return (
         factor.element is element
         and len(factor.touches) == len(touches)
@@ -411,66 +424,70 @@ class Problem(Generic[S]):
     held_directions: Array = field(
         default_factory=lambda: np.zeros((0, 0))
     )  # (w, m <= n_kept) fixed gauge
-    name: str = "fit"  # in messages, with what to do where it fails
+    name: str = "fit"  # and the remedy where it fails, for messages
     remedy: str = "check the starting values and the measurements"
-    _layout: _Layout | None = field(default=None, repr=False)  # made here
+    _layout: _Layout | None = field(default=None, repr=False)  # built here
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_layout", self._laid_out(self._layout))
+        object.__setattr__(self, "_layout", self._make_layout(self._layout))
 
-    def _laid_out(self, old: _Layout | None) -> _Layout:
-        """Return the layout, with what is left of an old one."""
+    def _make_layout(self, old: _Layout | None) -> _Layout:
+        """Build the layout; parts of an earlier one are reused."""
         touches = tuple((factor.touches, factor.element) for factor in self.factors)
         if old is not None and old.is_of(self.variables, self.eliminated, touches):
             return old
-        same = old is not None and _same_unknowns(old, self)
-        if old is not None and same:
-            place, n_kept = old.place, old.n_kept
+        keeps_unknowns = old is not None and _same_unknowns(old, self)
+        if old is not None and keeps_unknowns:
+            columns, n_kept = old.columns, old.n_kept
         else:
             counts = [block.n_unknowns for block in self.variables]
             first = np.cumsum([0, *counts]).tolist()
             n_kept = first[-1]
-            place = {
+            columns = {
                 block.name: np.where(block.unknown < 0, n_kept, start + block.unknown)
                 for block, start in zip(self.variables, first, strict=False)
             }
-        known = [] if old is None else list(zip(old.touches, old.places, strict=True))
-        places = []
+        earlier = [] if old is None else list(zip(old.touches, old.sparsity, strict=True))
+        sparsity = []
         for factor in self.factors:
-            alike = next((p for (t, e), p in known if _same_touches(factor, t, e)), None)
-            if alike is not None and same:
-                places.append(alike)
+            reusable = next((p for (t, e), p in earlier if _same_touches(factor, t, e)), None)
+            if reusable is not None and keeps_unknowns:
+                sparsity.append(reusable)
                 continue
-            touched = [element for _, element, _ in factor.touches]
-            groups = None if alike is None else alike.groups
+            touched_elements = [element for _, element, _ in factor.touches]
+            groups = None if reusable is None else reusable.groups
             if groups is None:
-                groups = _Groups.of(touched, factor.element, factor.n)
-            parts = [place[name][e[groups.first]][..., d] for name, e, d in factor.touches]
-            flat = [part.reshape(len(part), int(np.prod(part.shape[1:]))) for part in parts]
+                groups = _Groups.of(touched_elements, factor.element, factor.n)
+            touched_columns = [
+                columns[name][e[groups.first]][..., d] for name, e, d in factor.touches
+            ]
+            flat = [
+                part.reshape(len(part), int(np.prod(part.shape[1:]))) for part in touched_columns
+            ]
             none = np.zeros((len(groups.first), 0), dtype=np.intp)
-            columns = np.concatenate([none, *flat], axis=1)
+            unknowns = np.concatenate([none, *flat], axis=1)
             sizes = self.n_elements, self.d_element
-            places.append(_places(groups, columns, factor.element, n_kept, sizes))
-        return _Layout(self.variables, self.eliminated, touches, place, n_kept, tuple(places))
+            sparsity.append(_sparsity(groups, unknowns, factor.element, n_kept, sizes))
+        return _Layout(self.variables, self.eliminated, touches, columns, n_kept, tuple(sparsity))
 
     @property
-    def _laid(self) -> _Layout:
-        return self._laid_out(None) if self._layout is None else self._layout
+    def _layout_or_new(self) -> _Layout:
+        return self._make_layout(None) if self._layout is None else self._layout
 
     @property
-    def place(self) -> Mapping[str, IntArray]:
-        """Positions in x of each kept block, (n, d); ``n_kept`` for what is no unknown."""
-        return self._laid.place
+    def columns(self) -> Mapping[str, IntArray]:
+        """Columns in x of each kept block, (n, d); ``n_kept`` for fixed coordinates."""
+        return self._layout_or_new.columns
 
     @cached_property
-    def places(self) -> Mapping[str, Places]:
-        """What the measurements of each factor depend on."""
-        return dict(zip((f.name for f in self.factors), self._laid.places, strict=True))
+    def sparsity(self) -> Mapping[str, Sparsity]:
+        """Columns of the Jacobian of each factor, by its name."""
+        return dict(zip((f.name for f in self.factors), self._layout_or_new.sparsity, strict=True))
 
     @property
     def n_kept(self) -> int:
-        """Number of unknowns that are not eliminated."""
-        return self._laid.n_kept
+        """Number of kept unknowns."""
+        return self._layout_or_new.n_kept
 
     @property
     def n_elements(self) -> int:
@@ -479,7 +496,7 @@ class Problem(Generic[S]):
 
     @property
     def d_element(self) -> int:
-        """Number of unknowns of each."""
+        """Number of unknowns of an eliminated element."""
         return 0 if self.eliminated is None else self.eliminated.unknown.shape[1]
 
     @property
@@ -489,31 +506,31 @@ class Problem(Generic[S]):
 
     @cached_property
     def named(self) -> tuple[str, ...]:
-        """Names of the first unknowns: those of blocks with labels."""
+        """Names of the leading unknowns, from the blocks with labels."""
         return tuple(label for block in self.variables for label in block.labels)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the named unknowns."""
         return tuple(unit for block in self.variables for unit in block.units)
 
     @cached_property
     def n_named(self) -> int:
-        """Number of unknowns with a name."""
+        """Number of named unknowns."""
         return len(self.named)
 
     @cached_property
     def priors(self) -> GaussianPrior:
-        """All priors, by positions in x."""
-        found, first = NO_PRIOR, 0
+        """All priors, by column in x."""
+        priors, first = NO_PRIOR, 0
         for block in self.variables:
             prior = block.prior
-            found = found + replace(prior, unknown=first + prior.unknown)
+            priors = priors + replace(prior, unknown=first + prior.unknown)
             first += block.n_unknowns
-        return found
+        return priors
 
     def where(self, name: str) -> IntArray:
-        """Return the positions in x of a block's unknowns."""
+        """Return the columns in x of a block's unknowns."""
         first = 0
         for block in self.variables:
             if block.name == name:
@@ -522,15 +539,15 @@ class Problem(Generic[S]):
         raise KeyError(name)
 
     def block(self, name: str) -> Variables:
-        """Return the kept block of a name."""
+        """Return a kept block by its name."""
         return next(block for block in self.variables if block.name == name)
 
     def factor(self, name: str) -> Factor[S]:
-        """Return the factor of a name."""
+        """Return a factor by its name."""
         return next(factor for factor in self.factors if factor.name == name)
 
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
-        """Return the problem with other blocks and factors in place of those of the same names."""
+        """Replace blocks and factors by others of the same names."""
         b, f = {block.name: block for block in blocks}, {factor.name: factor for factor in factors}
         return replace(
             self,
@@ -539,38 +556,38 @@ class Problem(Generic[S]):
         )
 
     def with_factors(self, *factors: Factor[S]) -> Self:
-        """Return the problem with other factors in place of those of the same names."""
+        """Replace factors by others of the same names."""
         return self.with_parts((), factors)
 
     def moved(self, state: S, x: Array) -> S:
-        """Return the state after a change of its unknowns, whatever constraints say."""
+        """Apply a step x of all unknowns; constraints are not enforced."""
         change = np.append(x[: self.n_kept], 0.0)
         values: dict[str, Any] = {
-            block.name: block.retract(getattr(state, block.name), change[self.place[block.name]])
+            block.name: block.retract(getattr(state, block.name), change[self.columns[block.name]])
             for block in self.variables
             if block.n_unknowns
         }
         if self.eliminated is not None:
-            own = x[self.n_kept :].reshape(-1, self.d_element)
+            element_change = x[self.n_kept :].reshape(-1, self.d_element)
             block = self.eliminated
-            values[block.name] = block.retract(getattr(state, block.name), own)
+            values[block.name] = block.retract(getattr(state, block.name), element_change)
         return replace(state, **values)  # type: ignore[type-var]
 
     def projected(self, state: S) -> S:
-        """Return the state with eliminated elements put back on their constraints."""
+        """Project the eliminated elements onto their constraints."""
         return state if self.constraint is None else self.constraint.project(state)
 
     def overshoot(self, x: Array) -> float:
-        """Return by which factor a step exceeds the largest changes that blocks allow."""
-        change, parts = np.append(x[: self.n_kept], 0.0), [0.0]
+        """Largest ratio of a step to the step limits of the blocks."""
+        change, ratios = np.append(x[: self.n_kept], 0.0), [0.0]
         for block in self.variables:
             if block.max_step and block.n_unknowns:
-                by = np.abs(change[self.place[block.name]]) / np.array(block.max_step)
-                parts.append(float(by.max(initial=0.0)))
+                ratio = np.abs(change[self.columns[block.name]]) / np.array(block.max_step)
+                ratios.append(float(ratio.max(initial=0.0)))
         if self.eliminated is not None and self.eliminated.max_step:
             moved = np.abs(x[self.n_kept :].reshape(-1, self.d_element))
-            parts.append(float((moved / np.array(self.eliminated.max_step)).max(initial=0.0)))
-        return max(parts)
+            ratios.append(float((moved / np.array(self.eliminated.max_step)).max(initial=0.0)))
+        return max(ratios)
 
     def coordinates(self, state: S) -> Array:
         """Return the values (n_named,) of the named unknowns."""
@@ -579,16 +596,16 @@ class Problem(Generic[S]):
 
     @property
     def is_read_directly(self) -> bool:
-        """Whether these values change as x does: :meth:`jacobian` is one."""
+        """Whether coordinates change as x does: :meth:`jacobian` is the identity."""
         return all(not block.labels or block.jacobian is None for block in self.variables)
 
     def jacobian(self, state: S) -> Array:
-        """Return the derivative (n_named, n_named) of these values by x."""
+        """Return the derivative (n_named, n_named) of the coordinates by x."""
         J = np.eye(self.n_named)
         for block in self.variables:
             if block.labels and block.jacobian is not None:
-                where = self.where(block.name)
-                J[np.ix_(where, where)] = block.jacobian(getattr(state, block.name))
+                unknowns = self.where(block.name)
+                J[np.ix_(unknowns, unknowns)] = block.jacobian(getattr(state, block.name))
         return J
 
 
@@ -598,16 +615,16 @@ class PriorRows(NamedTuple):
     r: Array  # (n,)
     # Derivatives by the unknowns of the block (n, n_unknowns), or by one unknown each (n,).
     slope: Array
-    unknown: IntArray  # (n,) which, in x
-    first: int  # of the block's unknowns, in x
+    unknown: IntArray  # (n,) columns in x
+    first: int  # column in x of the block's first unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Whitened residuals with derivatives of all factors and priors at a state."""
+    """Whitened residuals and derivatives of all factors and priors at a state."""
 
     rows: Mapping[str, Residuals]
-    priors: tuple[PriorRows, ...]  # of blocks that have any
+    priors: tuple[PriorRows, ...]  # of blocks with a prior
     n_kept: int
 
     def __getitem__(self, name: str) -> Residuals:
@@ -620,7 +637,7 @@ class Linearization:
 
     @property
     def prior_J(self) -> Array:
-        """Their derivatives, (n_priors, n_kept)."""
+        """Derivatives of the residuals of all priors, (n_priors, n_kept)."""
         parts = [np.zeros((0, self.n_kept))]
         for r, slope, unknown, first in self.priors:
             part = np.zeros((len(r), self.n_kept))
@@ -632,7 +649,7 @@ class Linearization:
         return np.concatenate(parts)
 
     def add_priors(self, U: Array, g: Array) -> None:
-        """Add the normal equations of all priors to sums (n_kept, n_kept) and (n_kept,)."""
+        """Add the normal equations of all priors to U (n_kept, n_kept) and g (n_kept,)."""
         for r, slope, unknown, first in self.priors:
             if slope.ndim == 1:
                 np.add.at(U, (unknown, unknown), slope * slope)
@@ -644,11 +661,11 @@ class Linearization:
 
 
 def linearize(
-    problem: Problem[S], state: S, known: Mapping[str, Residuals] | None = None
+    problem: Problem[S], state: S, computed_rows: Mapping[str, Residuals] | None = None
 ) -> Linearization:
-    """Return whitened residuals and derivatives of a problem at a state.
+    """Linearise a problem at a state.
 
-    *known* are rows of factors that were computed there already.
+    *computed_rows* are rows of factors that were computed at this state before.
     """
     priors, first = [], 0
     for block in problem.variables:
@@ -663,6 +680,6 @@ def linearize(
                 slope = prior.whitened(np.eye(size)[prior.unknown])
             priors.append(PriorRows(r, slope, first + prior.unknown, first))
         first += size
-    known = {} if known is None else known
-    rows = {f.name: known.get(f.name) or f.linearize(state) for f in problem.factors}
+    computed_rows = {} if computed_rows is None else computed_rows
+    rows = {f.name: computed_rows.get(f.name) or f.linearize(state) for f in problem.factors}
     return Linearization(rows, tuple(priors), problem.n_kept)

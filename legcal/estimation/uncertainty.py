@@ -1,6 +1,6 @@
 """Covariances, weak directions, responses and score tests of a problem.
 
-All of it follows from the normal equations at one state, eliminated elements following.
+All of them follow from the normal equations at one state, eliminated elements marginalised out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.estimation.problem import Linearization, Places, Problem, Residuals, S, linearize
+from legcal.estimation.problem import Linearization, Problem, Residuals, S, Sparsity, linearize
 from legcal.estimation.solver import (
     Minimum,
     NormalEquations,
@@ -20,18 +20,18 @@ from legcal.estimation.solver import (
 )
 from legcal.geometry.types import Array, IntArray
 
-_STIFF = 1e6  # information on what is tied, over that of measurements
-_ROUNDING = 1e-12  # of information, in differences
-_N_WORST = 3  # directions that are named
-_MIN_COMPONENT = 0.3  # components of a direction that are named, relative to the largest
+_STIFF = 1e6  # information on tied directions, over the information of measurements
+_ROUNDING = 1e-12  # relative error of differences of information
+_N_WORST = 3  # directions reported
+_MIN_COMPONENT = 0.3  # smallest reported component of a direction, over the largest
 
 
 @dataclass(frozen=True, eq=False)
 class WorstDirection:
-    """A combination of parameters that is known worst."""
+    """A combination of parameters with a large standard deviation."""
 
-    sigma: float  # standard deviation along it, in the unit of the scaled parameters
-    parts: tuple[tuple[str, float], ...]  # its largest components, as a unit vector
+    sigma: float  # standard deviation along the direction, in units of the scaled parameters
+    parts: tuple[tuple[str, float], ...]  # largest components of the unit vector
 
     def __str__(self) -> str:
         return " ".join(f"{value:+.2f} {name}" for name, value in self.parts)
@@ -40,20 +40,20 @@ class WorstDirection:
 def worst_directions(
     covariance: Array, names: tuple[str, ...], unit: Array
 ) -> tuple[WorstDirection, ...]:
-    """Return the few directions known worst, worst first; parameters count in *unit* (n,) each."""
+    """Return the directions of largest variance of parameters in units *unit* (n,), worst first."""
     variance, vector = np.linalg.eigh(covariance / unit[:, None] / unit)
-    found = []
+    directions = []
     for i in range(min(_N_WORST, len(names))):
         v = vector[:, -1 - i] * np.sign(vector[np.argmax(np.abs(vector[:, -1 - i])), -1 - i])
         order = np.argsort(-np.abs(v), kind="stable")
         named = [j for j in order if abs(v[j]) >= _MIN_COMPONENT * abs(v[order[0]])][:4]
         sigma = float(np.sqrt(max(variance[-1 - i], 0.0)))
-        found.append(WorstDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
-    return tuple(found)
+        directions.append(WorstDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
+    return tuple(directions)
 
 
 def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
-    """Return the covariance (n_named, n_named) of coordinates from that of all kept unknowns."""
+    """Return the covariance (n_named, n_named) of coordinates from that of the kept unknowns."""
     n = problem.n_named
     if problem.is_read_directly:
         return covariance[:n, :n].copy()
@@ -62,9 +62,10 @@ def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
 
 
 def named_information(problem: Problem[S], state: S, normal: NormalEquations) -> Array:
-    """Return the normal matrix (n_named, n_named) of coordinates, all else unknown.
+    """Return the information (n_named, n_named) of coordinates, other unknowns marginalised out.
 
-    What exact constraints tie counts as known a thousand times better than by measurements.
+    Directions tied by exact constraints count as known a thousand times better than by
+    measurements.
     """
     R, n = normal.reduced(), problem.n_named
     if normal.tangent is not None and len(normal.tangent.ties):
@@ -80,15 +81,15 @@ def named_information(problem: Problem[S], state: S, normal: NormalEquations) ->
 
 
 def marginal(information: Array, which: IntArray) -> Array:
-    """Return the normal matrix of some unknowns with all others unknown."""
+    """Return the information of unknowns *which*, the others marginalised out."""
     others = np.setdiff1d(np.arange(len(information)), which)
     mixed = information[np.ix_(others, which)]
     inverse = inverse_on_range(information[np.ix_(others, others)])
     return np.asarray(information[np.ix_(which, which)] - mixed.T @ inverse @ mixed)
 
 
-def _following(normal: NormalEquations) -> Array:
-    """Return how eliminated elements follow kept unknowns, (n_elements, d, n_kept)."""
+def _element_derivatives(normal: NormalEquations) -> Array:
+    """Jacobian (n_elements, d, n_kept) of elements at their minimum by the kept unknowns."""
     inside = normal.elements_by_kept
     if normal.tangent is None:
         return inside
@@ -102,45 +103,51 @@ def explained_share(
     name: str,
     covariance: Array | None = None,
 ) -> Array:
-    """Return the covariance (n, q, q) of a factor's predicted whitened residuals.
+    """Return the covariance (n, q, q) of a factor's predicted measurements, whitened.
 
-    Residuals of fitted measurements have covariance one minus this, those of others one plus this.
-    *covariance* is that of the kept unknowns, if not that of these equations.
+    Residuals of fitted measurements have the covariance 1 - C, residuals of held-out measurements
+    1 + C. *covariance* (n_kept, n_kept) of the kept unknowns is taken from *normal* by default.
     """
-    where, rows = problem.places[name], linear[name]
+    sparsity, rows = problem.sparsity[name], linear[name]
     if covariance is None:
         covariance = normal.kept_covariance()
     share = np.zeros((*rows.r.shape, rows.r.shape[1]))
-    padded = np.pad(covariance, (0, 1))  # no unknown has no variance
-    if where.element is not None:
-        following = _following(normal)
-        with_kept = (following.reshape(-1, len(covariance)) @ covariance).reshape(following.shape)
-        with_kept = np.pad(with_kept, ((0, 0), (0, 0), (0, 1)))
-        of_elements = with_kept[..., :-1] @ np.swapaxes(following, 1, 2)
+    padded = np.pad(covariance, (0, 1))  # a zero for fixed coordinates
+    if sparsity.element is not None:
+        following = _element_derivatives(normal)
+        cross_covariance = (following.reshape(-1, len(covariance)) @ covariance).reshape(
+            following.shape
+        )
+        cross_covariance = np.pad(cross_covariance, ((0, 0), (0, 0), (0, 1)))
+        element_total = cross_covariance[..., :-1] @ np.swapaxes(following, 1, 2)
         Z = None if normal.tangent is None else normal.tangent.Z
-        left = normal.V_inverse
-        of_elements += left if Z is None else Z @ left @ np.swapaxes(Z, 1, 2)
-    for member, columns in where.members:
+        element_covariance = normal.V_inverse
+        element_total += (
+            element_covariance if Z is None else Z @ element_covariance @ np.swapaxes(Z, 1, 2)
+        )
+    for member, columns in sparsity.members:
         J = np.ascontiguousarray(rows.J[member])
         k, q, m = J.shape
-        along = (J.reshape(k * q, m) @ padded[np.ix_(columns, columns)]).reshape(k, q, m)
-        if where.element is None:
-            share[member] = along @ np.swapaxes(J, 1, 2)
+        J_covariance = (J.reshape(k * q, m) @ padded[np.ix_(columns, columns)]).reshape(k, q, m)
+        if sparsity.element is None:
+            share[member] = J_covariance @ np.swapaxes(J, 1, 2)
             continue
-        element, own = where.element[member], np.ascontiguousarray(rows.J_element[member])
-        mixed = own @ with_kept[:, :, columns][element]
-        crossed = mixed @ np.swapaxes(J, 1, 2)
-        share[member] = (along + mixed) @ np.swapaxes(J, 1, 2) + np.swapaxes(crossed, 1, 2)
-        share[member] += own @ of_elements[element] @ np.swapaxes(own, 1, 2)
+        element, J_element = sparsity.element[member], np.ascontiguousarray(rows.J_element[member])
+        element_cross = J_element @ cross_covariance[:, :, columns][element]
+        crossed = element_cross @ np.swapaxes(J, 1, 2)
+        share[member] = (J_covariance + element_cross) @ np.swapaxes(J, 1, 2) + np.swapaxes(
+            crossed, 1, 2
+        )
+        share[member] += J_element @ element_total[element] @ np.swapaxes(J_element, 1, 2)
     return share
 
 
 def residual_changes(
     problem: Problem[S], linear: Linearization, block: str, error: Array
 ) -> dict[str, Array]:
-    """Return how whitened residuals (n, q) of each factor change with an error of a block's values.
+    """Return the change of whitened residuals (n, q) of each factor by an error of a block.
 
-    *error* (n, d) is of all numbers of the block, whether they are unknowns or fixed.
+    *error* (n, d) has all coordinates of the block, estimated or fixed.
     """
     changes = {}
     width = {variables.name: variables.unknown.shape[1] for variables in problem.variables}
@@ -148,11 +155,11 @@ def residual_changes(
         J, first = linear[factor.name].J, 0
         change = np.zeros(J.shape[:2])
         for name, element, numbers in factor.touches:
-            end = first + len(range(width[name])[numbers]) * int(np.prod(element.shape[1:]))
+            stop = first + len(range(width[name])[numbers]) * int(np.prod(element.shape[1:]))
             if name == block:
-                by = error[element][..., numbers].reshape(factor.n, end - first)
-                change += np.einsum("nqk,nk->nq", J[..., first:end], by)
-            first = end
+                error_of_rows = error[element][..., numbers].reshape(factor.n, stop - first)
+                change += np.einsum("nqk,nk->nq", J[..., first:stop], error_of_rows)
+            first = stop
         changes[factor.name] = change
     return changes
 
@@ -163,16 +170,16 @@ def response(
     normal: NormalEquations,
     changes: Mapping[str, Array],
 ) -> Array:
-    """Return how kept unknowns (n_kept, c) move when factors' whitened residuals do.
+    """Return the shift (n_kept, c) of the kept unknowns for c changes of whitened residuals.
 
-    *changes* has (n, q, c) for factors by name, c different changes.
+    *changes* has (n, q, c) for factors by name.
     """
     n_changes = next(iter(changes.values())).shape[-1]
     gradient = np.zeros((problem.n_kept + 1, n_changes))
     elements = np.zeros((problem.n_elements, problem.d_element, n_changes))
     for name, change in changes.items():
-        where, rows = problem.places[name], linear[name]
-        _add_products(where, rows, change, gradient, elements)
+        sparsity, rows = problem.sparsity[name], linear[name]
+        _add_products(sparsity, rows, change, gradient, elements)
     kept = gradient[:-1]
     if normal.tangent is not None:
         kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
@@ -182,23 +189,24 @@ def response(
 
 
 def _add_products(
-    where: Places, rows: Residuals, columns: Array, kept: Array, elements: Array
+    sparsity: Sparsity, rows: Residuals, columns: Array, kept: Array, elements: Array
 ) -> None:
-    """Add J^T times columns (n, q, c) of a factor to sums of (n_kept + 1, c) and of elements."""
+    """Add J^T times columns (n, q, c) of a factor to *kept* (n_kept + 1, c) and *elements*."""
     c = columns.shape[-1]
-    for member, places in where.members:
-        J = rows.J[member]
-        flat = J.reshape(J.shape[0] * J.shape[1], J.shape[2])  # of no columns, too
-        np.add.at(kept, places, flat.T @ columns[member].reshape(-1, c))
-    if where.element is not None:
-        np.add.at(elements, where.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
+    for rows_of_group, unknowns in sparsity.members:
+        J = rows.J[rows_of_group]
+        flat = J.reshape(J.shape[0] * J.shape[1], J.shape[2])  # reshape(-1) fails without columns
+        np.add.at(kept, unknowns, flat.T @ columns[rows_of_group].reshape(-1, c))
+    if sparsity.element is not None:
+        np.add.at(elements, sparsity.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
 
 
 def restricted_log_likelihood(problem: Problem[S], minimum: Minimum[S]) -> float:
-    """Return the logarithm of the likelihood of whitened residuals, all unknowns integrated out.
+    """Return the log-likelihood of whitened residuals, all unknowns integrated out.
 
-    Of a minimum of plain squares, up to a constant of the numbers of unknowns and residuals and
-    the determinants of the whitening. Priors of random effects count with their variances.
+    At a minimum of plain squares, up to the determinants of the whitening and a constant that
+    depends on the numbers of unknowns and residuals. Priors of random effects count with their
+    variances.
     """
     linear = minimum.linear
     normal = normal_equations(problem, minimum.state, linear)
@@ -208,8 +216,8 @@ def restricted_log_likelihood(problem: Problem[S], minimum: Minimum[S]) -> float
     if len(normal.held_directions):
         N = null_space(normal.held_directions)
         R = N.T @ R @ N
-    widths = np.linalg.slogdet(R)[1] + np.sum(np.linalg.slogdet(normal.V)[1])
-    return -0.5 * (squares + float(widths)) - float(np.log(problem.priors.sigma).sum())
+    log_determinants = np.linalg.slogdet(R)[1] + np.sum(np.linalg.slogdet(normal.V)[1])
+    return -0.5 * (squares + float(log_determinants)) - float(np.log(problem.priors.sigma).sum())
 
 
 def score_test(
@@ -218,43 +226,55 @@ def score_test(
     normal: NormalEquations,
     columns: Mapping[str, Array],
 ) -> tuple[Array, Array]:
-    """Return v^T M r (c,) and v^T M v (c, c), M projecting onto residuals: Rao's test of columns v.
+    """Return Rao's score v^T M r (c,) and its information v^T M v (c, c) of columns v.
 
-    *columns* has whitened columns (n, q, c) of factors by name; *normal* is of plain squares.
+    M is the projector onto the residuals of the fit. *columns* has whitened columns (n, q, c) of
+    factors by name; *normal* is of plain squares.
     """
     c = next(iter(columns.values())).shape[-1]
-    of_kept, score, left = np.zeros((problem.n_kept + 1, c)), np.zeros(c), np.zeros((c, c))
-    of_elements = np.zeros((problem.n_elements, problem.d_element, c))
+    kept_products, score, projected = (
+        np.zeros((problem.n_kept + 1, c)),
+        np.zeros(c),
+        np.zeros((c, c)),
+    )
+    element_products = np.zeros((problem.n_elements, problem.d_element, c))
     for name, v in columns.items():
-        _add_products(problem.places[name], linear[name], v, of_kept, of_elements)
+        _add_products(problem.sparsity[name], linear[name], v, kept_products, element_products)
         score += np.einsum("nqc,nq->c", v, linear[name].r)
-        left += np.einsum("nqc,nqd->cd", v, v)
-    kept = of_kept[:-1] + np.einsum("kda,kdc->ac", _following(normal), of_elements, optimize=True)
-    by_element = of_elements
+        projected += np.einsum("nqc,nqd->cd", v, v)
+    kept = kept_products[:-1] + np.einsum(
+        "kda,kdc->ac", _element_derivatives(normal), element_products, optimize=True
+    )
+    by_element = element_products
     if normal.tangent is not None:
-        by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ of_elements
-    following = normal.V_inverse @ by_element
+        by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ element_products
+    element_response = normal.V_inverse @ by_element
     elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
-    moved = normal.moved_by(kept)
-    score = score - moved.T @ g_kept - np.einsum("kpc,kp->c", following, normal.g_elements)
-    left = left - moved.T @ kept - np.einsum("kpc,kpd->cd", following, by_element)
-    return score, left
+    kept_response = normal.moved_by(kept)
+    score = (
+        score
+        - kept_response.T @ g_kept
+        - np.einsum("kpc,kp->c", element_response, normal.g_elements)
+    )
+    projected = (
+        projected - kept_response.T @ kept - np.einsum("kpc,kpd->cd", element_response, by_element)
+    )
+    return score, projected
 
 
 def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Array]:
-    """Return the scores of a block of random effects where all of them are zero.
+    """Return the scores of a block of random effects at zero effects.
 
     Parameters
     ----------
     problem : Problem
-        With the block, whose every unknown has a prior of mean zero and its own, and comes last
-        of the named.
+        Contains the block as the last named one; each of its unknowns has a prior of mean zero.
     state : S
-        Near a minimum of the problem with some of them or none; Gauss-Newton's step from there is
-        taken into account.
+        Near a minimum of the problem with some of the effects or none; the Gauss-Newton step from
+        there is taken into account.
     name : str
-        The block.
+        Name of the block.
 
     Returns
     -------
@@ -262,7 +282,7 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
         B^T M r with B the whitened effects, r the residuals without any effect and M the projector
         onto the residuals of the fit.
     K : (b, b) array
-        B^T M B: the covariance of z if all effects are zero.
+        B^T M B: the covariance of z for zero effects.
     """
     normal = normal_equations(problem, state, linearize(problem, state))
     R = normal.reduced()
@@ -271,21 +291,21 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
     effects, block = problem.where(name), problem.block(name)
     value = block.read(getattr(state, name))
     others = np.setdiff1d(np.arange(len(R)), effects)
-    of_prior = 1.0 / block.prior.sigma**2
+    prior_information = 1.0 / block.prior.sigma**2
     R_others, R_mixed = R[np.ix_(others, others)], R[np.ix_(others, effects)]
     if len(normal.held_directions):
         N = null_space(normal.held_directions[:, others])
         inverse = N @ inverse_on_range(N.T @ R_others @ N) @ N.T
     else:
         inverse = inverse_on_range(R_others)
-    every = R[np.ix_(effects, effects)] - np.diag(of_prior)
-    K = every - R_mixed.T @ inverse @ R_mixed
+    block_information = R[np.ix_(effects, effects)] - np.diag(prior_information)
+    K = block_information - R_mixed.T @ inverse @ R_mixed
     K = 0.5 * (K + K.T)
     try:
-        np.linalg.cholesky(K + _ROUNDING * np.diag(np.diagonal(every)))
+        np.linalg.cholesky(K + _ROUNDING * np.diag(np.diagonal(block_information)))
     except np.linalg.LinAlgError:
-        # A difference of what nearly cancels where measurements determine little.
+        # Cancellation where measurements determine little: project onto semidefinite matrices.
         eigenvalue, vector = np.linalg.eigh(K)
         K = (vector * np.maximum(eigenvalue, 0.0)) @ vector.T
-    left = g[effects] - of_prior * value - R_mixed.T @ inverse @ g[others]
-    return K @ value - left, K
+    block_score = g[effects] - prior_information * value - R_mixed.T @ inverse @ g[others]
+    return K @ value - block_score, K

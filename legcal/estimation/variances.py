@@ -1,18 +1,16 @@
-"""Restricted maximum likelihood: how large random effects are, by what residuals say of them.
+"""Restricted maximum likelihood of the variances of random effects.
 
-With b the effects, of which one unit has the whitened columns B, and M the projector onto what
-a fit leaves of residuals, z = B^T M r holds all that the residuals r say of them, and K = B^T
-M B. If b has the covariance D, z has K + K D K, and the logarithm of the likelihood, zero for D
-= 0, is::
+Let b be the effects, B their whitened columns, M the projector onto the residuals of a fit, and r
+the residuals: z = B^T M r is a sufficient statistic of b, and K = B^T M B. If b has the covariance
+D, z has the covariance K + K D K, and the log-likelihood, zero for D = 0, is::
 
     L = -log det(1 + K D) / 2 + z^T (1 + D K)^-1 D z / 2
 
-Its slope and its expected curvature are sums of squares of y = (1 + K D)^-1 z and of
-(1 + K D)^-1 K. At D = 0 they are Rao's score test, and the first step are moments.
+Its gradient and its expected curvature are sums of squares of y = (1 + K D)^-1 z and of
+(1 + K D)^-1 K. At D = 0 they are Rao's score test, and the first step is the method of moments.
 
-Few effects leave their variance uncertain, and a covariance with the likeliest variances in place
-of the true ones is too small on average. :func:`expected_variances` are the means of all that the
-residuals allow.
+A variance estimated from few effects is uncertain, and a covariance with the likeliest variances
+is too small on average. :func:`expected_variances` returns posterior means instead.
 """
 
 from __future__ import annotations
@@ -28,23 +26,23 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 _CONVERGED = 1e-4  # change of the log-likelihood
 _MAX_STEPS = 50
 _HALVINGS = 30
-_NODES = np.geomspace(1e-3, 1e4, 512)  # of integrals over standard deviations, in their scale
-_EXPECTED, _MAX_ROUNDS = 0.02, 10  # relative change of expected variances, and rounds over kinds
-_SEEN = 1e-9  # of the largest eigenvalue of K: effects that the residuals show at all
+_NODES = np.geomspace(1e-3, 1e4, 512)  # quadrature nodes: standard deviations over their scale
+_EXPECTED, _MAX_ROUNDS = 0.02, 10  # relative change at convergence, and rounds over kinds
+_MIN_EIGENVALUE = 1e-9  # over the largest element of K: below, an effect is invisible to residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Effects:
-    """What the residuals of a fit say of b random effects.
+    """Scores of b random effects and their covariance, from the residuals of a fit.
 
     Attributes
     ----------
     z : (b,) array
-        Their scores where all of them are zero, the fit following.
+        Scores at zero effects, nuisance parameters of the fit projected out.
     K : (b, b) array
-        Covariance of the scores if all of them are zero.
+        Covariance of the scores for zero effects.
     kind : (b,) array of int
-        Effects of one kind have one variance.
+        Kind of each effect; effects of a kind have one variance.
     """
 
     z: Array
@@ -57,62 +55,64 @@ class Effects:
         return int(self.kind.max(initial=-1)) + 1
 
     def log_likelihood(self, variances: Array) -> float:
-        """Return the logarithm of the likelihood of variances (n_kinds,), 0 for none."""
-        return self.at(variances).log_likelihood
+        """Return the log-likelihood of variances (n_kinds,), 0 for zero variances."""
+        return self.with_variances(variances).log_likelihood
 
     def slope(self, variances: Array) -> tuple[Array, Array]:
         """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
-        return self.at(variances).slope()
+        return self.with_variances(variances).slope()
 
-    def at(self, variances: Array) -> EffectsAt:
-        """Return the effects at variances, L L^T = 1 + D^(1/2) K D^(1/2) of those that have one."""
-        some = np.flatnonzero(variances[self.kind] > 0.0)
-        root = np.asarray(np.sqrt(variances[self.kind[some]]))
-        spread = root[:, None] * self.K[np.ix_(some, some)] * root
-        L = np.asarray(np.linalg.cholesky(np.eye(len(some)) + spread), dtype=np.float64)
-        y = solve_triangular(L, root * self.z[some], lower=True, check_finite=False)
-        return EffectsAt(self, some, root, L, y)
+    def with_variances(self, variances: Array) -> EffectsWithVariances:
+        """Factor L L^T = 1 + D^(1/2) K D^(1/2) over the effects of positive variance."""
+        active = np.flatnonzero(variances[self.kind] > 0.0)
+        root = np.asarray(np.sqrt(variances[self.kind[active]]))
+        spread = root[:, None] * self.K[np.ix_(active, active)] * root
+        L = np.asarray(np.linalg.cholesky(np.eye(len(active)) + spread), dtype=np.float64)
+        y = solve_triangular(L, root * self.z[active], lower=True, check_finite=False)
+        return EffectsWithVariances(self, active, root, L, y)
 
 
 @dataclass(frozen=True, eq=False)
-class EffectsAt:
-    """Random effects at some variances."""
+class EffectsWithVariances:
+    """Random effects with given variances, and the Cholesky factor of their covariance."""
 
     effects: Effects
-    some: IntArray  # (s,) with a variance
-    root: Array  # (s,) of it
+    active: IntArray  # (s,) effects of positive variance
+    root: Array  # (s,) standard deviations
     L: Array  # (s, s)
     y: Array  # (s,) L^-1 D^(1/2) z
 
     @property
     def log_likelihood(self) -> float:
-        """The logarithm of their likelihood."""
+        """Log-likelihood of the variances."""
         return float(0.5 * self.y @ self.y - np.log(np.diagonal(self.L)).sum())
 
     def slope(self) -> tuple[Array, Array]:
         """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
         effects = self.effects
-        seen = self.root[:, None] * effects.K[self.some]
-        seen = solve_triangular(self.L, seen, lower=True, check_finite=False)
-        left, y = effects.K - seen.T @ seen, effects.z - seen.T @ self.y
-        of_kind = (effects.kind == np.arange(effects.n_kinds)[:, None]).astype(np.float64)
-        slope = 0.5 * of_kind @ (y**2 - np.diagonal(left))
-        return slope, np.asarray(0.5 * of_kind @ np.square(left, out=left) @ of_kind.T)
+        projected = self.root[:, None] * effects.K[self.active]
+        projected = solve_triangular(self.L, projected, lower=True, check_finite=False)
+        conditional, y = effects.K - projected.T @ projected, effects.z - projected.T @ self.y
+        membership = (effects.kind == np.arange(effects.n_kinds)[:, None]).astype(np.float64)
+        slope = 0.5 * membership @ (y**2 - np.diagonal(conditional))
+        return slope, np.asarray(
+            0.5 * membership @ np.square(conditional, out=conditional) @ membership.T
+        )
 
 
 def estimate_variances(
     effects: Effects, least_gain: float, start: Array | None = None
 ) -> tuple[Array, float]:
-    """Return the variances of random effects by restricted maximum likelihood.
+    """Estimate the variances of random effects by restricted maximum likelihood.
 
     Parameters
     ----------
     effects : Effects
     least_gain : float
-        Twice the log-likelihood that the variances must gain over no effects at all; with less,
-        all of them are zero.
+        Twice the log-likelihood that the variances must gain over zero variances; with less, all
+        of them are zero.
     start : (n_kinds,) array, optional
-        Variances nearby; none at all without it, or where it is less likely.
+        Starting values; zeros by default, and where these are less likely than zeros.
 
     Returns
     -------
@@ -122,23 +122,23 @@ def estimate_variances(
         Twice the log-likelihood gained.
     """
     variances = np.zeros(effects.n_kinds)
-    best = effects.at(variances)
+    best = effects.with_variances(variances)
     if start is not None and start.any():
-        near = _at(effects, start)
-        if near is not None and near.log_likelihood > best.log_likelihood:
-            variances, best = start, near
+        started = _with_variances(effects, start)
+        if started is not None and started.log_likelihood > best.log_likelihood:
+            variances, best = start, started
     for _ in range(_MAX_STEPS):
         slope, information = best.slope()
         step = _step(slope, information, variances > 0.0)
         before = best
         for halving in range(_HALVINGS):
             trial = np.maximum(variances + 0.5**halving * step, 0.0)
-            there = _at(effects, trial)
-            if there is not None and there.log_likelihood >= best.log_likelihood:
-                variances, best = trial, there
+            candidate = _with_variances(effects, trial)
+            if candidate is not None and candidate.log_likelihood >= best.log_likelihood:
+                variances, best = trial, candidate
                 break
         gained = best.log_likelihood - before.log_likelihood
-        # Even steps like this to the end would not gain enough.
+        # As many more steps of this size would not reach the required gain.
         hopeless = gained < least_gain / (8.0 * _MAX_STEPS)
         if gained < _CONVERGED or (hopeless and best.log_likelihood < 0.25 * least_gain):
             break
@@ -147,20 +147,20 @@ def estimate_variances(
 
 
 def expected_variances(effects: Effects, variances: Array, kinds: Sequence[int]) -> Array:
-    """Return the variances of some kinds of random effects that are expected, given residuals.
+    """Return the posterior means of the variances of some kinds of random effects.
 
-    Each is the mean over its distribution given the others, in turn until they agree. Before the
-    residuals are seen a standard deviation s has the density 1 / (1 + (s / s0)^2), with s0 as small
-    as the residuals show a typical effect of its kind: even below that, and with a mean for any
-    number of effects from two on.
+    Each is the mean over its posterior given the others, in turn until convergence. The prior
+    density of a standard deviation s is half-Cauchy, 1 / (1 + (s / s0)^2), with s0 the smallest
+    typical effect of its kind that residuals resolve: nearly flat below s0, and with a finite mean
+    from two effects on.
 
     Parameters
     ----------
     effects : Effects
     variances : (n_kinds,) array
-        Nearby, such as the likeliest ones; those of other kinds are known.
+        Starting values, such as the likeliest ones; the variances of other kinds stay.
     kinds : sequence of int
-        Those to estimate; one that residuals do not show keeps its variance.
+        Kinds to estimate; a kind invisible to the residuals keeps its variance.
 
     Returns
     -------
@@ -172,43 +172,49 @@ def expected_variances(effects: Effects, variances: Array, kinds: Sequence[int])
     Half-Cauchy distributions of standard deviations: A. Gelman, Prior distributions for variance
     parameters in hierarchical models, Bayesian Analysis 1 (2006).
     """
-    found = variances.copy()
-    beforehand = _NODES / (1.0 + _NODES**2)  # by the logarithm
+    expected = variances.copy()
+    prior = _NODES / (1.0 + _NODES**2)  # per unit of log s
     for _ in range(_MAX_ROUNDS):
-        before = found.copy()
+        before = expected.copy()
         for kind in kinds:
-            own = effects.kind == kind
-            others = _at(effects, np.where(np.arange(len(found)) == kind, 0.0, found))
+            of_kind = effects.kind == kind
+            others = _with_variances(
+                effects, np.where(np.arange(len(expected)) == kind, 0.0, expected)
+            )
             if others is None:
                 return before
-            seen = others.root[:, None] * effects.K[np.ix_(others.some, own)]
-            seen = solve_triangular(others.L, seen, lower=True, check_finite=False)
-            eigenvalues, vectors = np.linalg.eigh(effects.K[np.ix_(own, own)] - seen.T @ seen)
-            known = eigenvalues > _SEEN * np.abs(effects.K).max()
-            if np.count_nonzero(known) < 2:
+            projected = others.root[:, None] * effects.K[np.ix_(others.active, of_kind)]
+            projected = solve_triangular(others.L, projected, lower=True, check_finite=False)
+            eigenvalues, vectors = np.linalg.eigh(
+                effects.K[np.ix_(of_kind, of_kind)] - projected.T @ projected
+            )
+            visible = eigenvalues > _MIN_EIGENVALUE * np.abs(effects.K).max()
+            if np.count_nonzero(visible) < 2:
                 continue
-            k = eigenvalues[known, None]
-            squares = (vectors[:, known].T @ (effects.z[own] - seen.T @ others.y))[:, None] ** 2
+            k = eigenvalues[visible, None]
+            squares = (vectors[:, visible].T @ (effects.z[of_kind] - projected.T @ others.y))[
+                :, None
+            ] ** 2
             v = _NODES**2 / k.mean()
             spread = 1.0 + k * v
             likelihood = 0.5 * np.sum(squares * v / spread - np.log(spread), axis=0)
-            weight = beforehand * np.exp(likelihood - likelihood.max())
-            found[kind] = weight @ v / weight.sum()
-        if np.all(np.abs(found - before) <= _EXPECTED * found.max()):
+            weight = prior * np.exp(likelihood - likelihood.max())
+            expected[kind] = weight @ v / weight.sum()
+        if np.all(np.abs(expected - before) <= _EXPECTED * expected.max()):
             break
-    return found
+    return expected
 
 
-def _at(effects: Effects, variances: Array) -> EffectsAt | None:
-    """Return the effects at variances, None at such that the rounding of K exceeds one."""
+def _with_variances(effects: Effects, variances: Array) -> EffectsWithVariances | None:
+    """Factor the effects; None where rounding of K makes the matrix indefinite."""
     try:
-        return effects.at(variances)
+        return effects.with_variances(variances)
     except np.linalg.LinAlgError:
         return None
 
 
 def _step(slope: Array, information: Array, inside: BoolArray) -> Array:
-    """Return the scoring step of the variances that may move: not from zero downwards."""
+    """Fisher scoring step of the variances inside their bounds: none goes from zero downwards."""
     free = np.flatnonzero((inside | (slope > 0.0)) & (np.diagonal(information) > 0.0))
     step = np.zeros_like(slope)
     if len(free):

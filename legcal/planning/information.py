@@ -212,7 +212,7 @@ class Predictor:
         for factor in problem.factors:
             if not factor.n or factor.element is None:
                 continue
-            found, where = linear[factor.name], problem.places[factor.name]
+            found, where = linear[factor.name], problem.sparsity[factor.name]
             q = found.r.shape[1]
             J = np.zeros((factor.n, q, problem.n_kept + 1))
             at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]

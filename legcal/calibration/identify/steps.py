@@ -18,7 +18,7 @@ from legcal.calibration.identify.predicted_observations import (
     at_base_joints,
     at_platform_joints,
 )
-from legcal.estimation.square_root import compress, eliminate, grouped
+from legcal.estimation.square_root import compress, eliminate, stack_by_group
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, ActuatorKind
@@ -141,7 +141,7 @@ def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[
             )
         row[:, :6] = _by_camera(predicted, j, F)
         row[:, 6:] = F @ _unknowns_by_parameters(predicted, j)
-    return columns, grouped(rows, pairs[:, 0], predicted.n_frames)
+    return columns, stack_by_group(rows, pairs[:, 0], predicted.n_frames)
 
 
 def _unknowns_by_parameters(predicted: PredictedObservations, j: int) -> Array:
@@ -217,7 +217,7 @@ def offsets_from_distances(
     _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
     pair = pair.ravel()
     own = np.concatenate([weight[:, None], rows], axis=1)
-    laid = grouped(own[:, None], pair, int(pair.max(initial=-1)) + 1)
+    laid = stack_by_group(own[:, None], pair, int(pair.max(initial=-1)) + 1)
     return StepInformation("offsets", columns, eliminate(laid, 1))
 
 
@@ -249,7 +249,7 @@ def identify_platform(
     rows = np.concatenate([equations.by_pose, equations.by_parameters], axis=2)[groups.pose]
     wanted = _step_4_equations(equations, groups)
     rows = np.concatenate(
-        [rows * wanted[..., None], grouped(seen, groups.of_image, len(groups.pose))], axis=1
+        [rows * wanted[..., None], stack_by_group(seen, groups.of_image, len(groups.pose))], axis=1
     )
     ties = predicted.ties[:, columns] / predicted.sigma_exact
     found = np.concatenate([eliminate(rows[:, :, keep], n_f), ties])

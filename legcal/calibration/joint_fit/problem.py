@@ -535,7 +535,7 @@ def _intrinsics(
         if known is not None and at:
             numbers = np.array([len(names) + free.index(k) for k in at], dtype=np.intp)
             covariance = known.covariance[np.ix_(at, at)]
-            prior += GaussianPrior.of_covariance(numbers, known.mean[at], covariance)
+            prior += GaussianPrior.from_covariance(numbers, known.mean[at], covariance)
         names += [own[k] for k in free]
     numbers_of = [ParameterId.parse(name) for name in names]
     keys = tuple(dict.fromkeys(number.kind for number in numbers_of))

@@ -152,7 +152,7 @@ def first_minimum(
         max_iterations=problem.settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
-        known=known if chosen.all() and not is_rough else None,
+        computed_rows=known if chosen.all() and not is_rough else None,
         must_converge=must_converge,
     )
     there = of_determined_poses(claimed, found.state, every)
@@ -190,7 +190,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
         scores = _scores_of_biases(fit, possible)
         fit = fit.with_edge_biases(expected_biases(possible, *scores, fit.edge_biases, least))
         known = None
-    fit = replace(fit, minimum=_solved(fit.problem, fit.minimum, known=known))
+    fit = replace(fit, minimum=_solved(fit.problem, fit.minimum, computed_rows=known))
     _refuse_disagreement(fit)
     _refuse_wrong_axes(fit)
     return replace(

@@ -73,7 +73,7 @@ def sensitivities(
     }
     if contradicted:
         errors[FOUND_CAMERA] = of_cameras, np.sum([one.error for one in contradicted], axis=0)
-    errors["radii 1 % larger"] = problem.place["radii"], _RADIUS_PART * radii[:, None]
+    errors["radii 1 % larger"] = problem.columns["radii"], _RADIUS_PART * radii[:, None]
     names, changes, pulls = list[str](), list[dict[str, Array]](), list[Array]()
     for what, (place, error) in errors.items():
         of_prior = np.zeros(problem.n_kept + 1)
@@ -120,7 +120,7 @@ def _places_of_cameras(problem: FitProblem) -> IntArray:
     place = np.full((len(problem.outlines.views), len(_KEYS)), problem.n_kept, dtype=np.intp)
     for k, key in enumerate(_KEYS):
         if key in problem.keys:
-            place[:, k] = problem.place["cameras"][:, problem.keys.index(key)]
+            place[:, k] = problem.columns["cameras"][:, problem.keys.index(key)]
     return place
 
 

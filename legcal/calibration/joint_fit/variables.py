@@ -542,7 +542,7 @@ class LegConstraints:
         inverse = np.zeros((n_poses, d, len(rows.leg)))
         inverse[:, free] = scale[:, None] * np.linalg.pinv(slopes, rcond=_RANK)
         for i, leg in enumerate(rows.leg):
-            place = problem.place["legs"][leg]
+            place = problem.columns["legs"][leg]
             by_local = rows.by_local[:, i]
             if place[LegColumns.TWIST] == n_kept:
                 slope = tied_twist_slope(state.legs[leg], self.legs.nominal[leg])
