@@ -25,7 +25,7 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_resul
 from legcal.calibration.board import BoardViews, base_of_board, board_notes
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
-from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA, Sensitivity
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, Sensitivity
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
@@ -200,7 +200,7 @@ def test_a_contradicted_camera_counts_in_the_verdict(
     assert _judged(planar[1]).verdict.trustworthy
     every = planar[1].solution.sensitivities
     focal = next(s for s in every if "focal" in s.what)
-    wrong = Sensitivity(FOUND_CAMERA, 1e3 * focal.steps)
+    wrong = Sensitivity(FITTED_CAMERA, 1e3 * focal.steps)
     assert not _judged(planar[1], sensitivities=(*every, wrong)).verdict.trustworthy
 
 
@@ -305,7 +305,7 @@ def test_axes_with_too_small_sigmas_and_of_other_legs_are_found(
 
     folder = Path(shutil.copytree(axes[0].folder, tmp_path / "small"))
     _change(folder / "axes.csv", lambda rows: [shrunk(row) for row in rows])
-    note = next(note for note in calibrate(folder).notes if "worse than their standard" in note)
+    note = next(note for note in calibrate(folder).notes if "larger than their standard" in note)
     assert re.search(r"is about [345]\.", note)
     other = Path(shutil.copytree(axes[0].folder, tmp_path / "other"))
     names = {f"leg{j}": f"leg{j % 6 + 1}" for j in range(1, 7)}

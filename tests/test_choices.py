@@ -63,7 +63,7 @@ def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
     rod = choose(["leg2.base:leg2.platform=400±0.05mm"], parameters=delta)
     assert rod.priors == {"leg2.length": Prior(0.4, 5e-5)}
     for name in ("leg1.base:leg3.platform", "leg1.base:nothing", "leg1.base:leg1.base"):
-        with pytest.raises(UsageError, match=r"The length .* needed LEG\.base:LEG\.base"):
+        with pytest.raises(UsageError, match=r"The length .* write LEG\.base:LEG\.base"):
             choose([f"{name}=550±0.05mm"], parameters=delta)
     with pytest.raises(UsageError, match="check the number and its unit"):
         choose(["leg1.base:leg3.base=550±0.05m"], parameters=delta)
@@ -146,7 +146,7 @@ def test_overrides_of_a_call_win_over_the_dataset() -> None:
     assert found.free == {"c1.fx"}
     assert found.priors == {"leg2.offset": Prior(0.35, 0.001)}
     assert found.notes == (
-        "What the dataset says of leg1.offset, leg2.offset gave way to what this run asks for.",
+        "This run overrides the choices of the dataset for leg1.offset, leg2.offset.",
     )
 
 
@@ -246,7 +246,7 @@ def test_problems_are_refused_as_those_of_their_source() -> None:
 def test_a_machine_of_which_all_is_fixed_is_refused() -> None:
     parameters = known("3-upu-tilted")
     names = [name for name, p in parameters.by_name.items() if p.kind == "kinematic"]
-    with pytest.raises(UsageError, match="all of its parameters fixed"):
+    with pytest.raises(UsageError, match="all of its parameters are fixed"):
         choose(fixed=names, parameters=parameters)
     assert choose(fixed=names[1:], parameters=parameters).fixed == set(names[1:])
 

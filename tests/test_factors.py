@@ -466,7 +466,7 @@ def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> No
     problem = build_fit(session.legs, session.measurements, session.outlines)
     far = 0.3 * np.random.default_rng(13).normal(size=problem.size)
     far[problem.n_kinematic : problem.n_kept] = 0.0
-    with pytest.raises(DidNotConverge, match=r"a pose that still moves by \d"):
+    with pytest.raises(DidNotConverge, match=r"a pose did not converge \(last step \d"):
         problem.projected(problem.moved(problem.begin(session.start), far))
 
 

@@ -19,7 +19,7 @@ from fit_sessions import (
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
-from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.machine.parameters import moved_legs
@@ -213,7 +213,7 @@ def test_a_right_focal_length_is_left_alone() -> None:
     for seed in range(4):
         solution = fitted(session, seed, 1.0)
         assert notes_on_focal_lengths(solution) == []
-        assert not [s for s in solution.sensitivities if s.what == FOUND_CAMERA]
+        assert not [s for s in solution.sensitivities if s.what == FITTED_CAMERA]
 
 
 def test_nothing_is_said_where_the_noise_hides_it() -> None:
@@ -231,8 +231,8 @@ def test_a_focal_length_that_is_estimated_is_not_tested() -> None:
 @pytest.mark.parametrize(
     ("camera", "wrong", "start", "words"),
     [
-        (LENS, {"k1": 0.0}, "The distortion of c1", "had not been corrected"),
-        (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been corrected"),
+        (LENS, {"k1": 0.0}, "The distortion of c1", "had not been removed"),
+        (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been removed"),
         (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
         (LENS, {"cx": 524.0, "cy": 394.0}, "The principal point of c1", "given (524.0, 394.0) px"),
     ],
@@ -247,7 +247,7 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     assert note.startswith(start)
     assert words in note
     assert solution.camera_doubts.views == ("c1",)
-    (effect,) = (s for s in solution.sensitivities if s.what == FOUND_CAMERA)
+    (effect,) = (s for s in solution.sensitivities if s.what == FITTED_CAMERA)
     right = fitted(session, 0, 1.0)
     assert not [note for note in right.notes if "does not agree" in note]
     assert right.camera_doubts.views == ()

@@ -13,7 +13,7 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import SCALE
-from legcal.calibration.joint_fit.sensitivity import FOUND_CAMERA
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.result import Calibration, Verdict
 from legcal.data.corners import Corners
@@ -134,7 +134,7 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
         f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
         "(1 sigma)"
     )
-    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == FOUND_CAMERA]
+    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == FITTED_CAMERA]
     effect = max(of_cameras, default=0.0)
     if effect > 0.0:
         found += f"; a camera file that the measurements contradict may add {1e3 * effect:.3f} mm"

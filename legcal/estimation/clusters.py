@@ -142,7 +142,7 @@ def clustered(
         r, J = rows.r, rows.J
         if factor.robust and np.isfinite(loss.width):
             r, J = loss.softened(r, J)
-        index = problem.places[factor.name].index
+        index = problem.sparsity[factor.name].index
         np.add.at(score, (element[:, None], index), np.einsum("nqk,nq->nk", J, r))
         cells = element[:, None, None], index[:, :, None], index[:, None, :]
         np.add.at(U, cells, np.swapaxes(J, 1, 2) @ J)

@@ -28,7 +28,7 @@ class Loss(Protocol):
         """Return the total loss of measurements with squared norms s (n,)."""
 
     def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
-        """Return rows (n, q), (n, q, l) whose squares have the gradient and curvature of the loss."""
+        """Return rows (n, q), (n, q, l) whose squares have the loss's gradient and curvature."""
 
     def efficiency(self, m: int) -> float:
         """Return the efficiency of the M-estimator for m Gaussian residuals."""

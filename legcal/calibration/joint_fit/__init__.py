@@ -1,9 +1,9 @@
 """The joint fit of a machine: all outlines (or axes), readings and corners of a board at once.
 
 The client of :mod:`legcal.estimation` for legs and images. In: :class:`FittedLegs`, measurements,
-outlines or axes, a :class:`Start`, :class:`Choices`; out: a :class:`Solution`. :func:`refine` reads
-as the method: a first minimum with a wide loss, open directions held at nominal or refused, rounds
-that reject outlines and estimate their noise, checks of the result, its assembly.
+outlines or axes, a :class:`Start`, :class:`Choices`; out: a :class:`Solution`. :func:`refine` is
+the method from top to bottom: a first minimum with a wide loss, unobservable directions held at
+nominal or refused, rounds of outlier rejection and noise estimation, checks, the result.
 
 ===================== ==================================================================
 ``parameter_choices`` which parameters are estimated, fixed or have a prior
@@ -12,18 +12,18 @@ that reject outlines and estimate their noise, checks of the result, its assembl
 ``outline_errors``    noise of outlines, common-mode edge biases, gammas of cameras
 ``gammas``            fits to outlines measured with several gammas, compared
 ``problem``           variables and factors of a fit
-``fit``               the order of all of it
-``determinacy``       open directions: refused, or held at nominal
+``fit``               the whole fit, step by step
+``determinacy``       unobservable directions: refused, or held at nominal
 ``rounds``            rejection of outliers and estimation of noise
-``outlier_readings``  wrong readings of redundant motors: found and left out
+``outlier_readings``  wrong readings of redundant motors: detected and rejected
 ``diagnostics``       stated priors and fixed values against the measurements
-``scale``             what says how large a machine is: a measured length, or radii alone
-``sensitivity``       errors of what counts as known; focal lengths tested
-``held_out``          what a fit predicts of images that were not fitted
-``platform``          what a fit means at the platform
+``scale``             the source of the absolute scale: a measured length, or radii alone
+``sensitivity``       effect of errors of fixed quantities; score tests of cameras
+``held_out``          prediction errors in held-out images
+``platform``          accuracy at the platform
 ``solution``          the result
 ===================== ==================================================================
 
-Another kind of measurement is a class with a ``factor`` in ``factors`` and a line in its registry
-``Observed``; what it depends on besides is a field of ``State`` and a block in ``problem``.
+To add a kind of measurement: a class with a ``factor`` in ``factors``, a field of ``Observed``,
+and for each new variable a field of ``State`` and a block in ``problem``.
 """

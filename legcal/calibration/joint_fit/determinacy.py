@@ -1,8 +1,8 @@
-"""Open directions: refused where they matter, held at nominal where the platform stays.
+"""Unobservable directions: held at nominal if the platform hardly moves with them, else refused.
 
-Directions are held where they hardly move the platform, by up to a hundredth of their own change.
-The nominal model is assumed as wrong along them as elsewhere, by the root mean square of the
-changes that the fit found, of lengths and of angles apart.
+A direction is held if it moves the platform by at most a hundredth of its own change. The error of
+the nominal model along held directions is taken to be as large as elsewhere: the root mean square
+of the changes in the fit, separately for lengths and angles.
 """
 
 from __future__ import annotations
@@ -22,34 +22,36 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity
 
-_MAX_SIGMA = 0.1  # of the mean leg length
-_HELD_SIGMA = 0.01  # of it, where the platform does not move
-_HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
-_MAX_OTHERS = 0.05  # of a direction that is not kinematic: more, and it is not a matter of the legs
+_MAX_SIGMA = 0.1  # mean leg lengths: above, a direction is open
+_HELD_SIGMA = 0.01  # mean leg lengths: the same where the platform does not move
+_HARMLESS = 0.01  # motion of the platform over the change of parameters, below which it is ignored
+_MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"
-_MIN_SPREAD = 2.5e-12  # mean leg lengths: a spread that counts as none
+_MIN_SPREAD = 2.5e-12  # mean leg lengths: floor of the error of the nominal model
 
 
 @dataclass(frozen=True, eq=False)
 class HeldDirections:
-    """Directions of the parameters that are open and do not move the platform."""
+    """Open directions that do not move the platform and are held at nominal."""
 
-    basis: Array  # (w, n_named) in the values of named unknowns, each over its unit, orthonormal
-    unit: Array  # (n_named,) a metre of each in its own unit
+    basis: Array  # (w, n_named) orthonormal, in named unknowns over their unit
+    unit: Array  # (n_named,) equivalent of a metre in the unit of each
     directions: tuple[str, ...] = ()  # in words
-    names: tuple[str, ...] = ()  # parameters that a slightly wrong nominal model would move
+    names: tuple[
+        str, ...
+    ] = ()  # parameters that depend on the nominal model along these directions
 
 
 def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
-    *problem* holds nothing yet; *normal* is its information at the state. Intrinsics that are known
-    with the covariance of a camera file are none of the parameters that may be open.
+    *problem* has no held directions yet; *normal* is its information at the state. Intrinsics with
+    the covariance of a camera file are not tested.
 
     Raises
     ------
     NotIdentifiable
-        If an open direction moves the platform, or belongs to a camera or a radius.
+        If an open direction moves the platform, or includes a camera or a radius.
     """
     every_unit, length = named_units(problem, state), state.mean_length
     judged = np.setdiff1d(np.arange(problem.n_named), problem.calibrated)
@@ -57,32 +59,36 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     information = marginal(named_information(problem, state, normal), judged)
     unseen = [name for name, row in zip(names, information, strict=True) if not np.any(row)]
     scaled = unit[:, None] * information * unit
-    value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    basis = vector[:, _are_open(value, vector, length)].T
-    poor = vector[:, value * (_HELD_SIGMA * length) ** 2 < 1.0].T
-    if len(poor) == 0:
+    eigenvalue, eigenvector = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    basis = eigenvector[:, _are_open(eigenvalue, eigenvector, length)].T
+    weak_basis = eigenvector[:, eigenvalue * (_HELD_SIGMA * length) ** 2 < 1.0].T
+    if len(weak_basis) == 0:
         return HeldDirections(np.zeros((0, problem.n_named)), every_unit)
-    others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2)
-    if len(others):
-        basis = basis[others]
+    not_kinematic = np.flatnonzero(
+        (basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2
+    )
+    if len(not_kinematic):
+        basis = basis[not_kinematic]
     else:
         motion = _motion(problem, state, unit)
         basis, _ = split_by_motion(motion, basis, length, _HARMLESS)
-        _, harmless = split_by_motion(motion, poor, length, _HARMLESS)
+        _, harmless = split_by_motion(motion, weak_basis, length, _HARMLESS)
     if len(basis) and unseen:
         raise NotIdentifiable(
             f"The fit is not determined: no measurement depends on {', '.join(unseen)}; every leg "
             "needs readings or outlines; add images that show it."
         )
     if len(basis):
-        words = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
+        description = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
         raise NotIdentifiable(
-            f"The fit is not determined: found {len(basis)} of {len(names)} directions of the "
-            f"parameters that the measurements leave open and that matter, {words}, "
-            f"needed all to a tenth of a leg; {_REMEDY}, or state what is known with a prior."
+            f"The fit is not determined: the measurements do not fix {len(basis)} of {len(names)} "
+            f"directions of the parameters to a tenth of a leg length: {description}; {_REMEDY}, "
+            "or state known values with a prior."
         )
     weak: tuple[str, ...] = ()
-    if len(harmless):  # what nominal models that are a hundredth of a leg wrong move beyond sigma
+    if len(
+        harmless
+    ):  # moved by more than sigma if the nominal model is off by a hundredth of a leg
         N = null_space(harmless)
         sigma = np.sqrt(np.diagonal(N @ inverse_on_range(N.T @ scaled @ N) @ N.T))
         is_weak = _HELD_SIGMA * length * np.linalg.norm(harmless, axis=0) > sigma
@@ -98,42 +104,42 @@ def refuse_undetermined_inliers(
     state: State,
     normal: NormalEquations,
     held: HeldDirections,
-    accepted: BoolArray,  # which outlines agree with the fit
+    accepted: BoolArray,  # inlier outlines
 ) -> None:
-    """Refuse a fit that leaves more open than was held before outlines were rejected.
+    """Refuse a fit with open directions besides the held ones, after outlier rejection.
 
     Raises
     ------
     NotIdentifiable
-        With one of the directions.
+        Naming one of the directions.
     """
-    known = np.concatenate([problem.where("biases"), problem.calibrated])
-    kept = np.setdiff1d(np.arange(problem.n_named), known)
+    excluded = np.concatenate([problem.where("biases"), problem.calibrated])
+    kept = np.setdiff1d(np.arange(problem.n_named), excluded)
     unit, basis = held.unit[kept], held.basis[:, kept]
     scaled = unit[:, None] * marginal(named_information(problem, state, normal), kept) * unit
     N = null_space(basis) if len(basis) else np.eye(len(kept))
-    value, vector = np.linalg.eigh(N.T @ scaled @ N)
-    vector = N @ vector
-    if len(opened := np.flatnonzero(_are_open(value, vector, state.mean_length))):
+    eigenvalue, eigenvector = np.linalg.eigh(N.T @ scaled @ N)
+    eigenvector = N @ eigenvector
+    if len(is_open := np.flatnonzero(_are_open(eigenvalue, eigenvector, state.mean_length))):
         names = [problem.named[i] for i in kept]
-        words = _in_words(names, vector[:, opened[0]], problem.legs.names)
+        description = _in_words(names, eigenvector[:, is_open[0]], problem.legs.names)
         if accepted.all():
             raise NotIdentifiable(
-                f"The fit is not determined: found that its measurements leave {words} open where "
-                f"it ends, needed all to a tenth of a leg; {_REMEDY}, or state what is known with "
-                "a prior."
+                "The fit is not determined: at its minimum, the measurements do not fix "
+                f"{description} to a tenth of a leg length; {_REMEDY}, or state known values "
+                "with a prior."
             )
         raise NotIdentifiable(
-            f"The fit is not determined: found that the outlines which agree with it leave {words} "
-            "open, needed what the rejected ones showed; correct these, or add images."
+            "The fit is not determined: without the rejected outlines, the measurements do not fix "
+            f"{description}; correct the rejected outlines, or add images."
         )
 
 
 def _are_open(information: Array, direction: Array, length: float) -> BoolArray:
-    """Say which directions (n, k) leave one of the parameters open by a tenth of a leg.
+    """Which unit directions (n, k) leave a parameter uncertain by more than a tenth of a leg.
 
-    *information* (k,) is that of each, which has unit length. A scale that is known to a per cent
-    or two moves many parameters, each of them little.
+    *information* (k,) is along each. The test is by single parameters: a scale known to a per cent
+    or two moves many of them, each by little.
     """
     most = _MAX_SIGMA * length / np.abs(direction).max(axis=0)
     return np.asarray(information * most**2 < 1.0)
@@ -142,26 +148,26 @@ def _are_open(information: Array, direction: Array, length: float) -> BoolArray:
 def held_at_nominal(
     problem: FitProblem, state: State, held: HeldDirections
 ) -> tuple[FitProblem, State]:
-    """Return the problem with these directions held, and the state with them at nominal."""
+    """Hold directions in the problem, and set the state to nominal along them."""
     legs, free, n = problem.legs, problem.free, problem.n_kinematic
     rows = (held.basis / held.unit) @ problem.jacobian(state)
     orthonormal = np.linalg.qr(rows.T)[0].T
     values = legs.vector(state.legs)[free]
-    away = values - legs.vector(legs.nominal)[free]
-    along = held.basis[:, :n] @ (away / held.unit[:n])
-    wanted = values - held.unit[:n] * (along @ held.basis[:, :n])
-    where = np.flatnonzero(free).tolist()
-    moved = with_values(state.legs, legs, dict(zip(where, wanted.tolist(), strict=True)))
+    deviation = values - legs.vector(legs.nominal)[free]
+    component = held.basis[:, :n] @ (deviation / held.unit[:n])
+    target = values - held.unit[:n] * (component @ held.basis[:, :n])
+    numbers = np.flatnonzero(free).tolist()
+    moved = with_values(state.legs, legs, dict(zip(numbers, target.tolist(), strict=True)))
     return replace(problem, held_directions=orthonormal), replace(
         state, legs=problem.parameters.tied(moved)
     )
 
 
 def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Array:
-    """Return the covariance (n_kinematic, n_kinematic) of steps along what is held.
+    """Return the covariance (n_kinematic, n_kinematic) of steps along the held directions H.
 
-    Nominal errors e of variance D^2, of which all but what is held (the rows of H) is found, leave
-    H^T (H D^-2 H^T)^-1 H.
+    Errors of the nominal model with covariance D^2, conditioned on the estimated complement of H,
+    have the covariance H^T (H D^-2 H^T)^-1 H.
     """
     legs, free, n = problem.legs, problem.free, problem.n_kinematic
     if len(held.basis) == 0:
@@ -171,38 +177,40 @@ def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Arra
     is_length = np.array([name == "m" for name in problem.units[:n]], dtype=np.bool_)
     sigma = np.zeros(n)
     for kind in (is_length, ~is_length):
-        found = float(np.sum(kind) - np.sum(H[:, kind] ** 2))  # the rest is held: no change
-        sigma[kind] = np.sqrt(np.sum(change[kind] ** 2) / max(found, 1.0))
+        n_found = float(
+            np.sum(kind) - np.sum(H[:, kind] ** 2)
+        )  # degrees of freedom that are not held
+        sigma[kind] = np.sqrt(np.sum(change[kind] ** 2) / max(n_found, 1.0))
     weighted = H / np.maximum(sigma, _MIN_SPREAD * state.mean_length)
     spread = H.T @ np.linalg.solve(weighted @ weighted.T, H)
-    back = np.linalg.inv(problem.jacobian(state))[:n, :n] * unit
-    return np.asarray(back @ spread @ back.T)
+    to_steps = np.linalg.inv(problem.jacobian(state))[:n, :n] * unit
+    return np.asarray(to_steps @ spread @ to_steps.T)
 
 
 def named_units(problem: FitProblem, state: State) -> Array:
-    """Return a metre of each named unknown in its own unit: angles at the mean leg length."""
+    """Equivalent of a metre in the unit of each named unknown; angles at the mean leg length."""
     length = state.mean_length
     focal = float(np.mean([camera.K[0, 0] for camera in state.cameras]))
-    of = {"m": 1.0, "rad": 1.0 / length, "px": focal / length, "": 1.0 / length}
-    return np.array([of[unit] for unit in problem.units])
+    size_of_unit = {"m": 1.0, "rad": 1.0 / length, "px": focal / length, "": 1.0 / length}
+    return np.array([size_of_unit[unit] for unit in problem.units])
 
 
 def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
-    """Return how the platform moves (k, 6, n_named) by a metre of each named unknown."""
+    """Motion of the platform (k, 6, n_named) by each named unknown, scaled by *unit*."""
     legs, n = problem.legs, problem.n_kinematic
     try:
-        by = pose_sensitivity(
+        by_steps = pose_sensitivity(
             state.legs, legs.parametrization, legs.frame_legs, *state.platform_pose.frames
         )
     except NotIdentifiable:
         return None
-    motion = np.zeros((len(by), 6, len(unit)))
-    motion[..., :n] = by[..., problem.free] @ np.linalg.inv(problem.jacobian(state))[:n, :n]
+    motion = np.zeros((len(by_steps), 6, len(unit)))
+    motion[..., :n] = by_steps[..., problem.free] @ np.linalg.inv(problem.jacobian(state))[:n, :n]
     return motion * unit
 
 
 def _in_words(names: Sequence[str], row: Array, leg_names: Sequence[str]) -> str:
-    """Return a direction of named unknowns in words, its largest parts first."""
+    """Describe a direction of named unknowns, largest components first."""
     size = np.abs(row)
     order = np.argsort(-size, kind="stable")
     shown = [names[i] for i in order if size[i] > SHOWN * size[order[0]]]

@@ -1,13 +1,12 @@
 """Measurements and their factors: outlines, readings, axes, and corners of calibration boards.
 
-Each kind is a class of arrays, one row a measurement, with the ``Factor``
-that it is in the fit; :class:`Observed` registers the kinds. A measurement in an image depends on
-both ends of a leg in the camera frame; these depend on joints, camera and platform pose. Ends of an
-arm stand in their place where that is seen, and depend on its motor. Rotations change by Cayley's
-map from the left: a camera turns in its own frame, a platform about the origin of R_e in the
-directions of R_b. Residuals are written with their derivatives, which go backwards
-from each to the ends of the leg and on to the variables. Where there are many measurements, as of
-outlines and readings, arrays have these last: NumPy then works along them.
+Each kind is a class of arrays, one row per measurement, with its ``Factor``; :class:`Observed`
+registers the kinds. A measurement in an image depends on both ends of a leg in the camera frame,
+and these on joints, camera pose and platform pose; for the outline of an arm, on the ends of the
+arm and its motor. Rotations are perturbed from the left by Cayley's map: a camera in its own frame,
+a platform about the origin of R_e in the axes of R_b. Derivatives are computed in reverse mode,
+from residuals to leg ends to variables. Arrays of many measurements (outlines, readings) have them
+on the last axis, where NumPy is fastest.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ from legcal.vision.board import LINKS, FixedBoard, Link
 from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
 from legcal.vision.cylinder import EPSILON
 
-_SAME_GAMMA = 1e-6  # relative difference of gammas that count as one
+_SAME_GAMMA = 1e-6  # relative difference of equal gammas
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
 _OF_ACTUATOR = LegColumns.ACTUATOR
 
 
 class Observed(NamedTuple):
-    """All measurements of a fit, by kind; each kind is one factor."""
+    """All measurements of a fit, by kind; one factor each."""
 
     outlines: ObservedOutlines
     readings: Readings
@@ -53,22 +52,22 @@ class Observed(NamedTuple):
     platform_corners: ObservedCorners
 
     def factors(self, keys: tuple[str, ...]) -> tuple[Factor[State], ...]:
-        """Return the factor of each kind; *keys* are the intrinsics that may be unknown."""
+        """Return the factor of each kind; *keys* are the estimated intrinsics."""
         return tuple(kind.factor(keys) for kind in self)
 
     @property
     def views(self) -> IntArray:
-        """The views that show anything."""
+        """Indices of views with measurements."""
         seen = (self.outlines, self.axes, self.corners, self.platform_corners)
         return np.unique(np.concatenate([kind.view for kind in seen]))
 
     @property
     def boards(self) -> tuple[ObservedCorners, ...]:
-        """The corners of each board, in the order of the links."""
+        """Corners by board, in the order of ``LINKS``."""
         return self.corners, self.platform_corners
 
     def with_corners(self, corners: ObservedCorners) -> Observed:
-        """Return the same with other corners of the board on their link."""
+        """Replace the corners of one board."""
         if corners.link == "base":
             return self._replace(corners=corners)
         return self._replace(platform_corners=corners)
@@ -82,28 +81,28 @@ def observed_arrays(
     board: BoardCorners | None = None,
     cameras: Sequence[Camera] | None = None,
 ) -> Observed:
-    """Return measurements as arrays; of *cameras* in place of those of the views, where given.
+    """Return measurements as arrays; *cameras* override the cameras of the views.
 
     Raises
     ------
     DatasetError
         If an outline or an axis cannot be used.
     """
-    given = [view.camera for view in measurements.views]
-    found = observed_outlines(outlines, measurements, legs)
-    if cameras is not None and any(a is not b for a, b in zip(cameras, given, strict=True)):
-        found = found.through(cameras)
+    view_cameras = [view.camera for view in measurements.views]
+    observed = observed_outlines(outlines, measurements, legs)
+    if cameras is not None and any(a is not b for a, b in zip(cameras, view_cameras, strict=True)):
+        observed = observed.through(cameras)
     return Observed(
-        found,
+        observed,
         observed_readings(measurements, legs),
         observed_actuator_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
-        *observed_corners(board, measurements, given if cameras is None else cameras),
+        *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
 
 
 class Memory:
-    """The last result of a function, as long as the same objects go into it."""
+    """Cache of the last result of a function, keyed by the identity of its inputs."""
 
     def __init__(self) -> None:
         self._last: tuple[tuple[object, ...], Any] | None = None
@@ -112,13 +111,13 @@ class Memory:
         return Memory, ()
 
     def of(self, compute: Callable[[], Any], *inputs: object) -> Any:
-        """Return what a function of these objects returns; it is called if one is another."""
+        """Return the cached result; compute it if any input is another object."""
         last = self._last
         if last is not None and all(a is b for a, b in zip(last[0], inputs, strict=True)):
             return last[1]
-        found = compute()
-        self._last = inputs, found
-        return found
+        result = compute()
+        self._last = inputs, result
+        return result
 
 
 # ------------------------------------------------------------------------------------- outlines
@@ -126,53 +125,55 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class ObservedOutlines:
-    """The outlines that enter the fit, n of them."""
+    """The n outlines of the fit."""
 
     index: IntArray  # (n,) rows of the table of outlines
     leg: IntArray  # (n,)
     view: IntArray  # (n,)
     pose: IntArray  # (n,)
     radius: IntArray  # (n,) in ``parts``
-    # (n, 2, 2) points of the measured outline at both ends of the used piece, on the sensor plane
+    # (n, 2, 2) points of the measured outline at both ends of its segment, on the sensor plane
     feet: Array
     pixels: Array  # (n, 2, 2) the same points in the image [px]
     # (n, 9) data of the residual: the inverse transposed derivative of pixels at these points
     # [1/px], column by column, and epsilon of eq (5)
     constants: Array
     covariance: Array  # (n, 2, 2) claimed covariance of the offsets at both ends [px^2]
-    # (n,) derivative of their place by the logarithm of the gamma of the camera, positive inwards
-    # [px]; zero where that gamma is given, or the derivative is not known
+    # (n,) derivative of the outline's position by the logarithm of the camera's gamma, positive
+    # inwards [px]; zero where the gamma is given or the derivative unknown
     by_gamma: Array
     bias_index: IntArray  # (n, c) the common-mode biases that act on each outline
-    bias_shift: Array  # (n, c, 2) how far one unit of each shifts both ends [px]
+    bias_shift: Array  # (n, c, 2) shift of both ends by one unit of each [px]
     parts: tuple[tuple[int, str], ...]  # leg index and part of each radius, sorted by leg and name
     views: tuple[str, ...]  # names of the views
-    # (n_views,) the view that stands for each: the first of those that show one image each with the
-    # same camera, as one that is held in the hand does; else itself
+    # (n_views,) representative of each view: the first of the one-image views of the same camera
+    # (a hand-held one); else the view itself
     series: IntArray
-    cameras: tuple[str, ...]  # the view that stands for the camera of each view
-    on_actuators: bool = False  # whether some joints at A move
-    arms: frozenset[tuple[int, str]] = frozenset()  # which parts of the machine are arms
+    cameras: tuple[str, ...]  # representative view of the camera of each view
+    on_actuators: bool = False  # some joints at A move
+    arms: frozenset[tuple[int, str]] = frozenset()  # parts that are arms
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
     def width_px(self) -> float:
-        """Median width of the cylinders both of whose edges are seen; infinite without any [px]."""
-        across = self.pixels[:, 1] - self.pixels[:, 0]
-        normal = np.stack([-across[:, 1], across[:, 0]], axis=1)
+        """Median width of cylinders with both edges measured [px]; infinite without any."""
+        direction = self.pixels[:, 1] - self.pixels[:, 0]
+        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         middle = self.pixels.mean(axis=1)
         image = np.stack([self.view, self.pose, self.radius], axis=1)
-        _, of = np.unique(image, axis=0, return_inverse=True)
-        order = np.argsort(of, kind="stable")
+        _, image_of_outline = np.unique(image, axis=0, return_inverse=True)
+        order = np.argsort(image_of_outline, kind="stable")
         first, second = order[:-1], order[1:]
-        is_pair = (of[first] == of[second]) & (self.epsilon[first] != self.epsilon[second])
-        away = np.sum(normal[first] * (middle[second] - middle[first]), axis=1)
-        return float(np.median(np.abs(away[is_pair]))) if is_pair.any() else np.inf
+        is_pair = (image_of_outline[first] == image_of_outline[second]) & (
+            self.epsilon[first] != self.epsilon[second]
+        )
+        distance = np.sum(normal[first] * (middle[second] - middle[first]), axis=1)
+        return float(np.median(np.abs(distance[is_pair]))) if is_pair.any() else np.inf
 
     @property
     def on_arm(self) -> BoolArray:
-        """Whether each is of an arm, and not along its leg, (n,)."""
+        """Mask of the outlines of arms, (n,)."""
         return np.array([part in self.arms for part in self.parts], dtype=np.bool_)[self.radius]
 
     @property
@@ -184,7 +185,7 @@ class ObservedOutlines:
         return len(self.index)
 
     def at(self, which: IntArray) -> ObservedOutlines:
-        """Return some of the outlines, by index, without biases."""
+        """Select outlines by index, without biases."""
         bare = self.without_biases()
         shared = ("parts", "views", "series", "cameras", "on_actuators", "arms", "memory")
         chosen = {
@@ -193,17 +194,17 @@ class ObservedOutlines:
         return replace(self, **chosen, memory=Memory())
 
     def without_biases(self) -> ObservedOutlines:
-        """Return the same outlines without common-mode biases."""
+        """Remove the common-mode biases."""
         return replace(self, bias_index=self.bias_index[:, :0], bias_shift=self.bias_shift[:, :0])
 
     def with_parts_first(self, parts: Sequence[tuple[int, str]]) -> ObservedOutlines:
-        """Return the same outlines, radii numbered by these parts, then by those of no other."""
+        """Renumber radii: these parts first, then the others."""
         together = tuple(dict.fromkeys((*parts, *self.parts)))
         number = np.array([together.index(part) for part in self.parts], dtype=np.intp)
         return replace(self, radius=number[self.radius], parts=together)
 
     def through(self, cameras: Sequence[Camera]) -> ObservedOutlines:
-        """Return the same outlines in the image, on the sensor planes of other cameras."""
+        """Project the same pixels onto the sensor planes of other cameras."""
         feet, constants = self.feet.copy(), self.constants.copy()
         for v in np.unique(self.view):
             of_view = self.view == v
@@ -213,11 +214,11 @@ class ObservedOutlines:
         return replace(self, feet=feet, constants=constants)
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
-        """Return how far both ends are from the predicted outline, (n, 2) [px]."""
+        """Return the distance of both ends from the predicted outline, (n, 2) [px]."""
         return self._corrected(self._predicted(keys, state)[0], state)
 
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
-        """Return these offsets with their derivatives."""
+        """Return the offsets with their derivatives."""
         r, slope, ends, _ = self._predicted(keys, state)
         if self.bias_index.shape[1]:
             by_bias = -self.bias_shift.transpose(1, 2, 0)
@@ -225,13 +226,13 @@ class ObservedOutlines:
         return Residuals(self._corrected(r, state), slope.T, ends.chain)
 
     def by_intrinsics(self, wanted: tuple[str, ...], keys: tuple[str, ...], state: State) -> Array:
-        """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of the views."""
+        """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of their views."""
         by_xy = self._predicted(keys, state)[3]
         slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
         return np.asarray(np.einsum("nqck,cqn->nqk", slopes, by_xy))
 
     def _corrected(self, r: Array, state: State) -> Array:
-        """Return offsets (n, 2) without common-mode biases, from (2, n) with them."""
+        """Subtract the common-mode biases from offsets (2, n); return (n, 2)."""
         if not self.bias_index.shape[1]:
             return r.T
         biases = state.biases[self.bias_index]
@@ -240,9 +241,9 @@ class ObservedOutlines:
     def _predicted(
         self, keys: tuple[str, ...], state: State
     ) -> tuple[Array, Array, _EndsInCamera, Array]:
-        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and ends of legs.
+        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and leg ends.
 
-        The last are the derivatives (2, 2, n) by the points on the sensor plane.
+        The fourth are the derivatives (2, 2, n) by the points on the sensor plane.
         """
 
         def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
@@ -257,26 +258,26 @@ class ObservedOutlines:
                 slope = np.concatenate([slope, np.einsum("kcqn,cqn->kqn", by_key, by_xy)])
             return r, slope, ends, by_xy
 
-        own = self.radius, self.feet, self.constants
+        inputs = self.radius, self.feet, self.constants
         poses = state.camera_pose, state.platform_pose
-        found: tuple[Array, Array, _EndsInCamera, Array] = self.memory.of(
-            predicted, keys, *own, state.legs, state.radii, state.cameras, *poses
+        prediction: tuple[Array, Array, _EndsInCamera, Array] = self.memory.of(
+            predicted, keys, *inputs, state.legs, state.radii, state.cameras, *poses
         )
-        return found
+        return prediction
 
     @cached_property
     def _feet(self) -> Array:
-        """The feet by coordinate and end, (2, 2, n)."""
+        """Feet by coordinate and end, (2, 2, n)."""
         return np.ascontiguousarray(self.feet.T)
 
     @cached_property
     def _lens(self) -> Array:
-        """The inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
+        """Inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
         by_end = self.constants[:, :8].reshape(-1, 2, 2, 2)  # column by column
         return np.ascontiguousarray(by_end.transpose(3, 2, 1, 0))
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of outlines, whitened with their claimed covariances."""
+        """Return the factor, whitened by the claimed covariances."""
         touches: tuple[Touch, ...] = (
             ("legs", self.leg, _SIX),
             ("camera_pose", self.view, _ALL),
@@ -297,13 +298,13 @@ class ObservedOutlines:
 def observed_outlines(
     outlines: Outlines, measurements: Measurements, legs: FittedLegs
 ) -> ObservedOutlines:
-    """Return the used outlines.
+    """Return the used outlines as arrays.
 
     Raises
     ------
     DatasetError
-        If an outline has a covariance that is not positive definite, or shows a part that the
-        mechanism does not have, or outlines of a camera were measured with several gammas.
+        If the covariance of an outline is not positive definite, its part does not exist in the
+        mechanism, or outlines of a camera were measured with several gammas.
     """
     index = np.flatnonzero(outlines.used)
     row, leg = outlines.row[index], outlines.leg[index]
@@ -324,7 +325,7 @@ def observed_outlines(
     ]
     if problems:
         raise DatasetError(problems)
-    order = np.lexsort((measurements.pose[row], view, leg))  # those of a leg in a view together
+    order = np.lexsort((measurements.pose[row], view, leg))  # by leg and view
     index, row, leg, view = index[order], row[order], leg[order], view[order]
     covariance, by_gamma = covariance[order], by_gamma[order]
     n, numbers = len(index), {part: i for i, part in enumerate(parts)}
@@ -333,9 +334,12 @@ def observed_outlines(
     constants[:, 8] = EPSILON[outlines.edge[index] - 1]
     for v in np.unique(view):
         camera, of_view = measurements.views[v].camera, view == v
-        at = index[of_view]
-        normal, xy = outlines.h[at, None, :2], camera.undistort(outlines.ends[at])
-        value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[at, None, 2:]
+        rows_of_view = index[of_view]
+        normal, xy = (
+            outlines.h[rows_of_view, None, :2],
+            camera.undistort(outlines.ends[rows_of_view]),
+        )
+        value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[rows_of_view, None, 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
         constants[of_view, :8] = _inverses(camera.pixels_per_unit(feet[of_view])).reshape(-1, 8)
         pixels[of_view] = camera.distort(feet[of_view])
@@ -364,7 +368,7 @@ def observed_outlines(
 def _bad_covariances(
     covariance: Array, row: IntArray, leg: IntArray, measurements: Measurements, legs: FittedLegs
 ) -> list[str]:
-    """Return one sentence for each covariance that is not positive definite."""
+    """Describe each covariance that is not positive definite."""
     s00, s01, s11 = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     good = (s00 > 0.0) & (s11 > 0.0) & (s00 * s11 > s01**2)
     return [
@@ -376,22 +380,22 @@ def _bad_covariances(
 
 
 def _series(measurements: Measurements) -> IntArray:
-    """Return the view that stands for each, (n_views,)."""
+    """Return the representative view of each view, (n_views,)."""
     views = measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     images = np.bincount(measurements.view, minlength=len(views))
     first: dict[str, int] = {}
-    found = [
+    representative = [
         first.setdefault(owner, v) if n == 1 else v
         for v, (owner, n) in enumerate(zip(owners, images.tolist(), strict=True))
     ]
-    return np.array(found, dtype=np.intp)
+    return np.array(representative, dtype=np.intp)
 
 
 def _cameras_of(measurements: Measurements) -> tuple[str, ...]:
-    """Return the name of the view that stands for the camera of each view.
+    """Name of the representative view of each view's camera.
 
-    A view whose gamma is given stands for itself: no gamma is estimated for it.
+    A view with a given gamma represents itself: no gamma is estimated for it.
     """
     views = measurements.views
     unknown = [view for view in views if not view.camera.gamma_is_given]
@@ -401,44 +405,44 @@ def _cameras_of(measurements: Measurements) -> tuple[str, ...]:
 
 
 def _by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
-    """Return how far outlines (n,) move inwards by ln gamma, zero where that is given [px]."""
+    """Return the inward shift (n,) of outlines by ln gamma [px]; zero where gamma is given."""
     given = np.array([view.camera.gamma_is_given for view in measurements.views], dtype=np.bool_)
     unknown = ~given[measurements.view[outlines.row]] & np.isfinite(outlines.by_gamma)
     return np.where(unknown, outlines.by_gamma, 0.0)
 
 
 def _inverses(M: Array) -> Array:
-    """Return the inverses of matrices (..., 2, 2)."""
+    """Invert matrices (..., 2, 2)."""
     (a, b), (c, d) = np.moveaxis(M, (-2, -1), (0, 1))
     adjoint = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
     return np.asarray(adjoint / (a * d - b * c)[..., None, None])
 
 
 def _mixed_gammas(moved: Array, gamma: Array, view: IntArray, cameras: Sequence[str]) -> list[str]:
-    """Return one sentence for each camera whose outlines were measured with several gammas."""
-    found: dict[str, set[float]] = {}
-    some = np.flatnonzero(moved)
-    for one, v in zip(gamma[some].tolist(), view[some].tolist(), strict=True):
-        found.setdefault(cameras[v], set()).add(one)
+    """Describe each camera whose outlines were measured with several gammas."""
+    gammas_of: dict[str, set[float]] = {}
+    moving = np.flatnonzero(moved)
+    for value, v in zip(gamma[moving].tolist(), view[moving].tolist(), strict=True):
+        gammas_of.setdefault(cameras[v], set()).add(value)
     return [
-        f"The outlines of the camera of view {name} could not be used: found that they were "
-        f"measured with the gammas {min(values):g} and {max(values):g}, needed one; search the "
-        "images again, or write gamma of the view in dataset.yaml."
-        for name, values in sorted(found.items())
+        f"The outlines of the camera of view {name} could not be used: they were measured with "
+        f"different gammas, {min(values):g} and {max(values):g}; measure the images again, or "
+        "write gamma of the view in dataset.yaml."
+        for name, values in sorted(gammas_of.items())
         if max(values) / min(values) > 1.0 + _SAME_GAMMA
     ]
 
 
 def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, float]:
-    """Return the gamma with which used outlines were measured, by view, where none is given."""
+    """Return the gamma that used outlines were measured with, by view without a given gamma."""
     moved = outlines.used & (_by_gamma(outlines, measurements) != 0.0)
     cameras = _cameras_of(measurements)
     view = measurements.view[outlines.row[moved]].tolist()
-    known = {
+    gamma_of = {
         cameras[v]: gamma for v, gamma in zip(view, outlines.gamma[moved].tolist(), strict=True)
     }
     names = [view.name for view in measurements.views]
-    return {n: known[c] for n, c in zip(names, cameras, strict=True) if c in known}
+    return {n: gamma_of[c] for n, c in zip(names, cameras, strict=True) if c in gamma_of}
 
 
 # ------------------------------------------------------------------------------------- readings
@@ -446,11 +450,11 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """The encoder readings that enter the fit, n of them."""
+    """The n encoder readings of the fit."""
 
     leg: IntArray  # (n,) indices
     pose: IntArray  # (n,) indices
-    sign: Array  # (n,) of the reading in the length
+    sign: Array  # (n,) sign of the reading in the length
     length: Array  # (n,) sign * q: the leg length without its offset [m]
     sigma: Array  # (n,) standard deviations [m]
     n_legs: int  # of the mechanism
@@ -461,19 +465,17 @@ class Readings:
 
     @property
     def by_scale(self) -> Array:
-        """How residuals (n,) change with the scale of the readings [m]."""
+        """Derivative (n,) of residuals by the scale of the readings [m]."""
         return -self.length
 
     def wrong_by(self, rows: Residuals) -> Array:
-        """Return how far readings are above those of a state, (n,) [m]."""
+        """Return measured minus predicted readings, (n,) [m]."""
         return -self.sign * rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
-        """Return the closures of legs (n, 1) [m], |AB| - sign q - q0, with their derivatives."""
-        found: Residuals = self.memory.of(
-            lambda: self._rows(state), state.legs, state.platform_pose
-        )
-        return found
+        """Return the leg closures |AB| - sign q - q0, (n, 1) [m], with their derivatives."""
+        rows: Residuals = self.memory.of(lambda: self._rows(state), state.legs, state.platform_pose)
+        return rows
 
     def _rows(self, state: State) -> Residuals:
         arm, end = (table[:, self._end] for table in state.ends_at_poses)
@@ -499,7 +501,7 @@ class Readings:
         return self.pose * self.n_legs + self.leg
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of readings; no camera matters to them."""
+        """Return the factor; readings do not depend on intrinsics."""
         del keys
         touches = (("legs", self.leg, slice(0, 7)),)
         whitening = 1.0 / self.sigma[:, None, None]
@@ -507,9 +509,9 @@ class Readings:
 
 
 def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
-    """Return the encoder readings, one row of them for each platform pose.
+    """Return the encoder readings of legs with a motor, one for each leg and platform pose.
 
-    Images of one pose share one reading: that of the first row. Legs without a motor have none.
+    Images of a pose share the reading of the first row.
     """
     length = legs.sign * measurements.q_of_poses
     actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
@@ -521,7 +523,7 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
 
 @dataclass(frozen=True, eq=False)
 class ActuatorReadings:
-    """The readings of actuators that enter the fit, n of them."""
+    """The n readings of actuators of the fit."""
 
     actuator: IntArray  # (n,) indices
     pose: IntArray  # (n,) indices
@@ -534,15 +536,15 @@ class ActuatorReadings:
 
     @property
     def by_scale(self) -> Array:
-        """How residuals (n,) change with the scale of the readings [m or rad]."""
+        """Derivative (n,) of residuals by the scale of the readings [m or rad]."""
         return -self.reading
 
     def wrong_by(self, rows: Residuals) -> Array:
-        """Return how far readings are above those of a state, (n,) [m or rad]."""
+        """Return measured minus predicted readings, (n,) [m or rad]."""
         return -rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
-        """Return how far readings are from those of the state, (n, 1), with their derivatives."""
+        """Return predicted minus measured readings (n, 1) with their derivatives."""
         q = state.platform_pose.q
         by_posture = np.zeros((len(self), 1, 6 + q.shape[1]))
         by_posture[np.arange(len(self)), 0, 6 + self.actuator] = 1.0
@@ -550,14 +552,14 @@ class ActuatorReadings:
         return Residuals.of(r[:, None], np.zeros((len(self), 1, 0)), by_posture)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of these readings; nothing but a posture matters to them."""
+        """Return the factor; readings depend only on the posture."""
         del keys
         whitening = 1.0 / self.sigma[:, None, None]
         return Factor("actuator_readings", self.rows, (), len(self), 1, self.pose, whitening)
 
 
 def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> ActuatorReadings:
-    """Return the readings of actuators, one row of them for each platform pose."""
+    """Return the readings of actuators, one for each actuator and platform pose."""
     on = actuator_index(legs.nominal)
     first = [on.index(a) for a in range(legs.n_actuators)]
     q = measurements.q_of_poses[:, first]
@@ -569,10 +571,10 @@ def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLengths:
-    """Distances of joints that were measured by hand, n of them."""
+    """The n hand-measured distances between joints."""
 
     leg: IntArray  # (n, 2) the legs of both joints
-    is_base: BoolArray  # (n,) whether they are on the base, at reading 0, or on the platform
+    is_base: BoolArray  # (n,) joints on the base, at reading 0; else on the platform
     length: Array  # (n,) [m]
     sigma: Array  # (n,) standard deviations [m]
 
@@ -591,25 +593,25 @@ class MeasuredLengths:
         return Residuals.of((distance - self.length)[:, None], J.reshape(len(self), 1, 12))
 
     def factor(self) -> Factor[State]:
-        """Return the factor of these distances."""
+        """Return the factor."""
         touches = (("legs", self.leg[:, 0], _SIX), ("legs", self.leg[:, 1], _SIX))
         whitening = 1.0 / self.sigma[:, None, None]
         return Factor("lengths", self.rows, touches, len(self), 1, None, whitening)
 
 
 def measured_lengths(names: Sequence[str], choices: Choices) -> MeasuredLengths:
-    """Return the distances of joints that are stated, of legs with these names."""
-    found = [
+    """Return the stated distances between joints; *names* are the legs."""
+    stated = [
         (joints, prior)
         for name, prior in sorted(choices.priors.items())
         if (joints := joints_of_length(name)) is not None
     ]
-    legs = [[names.index(leg) for leg, _ in joints] for joints, _ in found]
+    legs = [[names.index(leg) for leg, _ in joints] for joints, _ in stated]
     return MeasuredLengths(
         np.array(legs, dtype=np.intp).reshape(-1, 2),
-        np.array([joints[0][1] == "base" for joints, _ in found], dtype=np.bool_),
-        np.array([prior.mean for _, prior in found]),
-        np.array([prior.sigma for _, prior in found]),
+        np.array([joints[0][1] == "base" for joints, _ in stated], dtype=np.bool_),
+        np.array([prior.mean for _, prior in stated]),
+        np.array([prior.sigma for _, prior in stated]),
     )
 
 
@@ -618,7 +620,7 @@ def measured_lengths(names: Sequence[str], choices: Choices) -> MeasuredLengths:
 
 @dataclass(frozen=True, eq=False)
 class ObservedAxes:
-    """The axes that enter the fit, n of them."""
+    """The n measured axes of the fit."""
 
     leg: IntArray  # (n,) indices
     view: IntArray  # (n,) indices
@@ -628,7 +630,7 @@ class ObservedAxes:
     # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
     # alpha2, beta1, beta2) [1/rad, 1/m]
     whitening: Array
-    on_actuators: bool = False  # whether some joints at A move
+    on_actuators: bool = False  # some joints at A move
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -641,7 +643,7 @@ class ObservedAxes:
         return Residuals(r.T, slope.T, ends.chain)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of measured axes, which contain cameras already."""
+        """Return the factor; axes are in the camera frame and do not depend on intrinsics."""
         del keys
         touches: tuple[Touch, ...] = (("legs", self.leg, _SIX), ("camera_pose", self.view, _ALL))
         if self.on_actuators:
@@ -653,12 +655,12 @@ class ObservedAxes:
 def observed_axes(
     axes: LegAxes | None, measurements: Measurements, legs: FittedLegs
 ) -> ObservedAxes:
-    """Return axes as arrays.
+    """Return measured axes as arrays.
 
     Raises
     ------
     DatasetError
-        If an axis has a covariance that is not positive definite.
+        If the covariance of an axis is not positive definite.
     """
     if axes is None or len(axes) == 0:
         none = np.zeros(0, dtype=np.intp)
@@ -672,14 +674,13 @@ def observed_axes(
             legs.n_actuators > 0,
         )
     scale = np.sqrt(np.abs(np.einsum("nii->ni", axes.covariance)))
-    scale = np.where(scale > 0.0, scale, 1.0)  # rad and m side by side
+    scale = np.where(scale > 0.0, scale, 1.0)  # rows in rad and m
     correlation = axes.covariance / (scale[:, :, None] * scale[:, None, :])
     least = np.linalg.eigvalsh(correlation)[:, 0]
     problems = [
         f"The axis of {legs.names[axes.leg[i]]} in "
         f"{measurements.image[axes.row[i]] or f'row {axes.row[i] + 1}'} could not be used: its "
-        "covariance is not positive definite, needed four positive variances; correct its "
-        "standard deviations."
+        "covariance is not positive definite; correct its standard deviations."
         for i in np.flatnonzero(~(least > 0.0))
     ]
     if problems:
@@ -691,9 +692,9 @@ def observed_axes(
 
 
 def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
-    """Return one axis for each leg at each pose in each view, weighted by the covariances.
+    """Average the axes of each leg by pose and view, weighted by their covariances.
 
-    No information is lost, and a fit is smaller by the number of images.
+    The mean is a sufficient statistic; the fit has fewer measurements.
     """
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     return join_axes(axes, view * measurements.n_poses + pose)
@@ -704,23 +705,23 @@ def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
 
 @dataclass(frozen=True, eq=False)
 class BoardCorners:
-    """Calibration boards that are fixed to base and platform, and their corners in images."""
+    """Calibration boards on base and platform, and their corners in images."""
 
-    boards: tuple[FixedBoard, ...]  # where corners are, in the frames of their boards
-    corners: Corners  # where images show them; only the used ones count
+    boards: tuple[FixedBoard, ...]  # corner points in board frames
+    corners: Corners  # measured corners; only the used ones enter
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedCorners:
-    """The corners of a board that enter the fit, n of them."""
+    """The n corners of a board in the fit."""
 
-    link: Link  # what the board is fixed to
+    link: Link  # that the board is fixed to
     view: IntArray  # (n,) index of the view
-    pose: IntArray  # (n,) index of the platform pose; -1 on the base, which no pose moves
-    corner: IntArray  # (n,) number of the corner, as the boards count them
+    pose: IntArray  # (n,) index of the platform pose; -1 for the board on the base
+    corner: IntArray  # (n,) number of the corner
     point: Array  # (n, 3) the corners in the frame of the board [m]
-    feet: Array  # (n, 2) where they were measured, on the sensor plane
-    pixels: Array  # (n, 2) the same in the image [px]
+    feet: Array  # (n, 2) measured corners on the sensor plane
+    pixels: Array  # (n, 2) measured corners in the image [px]
     # (n, 4) data of the residual: the derivative of pixels at these points [px], column by column
     constants: Array
     sigma: Array  # (n,) standard deviation of both coordinates [px]
@@ -729,18 +730,18 @@ class ObservedCorners:
         return len(self.view)
 
     def chosen(self, which: BoolArray, scale: float = 1.0) -> ObservedCorners:
-        """Return some of the corners, with standard deviations larger by a factor."""
+        """Select corners, and scale their standard deviations."""
         shown = [f.name for f in fields(self) if f.name != "link"]
         chosen = replace(self, **{name: getattr(self, name)[which] for name in shown})
         return replace(chosen, sigma=scale * chosen.sigma)
 
     @property
     def name(self) -> str:
-        """The name of its factor."""
+        """Name of the factor."""
         return "corners" if self.link == "base" else f"{self.link}_corners"
 
     def keys(self, which: BoolArray) -> list[tuple[int, int, int]]:
-        """Return view, pose and number of some corners."""
+        """Return view, pose and number of selected corners."""
         columns = (column[which].tolist() for column in (self.view, self.pose, self.corner))
         return list(zip(*columns, strict=True))
 
@@ -749,22 +750,22 @@ class ObservedCorners:
         R_camera, board = state.camera_pose.R[self.view], LINKS.index(self.link)
         moves = self.link == "platform"
         arm = self.point @ state.board_pose.R[board].T
-        grown = state.board_scale[board] * arm
-        on_link = in_base_frame = grown + state.board_pose.t[board]
+        scaled_arm = state.board_scale[board] * arm
+        on_link = in_base_frame = scaled_arm + state.board_pose.t[board]
         if moves:
             R_link = state.platform_pose.R[self.pose]
-            carried = _times(R_link, on_link)
-            in_base_frame = carried + state.platform_pose.t[self.pose]
-        turned = _times(R_camera, in_base_frame)
+            turned_on_link = _matvec(R_link, on_link)
+            in_base_frame = turned_on_link + state.platform_pose.t[self.pose]
+        turned = _matvec(R_camera, in_base_frame)
         xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
         in_camera = turned + state.camera_pose.t[self.view]
         depth = in_camera[:, 2:]
-        seen = in_camera[:, :2] / depth
+        projected = in_camera[:, :2] / depth
         lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
-        by_seen = lens / depth[:, None]
-        by_depth = -by_seen @ seen[..., None]
-        r = (lens @ (seen - xy)[..., None])[..., 0]
-        slope = np.concatenate([by_seen, by_depth, -lens], axis=-1)
+        by_projected = lens / depth[:, None]
+        by_depth = -by_projected @ projected[..., None]
+        r = (lens @ (projected - xy)[..., None])[..., 0]
+        slope = np.concatenate([by_projected, by_depth, -lens], axis=-1)
 
         def chain(slope: Array) -> tuple[Array, Array]:
             in_camera = slope[..., :3]
@@ -772,13 +773,13 @@ class ObservedCorners:
             in_link, by_pose = in_base, np.zeros((*slope.shape[:2], 0))
             if moves:
                 in_link = in_base @ R_link
-                turn = cross(carried[:, None], in_base)
-                none = np.zeros((*slope.shape[:2], state.platform_pose.q.shape[1]))
-                by_pose = np.concatenate([turn, in_base, none], axis=-1)
+                by_rotation = cross(turned_on_link[:, None], in_base)
+                by_q = np.zeros((*slope.shape[:2], state.platform_pose.q.shape[1]))
+                by_pose = np.concatenate([by_rotation, in_base, by_q], axis=-1)
             J = [
                 cross(turned[:, None], in_camera),
                 in_camera,
-                cross(grown[:, None], in_link),
+                cross(scaled_arm[:, None], in_link),
                 in_link,
                 in_link @ arm[..., None],
                 slope[..., 3:] @ by_intrinsics,
@@ -788,19 +789,19 @@ class ObservedCorners:
         return Residuals(r, slope, chain)
 
     def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
-        """Return derivatives (n, 2, n_wanted) of these by intrinsics of the views."""
+        """Return derivatives (n, 2, n_wanted) of the residuals by intrinsics of their views."""
         lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
         slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
         return np.asarray(-lens @ slopes)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor of corners; platform poses move those of a board on the platform."""
-        one = np.full(len(self), LINKS.index(self.link), dtype=np.intp)
+        """Return the factor; a board on the platform depends on its poses."""
+        board = np.full(len(self), LINKS.index(self.link), dtype=np.intp)
         element = self.pose if self.link == "platform" else None
         touches = (
             ("camera_pose", self.view, _ALL),
-            ("board_pose", one, _ALL),
-            ("board_scale", one, _ALL),
+            ("board_pose", board, _ALL),
+            ("board_scale", board, _ALL),
             ("cameras", self.view, _ALL),
         )
         whitening = 1.0 / self.sigma[:, None, None]
@@ -814,10 +815,9 @@ class ObservedCorners:
 def observed_corners(
     seen: BoardCorners | None, measurements: Measurements, cameras: Sequence[Camera]
 ) -> tuple[ObservedCorners, ...]:
-    """Return the used corners of the board on each link.
+    """Return the used corners of the board on each link, as arrays.
 
-    Those of all images of a view, or on the platform of all images of a view and a pose, are one
-    weighted mean.
+    A corner is averaged over the images of a view; on the platform, over those of a view and pose.
     """
     boards = {} if seen is None else {fixed.link: fixed for fixed in seen.boards}
     return tuple(_corners_on(link, boards.get(link), seen, measurements, cameras) for link in LINKS)
@@ -842,14 +842,14 @@ def _corners_on(
     row = corners.row[used]
     moving = measurements.pose[row] if link == "platform" else np.full(len(row), -1)
     key = np.stack([measurements.view[row], moving, corners.corner[used]], axis=1)
-    distinct, which = np.unique(key, axis=0, return_inverse=True)
+    unique_keys, which = np.unique(key, axis=0, return_inverse=True)
     which = which.ravel()
     weight = corners.sigma_px[used] ** -2.0
     total = np.bincount(which, weights=weight)
     pixels = np.stack(
         [np.bincount(which, weights=weight * corners.px[used, i]) / total for i in range(2)], axis=1
     )
-    view, pose, corner = distinct.T.astype(np.intp)
+    view, pose, corner = unique_keys.T.astype(np.intp)
     feet, constants = np.zeros((len(view), 2)), np.zeros((len(view), 4))
     for v in np.unique(view).tolist():
         of_view = view == v
@@ -866,12 +866,12 @@ def _corners_on(
 def outline_offsets(
     A: Array, B: Array, radius: Array, epsilon: Array, xy: Array, lens: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the distances of predicted outlines of legs from points, and their derivatives.
+    """Return the signed distances of points from predicted outlines of legs, and derivatives.
 
-    The outline h of the cylinder about AB seen from the origin, eqs (1) and (3), is up to its
-    length, with n = A x B and D = B - A, epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2). The
-    distance is h . (x, y, 1) / |J^-T (h1, h2)|, that of
-    :meth:`legcal.vision.camera.Camera.line_offset` with the derivative J of the lens constant.
+    With n = A x B and D = B - A, the outline of the cylinder about AB seen from the origin, eqs (1)
+    and (3), is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to scale. The distance is
+    h . (x, y, 1) / |J^-T (h1, h2)|, as in :meth:`legcal.vision.camera.Camera.line_offset` for a
+    constant derivative J of the lens.
 
     Parameters
     ----------
@@ -887,7 +887,7 @@ def outline_offsets(
     Returns
     -------
     offset : (2, n) array
-        Of both points [px]; NaN where the origin is inside the cylinder.
+        Distance of both points [px]; NaN where the origin is inside the cylinder.
     by_leg : (7, 2, n) array
         Derivatives by A, B and radius.
     by_xy : (2, 2, n) array
@@ -920,11 +920,11 @@ def outline_offsets(
 
 
 def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Array]:
-    """Return how far predicted axes of legs are from measured ones, and the derivatives.
+    """Return the errors of measured axes from predicted ones, and derivatives.
 
-    A measured axis passes through M along e1 x e2. alpha is the predicted direction in e1 and
-    e2, over its part along the axis; beta is where the predicted axis meets the plane through
-    M with these directions, from M [m].
+    A measured axis passes through M along e1 x e2. alpha are the components of the predicted
+    direction along e1 and e2, over its component along the axis; beta is the intersection of the
+    predicted axis with the plane of e1 and e2 through M, relative to M [m].
 
     Parameters
     ----------
@@ -956,74 +956,76 @@ def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Arr
 def _on_sensor(
     cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, feet: Array, pixels: Array
 ) -> tuple[Array, Array]:
-    """Return points of images (n, ..., 2) on the sensor plane, and (n, ..., 2, n_keys).
+    """Undistort pixels (n, ..., 2), with derivatives (n, ..., 2, n_keys) by intrinsics.
 
-    The latter is how they move with intrinsics; without any unknown these are at *feet*.
+    Without estimated intrinsics the points are *feet*.
     """
     xy, slopes = feet.copy(), np.zeros((*pixels.shape, len(keys)))
     for v in np.unique(view) if keys else ():
         camera, of_view = cameras[v], view == v
-        known = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
-        some = np.zeros((*pixels[of_view].shape, len(keys)))
-        names = [keys[k] for k in known]
-        xy[of_view], some[..., known] = undistort_with_derivatives(
+        present = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
+        by_intrinsics = np.zeros((*pixels[of_view].shape, len(keys)))
+        names = [keys[k] for k in present]
+        xy[of_view], by_intrinsics[..., present] = undistort_with_derivatives(
             camera, pixels[of_view], names, feet[of_view]
         )
-        slopes[of_view] = some
+        slopes[of_view] = by_intrinsics
     return xy, slopes
 
 
 @dataclass(frozen=True, eq=False)
 class _EndsInCamera:
-    """Both ends of legs in the camera frame, and what their derivatives are made of."""
+    """Both ends of legs in the camera frame, with the terms of the chain rule."""
 
-    A: Array  # (3, n) from the camera, in its directions, and B likewise
+    A: Array  # (3, n) in the camera frame
     B: Array
-    A_turned: Array  # without the camera's place
+    A_turned: Array  # (3, n) R_camera A, without the translation
     B_turned: Array
     arm: Array  # (3, n) from the origin of R_e to B, in R_b
     R_camera: Array  # (3, 3, n)
     R_pose: Array
-    moved: _Moved | None  # where joints at A move
+    moved: _JointMotions | None  # None where no joint at A moves
 
     def chain(self, slope: Array) -> tuple[Array, Array]:
-        """Return derivatives by A, B, camera and others, and by the pose, from those by both ends.
+        """Chain slopes by both ends to derivatives by kept variables and by the pose.
 
-        *slope* (n, q, l) has after these six numbers those of the others: radius, biases and
-        intrinsics. Those by the numbers of actuators come after them.
+        *slope* (n, q, l) has six columns for the ends, then radius, biases and intrinsics. The
+        derivatives by kept variables are A, B, camera, these, and the numbers of actuators.
         """
         by_ends, moved = slope.T, self.moved
-        n_own, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.n_q)
-        by_A, by_B, others = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
-        m = others + n_own
+        n_numbers, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.n_q)
+        by_A, by_B, n_leg_columns = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
+        m = n_leg_columns + n_numbers
         J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
         b = J[m + 3 : m + 6]
         np.einsum("jin,jqn->iqn", self.R_camera, by_A, out=J[:3])
         if moved is not None:
             a = J[:3].copy()
             np.einsum("jin,jqn->iqn", moved.by_A, a, out=J[:3])
-            np.einsum("jin,jqn->iqn", moved.by_numbers, a, out=J[others:m])
+            np.einsum("jin,jqn->iqn", moved.by_numbers, a, out=J[n_leg_columns:m])
             np.einsum("jin,jqn->iqn", moved.by_q, a, out=J[m + 6 :])
         np.einsum("jin,jqn->iqn", self.R_camera, by_B, out=b)
         if moved is not None and len(moved.arms):
             of_arms = b[:, :, moved.arms]
-            J[others:m, :, moved.arms] += np.einsum("jin,jqn->iqn", moved.far_numbers, of_arms)
+            J[n_leg_columns:m, :, moved.arms] += np.einsum(
+                "jin,jqn->iqn", moved.far_numbers, of_arms
+            )
             J[m + 6 :, :, moved.arms] += np.einsum("jin,jqn->iqn", moved.far_q, of_arms)
-            b[:, :, moved.arms] = 0.0  # nothing of them is on the platform
+            b[:, :, moved.arms] = 0.0  # arms do not depend on the platform
         np.einsum("jin,jqn->iqn", self.R_pose, b, out=J[3:6])
         J[6:9] = _cross(self.A_turned[:, None], by_A)
         J[6:9] += _cross(self.B_turned[:, None], by_B)
         np.add(by_A, by_B, out=J[9:12])
-        J[12:others] = by_ends[6:]
+        J[12:n_leg_columns] = by_ends[6:]
         J[m : m + 3] = _cross(self.arm[:, None], b)
         return J[:m].T, J[m:].T
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
-    """How the joints at A of measurements move with numbers of actuators and with readings.
+class _JointMotions:
+    """Derivatives of the joints at A by numbers of actuators and by readings.
 
-    Of an arm it is its near end that does, and its far end as well.
+    For an arm, they are of its near end, and ``far_*`` of its far end.
     """
 
     by_A: Array  # (3, 3, n) by A at reading 0
@@ -1039,10 +1041,12 @@ class _Moved:
         return int(self.by_q.shape[1])
 
 
-def _moved(state: State, leg: IntArray, pose: IntArray, arm: BoolArray) -> _Moved | None:
-    """Return how the joints at A of legs at poses move, None where no actuator carries any.
+def _joint_motion(
+    state: State, leg: IntArray, pose: IntArray, arm: BoolArray
+) -> _JointMotions | None:
+    """Return derivatives of the joints at A of legs at poses; None without actuators.
 
-    Where *arm* says so it is the ends of the arm of the leg that do.
+    Where *arm* is true, they are of both ends of the arm instead.
     """
     n_poses, n_q = state.platform_pose.q.shape
     if not n_q:
@@ -1063,37 +1067,37 @@ def _moved(state: State, leg: IntArray, pose: IntArray, arm: BoolArray) -> _Move
     by_numbers, by_q = (table[arm.astype(np.intp), leg, pose] for table in ends)
     arms = np.flatnonzero(arm)
     far_numbers, far_q = (table[2, leg[arms], pose[arms]] for table in ends)
-    return _Moved(
-        _last(np.where(arm[:, None, None], 0.0, by_A[leg, pose])),
-        _last(by_numbers),
-        _last(by_q),
+    return _JointMotions(
+        _measurement_last(np.where(arm[:, None, None], 0.0, by_A[leg, pose])),
+        _measurement_last(by_numbers),
+        _measurement_last(by_q),
         arms,
-        _last(far_numbers),
-        _last(far_q),
+        _measurement_last(far_numbers),
+        _measurement_last(far_q),
     )
 
 
 def _write_motion(motion: JointMotion, actuator: int, by_numbers: Array, by_q: Array) -> None:
-    """Write how a point moves with its actuator into (n_poses, 3, 9) and (n_poses, 3, n_q)."""
+    """Write the derivatives of a point into (n_poses, 3, 9) and (n_poses, 3, n_q)."""
     by_numbers[:, :, :2], by_numbers[:, :, 2:4] = motion.by_axis, motion.by_point
     by_numbers[:, :, 4], by_q[:, :, actuator] = motion.by_gain, motion.by_q
 
 
-def _last(table: Array) -> Array:
-    """Return a table (n, ...) with its first axis last."""
+def _measurement_last(table: Array) -> Array:
+    """Move the first axis of a table (n, ...) to the end."""
     return np.ascontiguousarray(np.moveaxis(table, 0, -1))
 
 
 def _ends_in_camera(
     state: State, leg: IntArray, view: IntArray, pose: IntArray, arm: BoolArray
 ) -> _EndsInCamera:
-    """Return both ends of legs in the camera frames of views at poses; of their arms where *arm*.
+    """Both ends of legs in the camera frames of views, at poses.
 
-    Ends of arms stand in place of A and B.
+    Where *arm* is true, the ends of the arm take the place of A and B.
     """
     n_legs = len(state.A)
     R_camera, t = _by_measurement(state.camera_pose.R, view), state.camera_pose.t.T[:, view]
-    moved = _moved(state, leg, pose, arm)
+    moved = _joint_motion(state, leg, pose, arm)
     to_B, end = (table[:, pose * n_legs + leg] for table in state.ends_at_poses)
     if moved is None:
         of_views = (state.camera_pose.R.transpose(1, 0, 2) @ state.A.T).reshape(3, -1)
@@ -1111,12 +1115,12 @@ def _ends_in_camera(
 
 
 def _by_measurement(R: Array, which: IntArray) -> Array:
-    """Return the matrix of each measurement, (3, 3, n), of some (k, 3, 3)."""
+    """Gather matrices (k, 3, 3) by measurement, (3, 3, n)."""
     return np.ascontiguousarray(R.transpose(1, 2, 0))[..., which]
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return vector products along the first axis."""
+    """Vector product along the first axis."""
     product = np.empty((3, *np.broadcast(a[0], b[0]).shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=product[i])
@@ -1124,6 +1128,6 @@ def _cross(a: Array, b: Array) -> Array:
     return product
 
 
-def _times(R: Array, v: Array) -> Array:
-    """Return R v of rows, (n, 3)."""
+def _matvec(R: Array, v: Array) -> Array:
+    """Product R v of rows, (n, 3)."""
     return np.asarray((R @ v[..., None])[..., 0])

@@ -1,7 +1,7 @@
-"""The joint fit: all outlines in pixels, or measured axes, and all readings and corners, at once.
+"""The joint fit (bundle adjustment): outlines in pixels or measured axes, readings and corners.
 
-A wide robust loss first, so that wrong outlines cannot bend the way; then rounds in which the
-noise of outlines is estimated, outlines that disagree are rejected, and the rest is fitted again.
+A first minimum with a wide robust loss, which outliers cannot lead astray; then rounds that
+estimate the noise of outlines, reject outliers, and fit the inliers again.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
-_COST_TOLERANCE = 1e-6  # relative: the same minimum
-_POSE_ROUNDS = 8  # in which other poses are looked for, where readings leave them open
-_PART_OF_MODEL = 0.1  # of the errors of a nominal model, which are left then
-_SEED = 2001  # of other starts
-_OTHER_MODEL = 0.005  # of the mean leg length, angles at it: errors of models that are tried
-_SAME_COST = 0.01  # relative: the same minimum, by first minima
-_ENOUGH_STARTS = 3  # that come to the same minimum: there is no better one near
+_COST_TOLERANCE = 1e-6  # relative difference of costs of the same minimum
+_POSE_ROUNDS = 8  # searches for better poses, where readings do not determine them
+_PART_OF_MODEL = 0.1  # error of the model after a first minimum, over a nominal model's
+_SEED = 2001  # of the random starts
+_OTHER_MODEL = 0.005  # mean leg lengths or rad: perturbation of the random starts
+_SAME_COST = 0.01  # relative difference of costs of the same first minimum
+_ENOUGH_STARTS = 3  # reaching the same minimum: no better one is near
 
 
 def refine(
@@ -78,10 +78,10 @@ def refine(
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
 ) -> Solution:
-    """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
+    """Fit kinematic parameters, cameras, platform poses and radii jointly to all data.
 
-    Of several starts the first minima are compared; only the lowest is refined, the next one if
-    that fails. A start that fails is skipped with a note; between equal costs the earlier one wins.
+    From several starts, the lowest first minimum is refined; if that fails, the next one. A start
+    that fails is skipped with a note; between equal costs the earlier start wins.
 
     Parameters
     ----------
@@ -96,12 +96,12 @@ def refine(
     settings : RefinementSettings
         Settings of the fit.
     axes : LegAxes, optional
-        Measured axes, beside outlines or instead of them (give
-        :func:`legcal.data.outlines.no_outlines`). Their covariances are taken as they are.
+        Measured axes, in addition to outlines or instead of them (pass
+        :func:`legcal.data.outlines.no_outlines`). Their covariances are not re-estimated.
     board : BoardCorners, optional
-        A calibration board that stands still on the base, and its corners in images.
+        Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
-        Parameters that are fixed, freed or known beforehand.
+        Fixed and freed parameters, and priors.
 
     Returns
     -------
@@ -110,33 +110,33 @@ def refine(
     Raises
     ------
     NotIdentifiable
-        If the data do not determine the parameters, from no start.
+        If the data do not determine the parameters, from any start.
     DidNotConverge
-        If the solver stops early from all starts, or most outlines or axes disagree with what it
-        found.
+        If the solver does not converge from any start, or most outlines or axes are outliers of the
+        fit.
     DatasetError
         If an outline or an axis cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 
-    def fitted(seen: Outlines) -> Solution:
+    def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, seen, settings, axes=axes, board=board, choices=choices
+            legs, measurements, used, settings, axes=axes, board=board, choices=choices
         )
         problem.require_determined()
         with naming_missing_lengths(problem):
-            return _best(problem, seen, starts)
+            return _fit_from_best_start(problem, used, starts)
 
-    return _without_wrong_arms(fitted, outlines, legs.nominal)
+    return _fit_without_wrong_arms(fitted, outlines, legs.nominal)
 
 
-def _without_wrong_arms(
+def _fit_without_wrong_arms(
     fitted: Callable[[Outlines], Solution], outlines: Outlines, legs: Sequence[Leg]
 ) -> Solution:
-    """Return a fit without the arms that are no cylinders on their motors, each as a whole.
+    """Fit; leave out arms that contradict the fit, with all their outlines, and fit again.
 
-    The rods do without arms, and outlines of another shape bend the fit or raise the noise of all.
-    So arms that a fit contradicts are left out, and all of them where it fails with them.
+    Rods alone determine the fit, and outlines of arms that are not cylinders would bias it or raise
+    the estimated noise. If the fit fails with arms, all of them are left out.
     """
     is_arm = are_of_arms(outlines, legs)
     notes, wrong = list[str](), arms_of_other_widths(outlines, is_arm)
@@ -146,55 +146,59 @@ def _without_wrong_arms(
             outlines = outlines.reject(left_out, Reason.ARM_LEFT_OUT)
             notes.append(f"Arms were left out as a whole: {wrong_arms_in_words(wrong, legs)}")
         try:
-            found = fitted(outlines)
-            fit = found.posterior
-            wrong = wrong_arms(fit.problem, fit.state, fit.noise, found.outlines)
+            solution = fitted(outlines)
+            fit = solution.posterior
+            wrong = wrong_arms(fit.problem, fit.state, fit.noise, solution.outlines)
         except (DidNotConverge, NotIdentifiable):
-            seen = np.unique(outlines.leg[is_arm & outlines.used]).tolist()
-            if not seen:
+            with_arms = np.unique(outlines.leg[is_arm & outlines.used]).tolist()
+            if not with_arms:
                 raise
-            wrong = dict.fromkeys(seen, "with whose outlines the joint fit fails")
+            wrong = dict.fromkeys(with_arms, "with whose outlines the joint fit fails")
         else:
             if not wrong:
-                return dataclasses.replace(found, notes=(*notes, *found.notes))
+                return dataclasses.replace(solution, notes=(*notes, *solution.notes))
 
 
-def _called(start: Start) -> str:
-    """Return where a start comes from, for sentences."""
-    known = {"nominal": "the nominal model", "staged": "the four steps"}
-    return known.get(start.label, f"the start '{start.label}'")
+def _origin(start: Start) -> str:
+    """Origin of a start, for messages."""
+    origins = {"nominal": "the nominal model", "staged": "the four steps"}
+    return origins.get(start.label, f"the start '{start.label}'")
 
 
-def _best(problem: FitProblem, outlines: Outlines, starts: Sequence[Start]) -> Solution:
-    """Return the fit from the start with the least cost."""
+def _fit_from_best_start(
+    problem: FitProblem, outlines: Outlines, starts: Sequence[Start]
+) -> Solution:
+    """Fit from the start with the lowest first minimum."""
     candidates: list[tuple[Start, Minimum[State]]] = []
     notes, details = list[str](), list[str]()
     failures: list[LegcalError] = []
     for start in starts:
-        begun = _called(start)
+        origin = _origin(start)
         try:
-            minimum = _first(problem, start)
+            minimum = _first_minimum(problem, start)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
-            notes.append(f"The joint fit could not start from {begun}. {failure}")
+            notes.append(f"The joint fit failed from {origin}. {failure}")
             continue
         if len(starts) > 1:
             cost = f"{minimum.cost:.6g}"
-            details.append(f"Started from {begun}, the joint fit came to a cost of {cost}.")
-        least = (1.0 + _COST_TOLERANCE) * minimum.cost
-        place = sum(other.cost <= least for _, other in candidates)
-        candidates.insert(place, (start, minimum))
+            details.append(f"From {origin}, the joint fit reached a cost of {cost}.")
+        bound_of_ties = (1.0 + _COST_TOLERANCE) * minimum.cost
+        rank = sum(other.cost <= bound_of_ties for _, other in candidates)
+        candidates.insert(rank, (start, minimum))
     for start, minimum in candidates:
         try:
-            found = _refined(problem, outlines, start, minimum)
+            solution = _refine_minimum(problem, outlines, start, minimum)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
-            notes.append(f"The joint fit started from {_called(start)} was given up. {failure}")
+            notes.append(f"The joint fit from {_origin(start)} was abandoned. {failure}")
             continue
-        if found.left_out or _shifted_px(found) > problem.settings.largest_rms_px:
-            found = _from_other_starts(problem, outlines, start, minimum, found)
-        _refuse_shifted(found, problem.settings.largest_rms_px)
-        return dataclasses.replace(found, notes=(*found.notes, *notes), details=tuple(details))
+        if solution.left_out or _common_mode_px(solution) > problem.settings.largest_rms_px:
+            solution = _retry_from_other_starts(problem, outlines, start, minimum, solution)
+        _refuse_common_mode(solution, problem.settings.largest_rms_px)
+        return dataclasses.replace(
+            solution, notes=(*solution.notes, *notes), details=tuple(details)
+        )
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
     problems = dict.fromkeys(problem for failure in failures for problem in failure.problems)
@@ -203,66 +207,66 @@ def _best(problem: FitProblem, outlines: Outlines, starts: Sequence[Start]) -> S
     )
 
 
-def _from_other_starts(
+def _retry_from_other_starts(
     problem: FitProblem,
     outlines: Outlines,
     start: Start,
     first: Minimum[State],
-    found: Solution,
+    best: Solution,
 ) -> Solution:
-    """Return what a fit that left out or moved a leg of a view finds from other models, if better.
+    """Retry from perturbed models after a fit that rejected a leg of a view; return the better fit.
 
-    Outlines of one leg in one view are not wrong together by chance: they are of another leg, or
-    the fit is at a wrong minimum, where it may pass through all others without an error. So nominal
-    models that are wrong otherwise are tried, until the fit leaves out no leg of a view, or several
-    starts come to the same minimum, which confirms that it is the outlines that are wrong.
+    Outlines of one leg in one view are not wrong together by chance: they show another leg, or the
+    fit is at a wrong minimum, possibly with small residuals elsewhere. Perturbed nominal models are
+    tried until a fit rejects no leg of a view, or several starts reach the same minimum, which
+    confirms that the outlines are wrong.
     """
-    rng, begin = np.random.default_rng(_SEED), problem.begin(start)
+    rng, start_state = np.random.default_rng(_SEED), problem.begin(start)
     n = problem.n_kinematic
-    unit = np.array([begin.mean_length if unit == "m" else 1.0 for unit in problem.units[:n]])
+    unit = np.array([start_state.mean_length if unit == "m" else 1.0 for unit in problem.units[:n]])
     n_same = 0
     for _ in range(problem.settings.other_starts):
         step = np.zeros(problem.size)
         step[:n] = _OTHER_MODEL * unit * rng.normal(size=n)
         try:
-            minimum = _first(problem, start, problem.moved(begin, step))
+            minimum = _first_minimum(problem, start, problem.moved(start_state, step))
             if minimum.cost > (1.0 - _SAME_COST) * first.cost:
                 n_same += minimum.cost < (1.0 + _SAME_COST) * first.cost
                 if n_same == _ENOUGH_STARTS:
-                    return dataclasses.replace(found, left_out=())
+                    return dataclasses.replace(best, left_out=())
                 continue
-            found = _refined(problem, outlines, start, minimum)
+            best = _refine_minimum(problem, outlines, start, minimum)
         except (DidNotConverge, NotIdentifiable):
             continue
-        if not found.left_out and _shifted_px(found) <= problem.settings.largest_rms_px:
+        if not best.left_out and _common_mode_px(best) <= problem.settings.largest_rms_px:
             break
         first, n_same = minimum, 0
-    return found
+    return best
 
 
-def _shifted_px(found: Solution) -> float:
-    """Return how far a fit moves outlines together, one standard deviation [px]."""
-    return max(found.quality.shared_px.values(), default=0.0)
+def _common_mode_px(solution: Solution) -> float:
+    """Largest standard deviation of common-mode edge biases [px]."""
+    return max(solution.quality.shared_px.values(), default=0.0)
 
 
-def _refuse_shifted(found: Solution, most_px: float) -> None:
-    """Raise DidNotConverge if a fit explains by light and blur what these cannot have done."""
-    shifted = _shifted_px(found)
+def _refuse_common_mode(solution: Solution, most_px: float) -> None:
+    """Raise DidNotConverge if common-mode edge biases are too large for light and blur."""
+    shifted = _common_mode_px(solution)
     if shifted > most_px:
-        kind = max(found.quality.shared_px, key=found.quality.shared_px.__getitem__)
+        kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
         raise DidNotConverge(
-            f"The joint fit ended where outlines are off together ({kind}) by {shifted:.1f} px, "
-            f"needed at most {most_px:g} px, which is more than light and blur "
-            "do; check camera poses, readings and outlines, or start nearer to the truth."
+            f"The joint fit ended with a common-mode error of outlines ({kind}) of {shifted:.1f} "
+            f"px, more than the {most_px:g} px that light and blur can explain; check camera "
+            "poses, readings and outlines, or start nearer to the truth."
         )
 
 
-def _first(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:
-    """Return the first minimum that a start leads to, or another begin near it."""
+def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:
+    """First minimum from a start, or from the state *begin* near it."""
     begin = problem.begin(start) if begin is None else begin
     try:
         if are_free(problem, begin):
-            return _first_of_free_poses(problem, begin)
+            return _first_minimum_with_free_poses(problem, begin)
         return first_minimum(*_held_at_start(problem, begin))
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, with_priors=True)
@@ -270,46 +274,48 @@ def _first(problem: FitProblem, start: Start, begin: State | None = None) -> Min
         raise naming_stated_values(problem, failure) from None
 
 
-def _first_of_free_poses(problem: FitProblem, begin: State) -> Minimum[State]:
-    """Return the first minimum, with other poses where some suit their images badly."""
+def _first_minimum_with_free_poses(problem: FitProblem, start_state: State) -> Minimum[State]:
+    """First minimum, with a search for better poses of images with large residuals."""
 
     def minimum(state: State, must_converge: bool = True) -> Minimum[State]:
         return first_minimum(*_held_at_start(problem, state), must_converge=must_converge)
 
     try:
-        found = minimum(begin)
-        if not have_outliers(problem, found.state):
-            return found
+        best = minimum(start_state)
+        if not have_outliers(problem, best.state):
+            return best
     except DidNotConverge:
-        found = None
-    # Poses that suit nothing slide on for ever: what comes before the last minimum need not end.
-    again = minimum(with_free_poses(problem, problem.projected(begin)), must_converge=False)
-    found = again if found is None or again.cost < found.cost else found
+        best = None
+    # Poses of wrong images drift without end: only the last minimisation has to converge.
+    candidate = minimum(
+        with_free_poses(problem, problem.projected(start_state)), must_converge=False
+    )
+    best = candidate if best is None or candidate.cost < best.cost else best
     for k in range(_POSE_ROUNDS):
-        if not have_outliers(problem, found.state):
+        if not have_outliers(problem, best.state):
             break
-        state = with_better_poses(problem, found.state, _PART_OF_MODEL, seed=k)
-        again = minimum(state, must_converge=False)
-        found = again if again.cost < found.cost else found
-    return found
+        state = with_better_poses(problem, best.state, _PART_OF_MODEL, seed=k)
+        candidate = minimum(state, must_converge=False)
+        best = candidate if candidate.cost < best.cost else best
+    return best
 
 
 def _held_at_start(
     problem: FitProblem, begin: State
 ) -> tuple[FitProblem, State, Mapping[str, Residuals] | None]:
-    """Return problem and state with directions held that are open at the start, and known rows."""
+    """Hold the directions that are open at the start; also return the rows computed there."""
     begin = problem.projected(begin)
     linear = linearize(problem, begin)
     try:
         held = open_directions(problem, begin, information(problem, begin, linear))
-    except NotIdentifiable:  # by accident of the start, or to be said of the minimum
+    except NotIdentifiable:  # at the start only, or reported at the minimum
         return problem, begin, linear.rows
     if len(held.basis):
         return *held_at_nominal(problem, begin, held), None
     return problem, begin, linear.rows
 
 
-def _refined(
+def _refine_minimum(
     problem: FitProblem,
     outlines: Outlines,
     start: Start,
@@ -320,37 +326,39 @@ def _refined(
     normal = information(problem, first.state, first.linear, problem.loss)
     held = open_directions(problem, first.state, normal)
     refuse_other_board(problem, first.state, normal)
-    free, state = problem, first.state
+    unheld, state = problem, first.state
     try:
         if len(held.basis):
             problem, state = held_at_nominal(problem, state, held)
-            there = first_minimum(problem, state)
-            state = there.state
-            first = dataclasses.replace(there, iterations=first.iterations + there.iterations)
+            continued = first_minimum(problem, state)
+            state = continued.state
+            first = dataclasses.replace(
+                continued, iterations=first.iterations + continued.iterations
+            )
         fit = fit_in_rounds(problem, first)
         normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
         refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
-        refuse_contradicted_values(free, start, state, with_priors=True)
-        _refuse_contradicted(free, state)
-        _refuse_undetermined(free, state)
+        refuse_contradicted_values(unheld, start, state, with_priors=True)
+        _refuse_contradicted(unheld, state)
+        _refuse_undetermined(unheld, state)
         if isinstance(failure, DidNotConverge):
-            raise naming_stated_values(free, failure) from None
+            raise naming_stated_values(unheld, failure) from None
         raise
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(free, start, state, with_priors=True)
+        refuse_contradicted_values(unheld, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
-    """Raise NotIdentifiable if that is why there is no minimum to converge to."""
+    """Raise NotIdentifiable if open directions explain a failed fit."""
     open_directions(problem, state, information(problem, state, linearize(problem, state)))
 
 
 def _refuse_contradicted(problem: FitProblem, state: State) -> None:
-    """Raise DidNotConverge if stated priors are why a fit fails."""
+    """Raise DidNotConverge if stated priors explain a failed fit."""
     claimed = problem.outlines.covariance
     noise = NoiseModel()
     if len(claimed):
@@ -361,12 +369,12 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:
-    """Raise DidNotConverge if the fit needs radii that are not those of the legs at all."""
+    """Raise DidNotConverge if fitted radii are far from the model's."""
     legs = problem.legs
     problems = [
         f"The joint fit ended with a radius of {1e3 * radius:.2f} mm for "
-        f"{legs.names[leg]}.{part}, the model has {1e3 * legs.radii[leg, part]:.2f} mm; they must "
-        "agree to a half; check the radius, and the outlines for edges that are swapped or "
+        f"{legs.names[leg]}.{part}; the model has {1e3 * legs.radii[leg, part]:.2f} mm, and they "
+        "must agree to 50 %; check the radius, and the outlines for edges that are swapped or "
         "belong to another leg."
         for (leg, part), radius in zip(problem.outlines.parts, state.radii, strict=True)
         if not abs(radius / legs.radii[leg, part] - 1.0) < _MAX_RADIUS_CHANGE
@@ -376,27 +384,27 @@ def _refuse_other_radii(problem: FitProblem, state: State) -> None:
 
 
 def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Array:
-    """Return the Cramer-Rao bound: the inverse of the information of a fit's data at a state.
+    """Return the Cramer-Rao bound: the inverse of the information at the true state.
 
     Parameters
     ----------
     problem : FitProblem
-        Built of data whose covariances count; of outlines and axes also the lines, as the place
-        where these are written: exact ones for the bound to the letter.
+        Built from data with the true covariances; outlines and axes are the linearisation points,
+        exact ones for the exact bound.
     truth : Start
         The true legs, cameras and poses.
     radii : (n_radii,) array, optional
-        The true radii [m]; nominal without it.
+        The true radii [m]; nominal by default.
 
     Returns
     -------
     (n, n) array
-        Covariance of ``problem.named`` with everything else unknown, priors used.
+        Covariance of ``problem.named`` with all other unknowns marginalised out; includes priors.
 
     Raises
     ------
     NotIdentifiable
-        If the data do not determine what moves the platform.
+        If an open direction moves the platform.
     """
     state = problem.begin(truth)
     state = state if radii is None else dataclasses.replace(state, radii=radii)

@@ -1,14 +1,13 @@
-"""Which gamma of a camera makes its outlines most likely, where nobody gives it.
+"""Maximum-likelihood gamma of a camera whose gamma is not given.
 
-Outlines are measured with a few gammas and fitted anew for each. Where a gamma is wrong, outlines
-lie off by different amounts, and what the fit leaves of them is larger. What is compared is the
-restricted likelihood of the fits, with noise and common-mode biases as each of them finds, of
-the same outlines: those that all of these fits use. A gamma at which outlines get lost could not be
-compared otherwise, since it seems right for those that are left.
+Outlines are measured with a few gammas, and the joint fit is repeated for each. With a wrong gamma,
+outlines are displaced by different amounts, and residuals increase. The restricted likelihoods of
+the fits are compared, each with its estimated noise and common-mode biases, over the outlines that
+all fits use; otherwise a gamma that loses outlines would look right for the remaining ones.
 
-Linear photographs have a gamma of 1, those encoded for screens one near 2.2: trials begin at 1 and
-go on in steps of :data:`GAMMA_STEP` until the likelihood falls. A parabola through the best three
-gives the gamma. Where the likelihood is flat, the first one stays.
+Linear photographs have a gamma of 1, sRGB ones about 2.2: trials begin at 1 and go on in steps of
+:data:`GAMMA_STEP` until the likelihood falls. The estimate is the vertex of a parabola through the
+best three. Where the likelihood is flat, the first gamma stays.
 """
 
 from __future__ import annotations
@@ -28,25 +27,25 @@ from legcal.estimation.solver import minimise
 from legcal.estimation.uncertainty import restricted_log_likelihood
 from legcal.geometry.types import Array
 
-GAMMA_RANGE = (1.0, 3.0)  # of gammas that are tried: linear, or encoded for screens
-GAMMA_STEP = 0.4  # of the logarithm
-GAMMA_TOLERANCE = 0.12  # of the logarithm: smaller than LIMB_SIGMA
+GAMMA_RANGE = (1.0, 3.0)  # of trials: from linear to beyond sRGB
+GAMMA_STEP = 0.4  # in ln gamma
+GAMMA_TOLERANCE = 0.12  # in ln gamma; smaller than LIMB_SIGMA
 MAX_GAMMA_TRIALS = 4  # after the first one
-SIGNIFICANCE = 2.0  # standard deviations: less may be chance
+SIGNIFICANCE = 2.0  # standard deviations
 
-Views = tuple[str, ...]  # those of one camera
+Views = tuple[str, ...]  # of one camera
 
 
 @dataclass(frozen=True, eq=False)
 class GammaTrials:
-    """Fits to outlines that were measured with several gammas, the first one first.
+    """Fits to outlines measured with several gammas, in the order of trials.
 
     Attributes
     ----------
     cameras : tuple of tuple of str
-        The views of each camera whose gamma is searched for.
+        Views of each camera with an unknown gamma.
     solutions : tuple of Solution or None
-        What was fitted in each trial; None where nothing fits.
+        The fit of each trial; None where it failed.
     log_gamma : (n_trials, n_cameras) array
         Logarithms of the gammas.
     """
@@ -57,13 +56,17 @@ class GammaTrials:
 
     @classmethod
     def begun(cls, first: Solution, given: Mapping[str, float]) -> GammaTrials:
-        """Return the first trial; gammas of some views are given by outlines that are kept."""
-        found = [one for one in first.gammas if not any(view in given for view in one.views)]
-        logs = np.log([one.measured_with for one in found])
-        return cls(tuple(one.views for one in found), (first,), logs[None])
+        """Start with the first fit; gammas of views in *given* are fixed by earlier outlines."""
+        unknown = [
+            estimate
+            for estimate in first.gammas
+            if not any(view in given for view in estimate.views)
+        ]
+        logs = np.log([estimate.measured_with for estimate in unknown])
+        return cls(tuple(estimate.views for estimate in unknown), (first,), logs[None])
 
     def tried(self, gammas: Mapping[str, float], solution: Solution | None) -> GammaTrials:
-        """Return the trials with one more, of gammas by view."""
+        """Append a trial with gammas by view."""
         row = np.log([[gammas[views[0]] for views in self.cameras]])
         return replace(
             self,
@@ -73,35 +76,37 @@ class GammaTrials:
 
     @property
     def best(self) -> int:
-        """The number of the most likely trial."""
+        """Index of the most likely trial."""
         return int(np.argmax(self.likelihoods.sum(axis=1)))
 
     @cached_property
     def likelihoods(self) -> Array:
-        """Logarithms of the likelihood of outlines of each camera, (n_trials, n_cameras).
+        """Log-likelihoods by camera with the prior of gamma, (n_trials, n_cameras).
 
-        With what is known of gammas beforehand; minus infinity where nothing fits.
+        Minus infinity where the fit failed.
         """
-        known = [solution for solution in self.solutions if solution is not None]
-        found = np.full(self.log_gamma.shape, -np.inf)
-        has = np.array([solution is not None for solution in self.solutions])
-        found[has] = log_likelihoods(known, self.cameras)
-        return np.asarray(found - 0.5 * (self.log_gamma / GAMMA_SIGMA) ** 2)
+        fitted = [solution for solution in self.solutions if solution is not None]
+        log_likelihood = np.full(self.log_gamma.shape, -np.inf)
+        is_fitted = np.array([solution is not None for solution in self.solutions])
+        log_likelihood[is_fitted] = log_likelihoods(fitted, self.cameras)
+        return np.asarray(log_likelihood - 0.5 * (self.log_gamma / GAMMA_SIGMA) ** 2)
 
     def next(self) -> dict[str, float]:
-        """Return the gammas to try next, by view; nothing where no other one has to be tried."""
+        """Return the gammas of the next trial, by view; empty if no trial is needed."""
         if not self.cameras or len(self.solutions) > MAX_GAMMA_TRIALS:
             return {}
         merits = self.likelihoods.T
-        every = list(zip(self.log_gamma.T, merits, strict=True))
-        ahead = [next_trial(*one) for one in every]
-        if all(one is None for one in ahead):
+        trials = list(zip(self.log_gamma.T, merits, strict=True))
+        next_logs = [next_trial(*trial) for trial in trials]
+        if all(trial is None for trial in next_logs):
             return {}
-        at_best = [float(tried[np.argmax(merit)]) for tried, merit in every]
-        return self._by_view([b if a is None else a for a, b in zip(ahead, at_best, strict=True)])
+        best_logs = [float(tried[np.argmax(merit)]) for tried, merit in trials]
+        return self._by_view(
+            [b if a is None else a for a, b in zip(next_logs, best_logs, strict=True)]
+        )
 
     def found(self) -> dict[str, float]:
-        """Return the most likely gammas by view; nothing where the first ones are near these."""
+        """Return the most likely gammas by view; empty if the first trial is close enough."""
         peaks = [
             most_likely(tried, merit)
             for tried, merit in zip(self.log_gamma.T, self.likelihoods.T, strict=True)
@@ -110,23 +115,23 @@ class GammaTrials:
         return self._by_view(peaks) if np.any(moved) else {}
 
     def notes(self, refused: Mapping[str, float]) -> tuple[str, ...]:
-        """Return notes on cameras whose gamma stays open; some gammas may have been *refused*."""
+        """Return notes on cameras with an undecided gamma; *refused* gammas lose outlines."""
         notes = []
         for views, tried, merit in zip(
             self.cameras, self.log_gamma.T, self.likelihoods.T, strict=True
         ):
             if views[0] in refused:
-                why = f"fewer of its outlines can be used with {refused[views[0]]:.2f}"
+                why = f"fewer of its outlines are usable with {refused[views[0]]:.2f}"
             elif np.isfinite(merit).sum() == 1 < len(merit):
-                why = "no other one could be fitted"
+                why = "the fit failed with every other gamma"
             elif (rival := _rival(tried, merit)) is not None:
                 why = f"its outlines are about as likely with {np.exp(rival):.2f}"
             else:
                 continue
             notes.append(
-                f"The gamma of the camera of {few_views(views)} stays undecided: {why}, as where "
-                "a camera has processed its photographs; write gamma of the views in dataset.yaml "
-                "if you know it, or switch the processing off."
+                f"The gamma of the camera of {few_views(views)} is undecided: {why}; processing in "
+                "the camera is a common cause; write gamma of the views in dataset.yaml if you "
+                "know it, or switch the processing off."
             )
         return tuple(notes)
 
@@ -139,21 +144,21 @@ class GammaTrials:
 
 
 def next_trial(log_gamma: Array, merit: Array) -> float | None:
-    """Return the logarithm of the gamma to try next, beside the most likely one, if any."""
+    """Return ln gamma of the next trial beside the most likely one, if any."""
     best = float(log_gamma[np.argmax(merit)])
     least, most = np.log(GAMMA_RANGE).tolist()
-    beyond = [float(np.clip(best + side * GAMMA_STEP, least, most)) for side in (1.0, -1.0)]
-    for there, side in zip(beyond, (1.0, -1.0), strict=True):
-        is_new = abs(there - best) > GAMMA_TOLERANCE
+    neighbours = [float(np.clip(best + side * GAMMA_STEP, least, most)) for side in (1.0, -1.0)]
+    for candidate, side in zip(neighbours, (1.0, -1.0), strict=True):
+        is_new = abs(candidate - best) > GAMMA_TOLERANCE
         if is_new and not np.any(side * (log_gamma - best) > GAMMA_TOLERANCE):
-            return there
+            return candidate
     return None
 
 
 def most_likely(log_gamma: Array, merit: Array) -> float:
-    """Return the most likely logarithm of a gamma, by a parabola through the best three trials.
+    """Return the most likely ln gamma, by a parabola through the best three trials.
 
-    That of the first trial where no other one is clearly better.
+    The first trial wins unless another one is significantly better.
     """
     x, y, i = _in_order(log_gamma, merit)
     if y[i] - merit[0] <= 0.5 * SIGNIFICANCE**2:
@@ -161,52 +166,56 @@ def most_likely(log_gamma: Array, merit: Array) -> float:
     if not 0 < i < len(x) - 1 or not np.all(np.isfinite(y[i - 1 : i + 2])):
         return float(x[i])
     left, right = (y[i] - y[i - 1]) / (x[i] - x[i - 1]), (y[i + 1] - y[i]) / (x[i + 1] - x[i])
-    at = 0.5 * (x[i - 1] + x[i]), 0.5 * (x[i] + x[i + 1])
-    return float(at[0] + (at[1] - at[0]) * left / (left - right)) if left > right else float(x[i])
+    midpoints = 0.5 * (x[i - 1] + x[i]), 0.5 * (x[i] + x[i + 1])
+    return (
+        float(midpoints[0] + (midpoints[1] - midpoints[0]) * left / (left - right))
+        if left > right
+        else float(x[i])
+    )
 
 
 def _rival(log_gamma: Array, merit: Array) -> float | None:
-    """Return the logarithm of another gamma that is nearly as likely as the best one, if any."""
+    """Return ln gamma of another trial nearly as likely as the best one, if any."""
     x, y, i = _in_order(log_gamma, merit)
     near = [k for k in range(len(x)) if k != i and y[i] - y[k] <= 0.5 * SIGNIFICANCE**2]
     return float(x[near[0]]) if near else None
 
 
 def _in_order(log_gamma: Array, merit: Array) -> tuple[Array, Array, int]:
-    """Return trials of different gammas, rising, the most likely of each, and which is the best."""
+    """Sort trials by gamma, the most likely one of equal gammas; also return the best index."""
     order = sorted(range(len(merit)), key=lambda k: (log_gamma[k], -merit[k]))
-    place = [k for n, k in enumerate(order) if n == 0 or log_gamma[k] > log_gamma[order[n - 1]]]
-    return log_gamma[place], merit[place], int(np.argmax(merit[place]))
+    distinct = [k for n, k in enumerate(order) if n == 0 or log_gamma[k] > log_gamma[order[n - 1]]]
+    return log_gamma[distinct], merit[distinct], int(np.argmax(merit[distinct]))
 
 
 def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> Array:
-    """Return logarithms of the restricted likelihood (n_solutions, n_cameras) of the same outlines.
+    """Return restricted log-likelihoods (n_solutions, n_cameras) of the outlines used in all fits.
 
-    Of all that are used in all solutions, with noise and biases as they are most likely for each.
-    Every camera has its outlines, and of what they have in common its part.
+    Noise and biases are the most likely ones of each fit. The terms that do not belong to single
+    outlines are divided among cameras by their numbers of outlines.
     """
-    same = set.intersection(*(solution.outlines.used_keys() for solution in solutions))
-    found = np.zeros((len(solutions), len(cameras)))
+    common_keys = set.intersection(*(solution.outlines.used_keys() for solution in solutions))
+    log_likelihood = np.zeros((len(solutions), len(cameras)))
     for i, solution in enumerate(solutions):
-        fit, of = solution.posterior, solution.outlines.row_keys()
+        fit, key_of_row = solution.posterior, solution.outlines.row_keys()
         o = fit.problem.outlines
-        kept = np.array([of[k] in same for k in o.index.tolist()], dtype=np.bool_)
+        kept = np.array([key_of_row[k] in common_keys for k in o.index.tolist()], dtype=np.bool_)
         problem, state = with_edge_biases(fit.problem, fit.state, fit.edge_biases.likeliest)
         problem = problem.weighted(fit.noise, kept)
         minimum = minimise(problem, state, is_near=True)
         norms = minimum.linear["outlines"].squared_norms
-        widths = np.linalg.slogdet(fit.noise.covariance(o.covariance))[1]
-        own = -0.5 * (norms + widths) * kept
-        common = restricted_log_likelihood(problem, minimum) + 0.5 * float(norms.sum())
+        log_determinants = np.linalg.slogdet(fit.noise.covariance(o.covariance))[1]
+        log_densities = -0.5 * (norms + log_determinants) * kept
+        shared = restricted_log_likelihood(problem, minimum) + 0.5 * float(norms.sum())
         for c, views in enumerate(cameras):
-            shown = np.array([name in views for name in o.views], dtype=np.bool_)[o.view]
-            part = float(np.sum(shown & kept)) / max(float(np.sum(kept)), 1.0)
-            found[i, c] = own[shown].sum() + part * common
-    return found
+            of_camera = np.array([name in views for name in o.views], dtype=np.bool_)[o.view]
+            share = float(np.sum(of_camera & kept)) / max(float(np.sum(kept)), 1.0)
+            log_likelihood[i, c] = log_densities[of_camera].sum() + share * shared
+    return log_likelihood
 
 
 def loses_outlines(before: Outlines, after: Outlines) -> bool:
-    """Say whether fewer outlines are used than before, by more than chance (McNemar's test)."""
+    """Whether significantly fewer outlines are used than before (McNemar's test)."""
     used, still = before.used_keys(), after.used_keys()
     lost, gained = len(used - still), len(still - used)
     return bool(lost - gained > SIGNIFICANCE * np.sqrt(lost + gained))

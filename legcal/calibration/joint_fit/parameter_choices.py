@@ -1,4 +1,4 @@
-"""Which parameters are estimated, fixed or known: choices, and how overrides resolve to them."""
+"""Estimated, fixed and prior-constrained parameters: choices, resolved from overrides."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_valu
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a parameter before the fit: a mean and a standard deviation [its unit]."""
+    """A Gaussian prior on a parameter: mean and standard deviation [its unit]."""
 
     mean: float
     sigma: float
@@ -39,7 +39,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class KnownIntrinsics:
-    """What is known of all intrinsics of a camera, in the order of ``intrinsic_names``."""
+    """A prior on all intrinsics of a camera, in the order of ``intrinsic_names``."""
 
     mean: Array  # (n,) [px; distortion without unit]
     covariance: Array  # (n, n) zero for what is exact
@@ -49,54 +49,54 @@ class KnownIntrinsics:
 class Choices:
     """Choices of parameters by their full names.
 
-    Without any the fit estimates all kinematic parameters except twists, radii with a prior, and
-    intrinsics whose camera file states a covariance, which is their prior; others are fixed. What
-    is chosen of an intrinsic takes it out of that covariance, whose others stay as they are.
+    By default the fit estimates all kinematic parameters except twists, radii with a prior, and
+    intrinsics with the covariance of their camera file as a prior; others are fixed. A choice for
+    an intrinsic replaces its part of that covariance.
     """
 
     fixed: frozenset[str] = frozenset()  # at nominal, or at ``values``
     free: frozenset[str] = frozenset()  # without a prior: radii, and what is fixed by default
     priors: Mapping[str, Prior] = field(default_factory=dict)  # in place of those by default
     values: Mapping[str, float] = field(default_factory=dict)  # [m, rad, px], axes as angles
-    notes: tuple[str, ...] = ()  # what gave way to what
+    notes: tuple[str, ...] = ()  # on overridden choices
     least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by edge_biases.KINDS
-    # by the view that stands for a camera, in place of what its file states
+    # by the representative view of a camera, in place of the covariance of its file
     cameras: Mapping[str, KnownIntrinsics] = field(default_factory=dict)
 
     def holds(self, name: str, *, by_default: bool = False) -> bool:
-        """Say whether a parameter is held; ``by_default``: whether it is without a choice."""
+        """Whether a parameter is fixed; *by_default*: whether it is without a choice."""
         if name in self.fixed:
             return True
         return by_default and name not in self.free and name not in self.priors
 
     def document(self) -> dict[str, object]:
-        """Return what was chosen as JSON has it; nothing where nothing was."""
-        found = {
+        """Return the choices for JSON, without empty entries."""
+        document = {
             "fixed": sorted(self.fixed - self.values.keys()),
             "fixed_at": dict(sorted(self.values.items())),
             "free": sorted(self.free),
             "priors": {name: [p.mean, p.sigma] for name, p in sorted(self.priors.items())},
             "cameras": {
-                name: [known.mean.tolist(), known.covariance.tolist()]
-                for name, known in sorted(self.cameras.items())
+                name: [intrinsics.mean.tolist(), intrinsics.covariance.tolist()]
+                for name, intrinsics in sorted(self.cameras.items())
             },
             "least_shared_px": dict(sorted(self.least_shared_px.items())),
         }
-        return {key: value for key, value in found.items() if value}
+        return {key: value for key, value in document.items() if value}
 
 
 NO_CHOICES = Choices()
 
 ParameterKind = Literal["kinematic", "radius", "intrinsic", "board"]
-_MEASURED_RATIO = 1.15  # between a measured distance of joints and that of a model that is usable
-_RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
+_MEASURED_RATIO = 1.15  # largest plausible ratio of measured and nominal distances of joints
+_RATIO = 10.0  # of a radius or length to its nominal value; more is a wrong unit
 _FOCAL_RATIO = 2.0
 _COEFFICIENT = 1e3  # of distortion; far more than any lens has
 
 
 @dataclass(frozen=True)
 class KnownParameter:
-    """A parameter and what values make sense for it."""
+    """A parameter with the limits of plausible values."""
 
     nominal: float  # its value in the model or camera file [unit]
     unit: str  # its unit; "" for coefficients of distortion and for the size of a board
@@ -112,29 +112,29 @@ class KnownParameters:
     # the parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
     # calibration board
     by_name: Mapping[str, KnownParameter]
-    # names that look like parameters and are none, and why: the end of a sentence
+    # names that look like parameters but are not, and the reason: the end of a sentence
     others: Mapping[str, str]
-    # other names of intrinsics, and the one that counts: views of one camera share them
+    # alternative names of intrinsics, to canonical names: views of one camera share them
     synonyms: Mapping[str, str]
-    # distances of two joints, by both names with a colon: what a person can measure
+    # distances of two joints, by both names with a colon: measurable by hand
     lengths: Mapping[str, KnownParameter] = field(default_factory=dict)
 
     def parameter(self, name: str) -> KnownParameter:
-        """Return a parameter, or a distance of joints, by the name that counts."""
+        """Return a parameter, or a distance of joints, by its canonical name."""
         return self.by_name[name] if name in self.by_name else self.lengths[name]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names by which a parameter may be called."""
+        """All names of parameters, with synonyms."""
         return (*self.by_name, *self.synonyms)
 
     def counted(self, name: str) -> str:
-        """Return the name that counts for a name."""
+        """Return the canonical name."""
         return self.synonyms.get(name, name)
 
 
 def board_scale(link: Link) -> str:
-    """Return the name of the factor on the dimensions of the calibration board on a link."""
+    """Name of the scale factor of the calibration board on a link."""
     return f"{board_name(link)}.scale"
 
 
@@ -167,41 +167,43 @@ def _lengths(machine: Machine) -> dict[str, KnownParameter]:
 
     Joints at A that move are where they are at reading 0.
     """
-    found: dict[str, KnownParameter] = {}
+    lengths: dict[str, KnownParameter] = {}
     for side in ("base", "platform"):
         points = machine.A_base if side == "base" else machine.B_platform
-        for (j, one), (k, other) in permutations(enumerate(machine.leg_names), 2):
+        for (j, first_leg), (k, second_leg) in permutations(enumerate(machine.leg_names), 2):
             nominal = float(np.linalg.norm(points[j] - points[k]))
             limits = nominal / _RATIO, nominal * _RATIO
-            name = f"{one}.{side}:{other}.{side}"
-            found[name] = KnownParameter(nominal, "m", "kinematic", *limits)
-    return found
+            name = f"{first_leg}.{side}:{second_leg}.{side}"
+            lengths[name] = KnownParameter(nominal, "m", "kinematic", *limits)
+    return lengths
 
 
 def joints_of_length(name: str) -> tuple[tuple[str, str], tuple[str, str]] | None:
-    """Return leg and side of both joints that a measured length is between, None if it is none."""
+    """Parse the name of a distance: leg and side of both joints; None for another name."""
     ends = [tuple(end.rpartition(".")[::2]) for end in name.split(":")]
     if len(ends) != 2:
         return None
-    (one, side), (other, there) = ends
-    return (one, side), (other, there)
+    (leg, side), (other_leg, other_side) = ends
+    return (leg, side), (other_leg, other_side)
 
 
 def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
     """Return the kinematic parameters with their nominal values."""
-    legs, found = geometries(machine), parametrization_of(machine, twists=True)
-    values = vector_of(found, legs, legs)
-    metres = np.array(found.units) == "m"
+    legs, parametrization = geometries(machine), parametrization_of(machine, twists=True)
+    values = vector_of(parametrization, legs, legs)
+    metres = np.array(parametrization.units) == "m"
     size = float(np.abs(values[metres]).max())
-    known = {}
-    for name, unit, nominal in zip(found.names, found.units, values.tolist(), strict=True):
+    parameters = {}
+    for name, unit, nominal in zip(
+        parametrization.names, parametrization.units, values.tolist(), strict=True
+    ):
         least, most = -np.pi, np.pi
         if unit == "m":
             least, most = nominal - size, nominal + size
         if ParameterId.parse(name).kind == "length":
             least = nominal / _RATIO
-        known[name] = KnownParameter(nominal, unit, "kinematic", least, most)
-    return known
+        parameters[name] = KnownParameter(nominal, unit, "kinematic", least, most)
+    return parameters
 
 
 def _radii(machine: Machine) -> Iterator[tuple[str, KnownParameter]]:
@@ -216,7 +218,7 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
     """Return the numbers of cameras, and the other names that they have."""
     cameras = [view.camera for view in views]
     owners = shared_cameras([view.name for view in views], cameras)
-    known: dict[str, KnownParameter] = {}
+    parameters: dict[str, KnownParameter] = {}
     synonyms: dict[str, str] = {}
     for view, camera, owner in zip(views, cameras, owners, strict=True):
         values = intrinsic_values(camera).tolist()
@@ -231,12 +233,12 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
                 "fy": (nominal / _FOCAL_RATIO, nominal * _FOCAL_RATIO),
             }.get(name, (-_COEFFICIENT, _COEFFICIENT))
             unit = intrinsic_unit(name)
-            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits)
-    return known, synonyms
+            parameters[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits)
+    return parameters, synonyms
 
 
 def _no_parameters(machine: Machine) -> dict[str, str]:
-    """Return the names that look like parameters of a machine and are none, and why."""
+    """Names that look like parameters of a machine but are not, with the reason."""
     free = free_coordinates(len(machine.legs), machine.frame_legs)
     known = parametrization_of(machine, twists=True).names
     others: dict[str, str] = {}
@@ -261,7 +263,7 @@ def _no_parameters(machine: Machine) -> dict[str, str]:
 
 
 def _other_lengths(leg: Leg) -> dict[str, str]:
-    """Return the names of the length and offset that a leg does not have, and why."""
+    """Names of the length or offset that a leg does not have, with the reason."""
     offset, length = f"{leg.name}.offset", f"{leg.name}.length"
     if leg.kind is LegKind.CONSTANT:
         return {offset: f"a leg of constant length, whose parameter is {length}"}
@@ -275,43 +277,44 @@ _DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed
 
 
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
-    """Return the choices that overrides come to.
+    """Resolve overrides to choices.
 
     Raises
     ------
     UsageError, DatasetError
-        With one sentence for each name that is no parameter's, value that cannot be meant, and
-        pair of overrides that contradict each other.
+        One sentence for each unknown name, implausible value, and pair of contradictory overrides.
     """
-    in_file, its_problems = _decisions([w for w in overrides if w.in_file], known)
-    of_call, problems = _decisions([w for w in overrides if not w.in_file], known)
+    from_file, problems_of_file = _decisions([w for w in overrides if w.in_file], known)
+    from_call, problems = _decisions([w for w in overrides if not w.in_file], known)
     if problems:
-        raise UsageError([*problems, *its_problems])
-    if its_problems:
-        raise DatasetError(its_problems)
-    decisions = in_file | of_call
-    given_way = [name for name in in_file if of_call.get(name, in_file[name]) != in_file[name]]
-    note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
+        raise UsageError([*problems, *problems_of_file])
+    if problems_of_file:
+        raise DatasetError(problems_of_file)
+    decisions = from_file | from_call
+    overridden = [
+        name for name in from_file if from_call.get(name, from_file[name]) != from_file[name]
+    ]
+    note = f"This run overrides the choices of the dataset for {', '.join(overridden)}."
     stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}
     choices = Choices(
         frozenset(name for name, d in decisions.items() if d.action == "fixed"),
         frozenset(name for name, d in decisions.items() if d.action == "free"),
         {name: Prior(value, sigma) for name, (value, sigma) in stated.items() if sigma is not None},
         {name: value for name, (value, sigma) in stated.items() if sigma is None},
-        (note,) if given_way else (),
+        (note,) if overridden else (),
     )
     names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
     if all(choices.holds(n, by_default=is_held_by_default(n)) for n in names):
         raise UsageError(
-            "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
-            "at least that is not; fix fewer of them."
+            "The mechanism could not be calibrated: all of its parameters are fixed; fix fewer of "
+            "them."
         )
     return choices
 
 
 @dataclass(frozen=True)
 class _Decision:
-    """What is to be done with one parameter, in its unit."""
+    """The action for one parameter, values in its unit."""
 
     action: Action
     value: float | None = None
@@ -321,8 +324,8 @@ class _Decision:
 def _decisions(
     overrides: Sequence[Override], known: KnownParameters
 ) -> tuple[dict[str, _Decision], list[str]]:
-    """Return what overrides of one source mean for each parameter, and what is wrong with them."""
-    found: dict[str, list[tuple[Override, _Decision]]] = {}
+    """Decisions of the overrides of one source by parameter, and problems."""
+    decisions: dict[str, list[tuple[Override, _Decision]]] = {}
     problems: list[str] = []
     for override in overrides:
         names = _matches(override, known)
@@ -334,20 +337,22 @@ def _decisions(
             if problem:
                 problems.append(problem)
             else:
-                found.setdefault(name, []).append((override, _decision(override, name, parameter)))
+                decisions.setdefault(name, []).append(
+                    (override, _decision(override, name, parameter))
+                )
     problems += [
-        p for name, several in found.items() if (p := _contradiction(name, several, known))
+        p for name, group in decisions.items() if (p := _contradiction(name, group, known))
     ]
-    # Of several that agree one that states a value says most.
+    # Of several consistent decisions, one with a value wins.
     strongest = {
-        name: next((d for _, d in several if d.value is not None), several[0][1])
-        for name, several in found.items()
+        name: next((d for _, d in group if d.value is not None), group[0][1])
+        for name, group in decisions.items()
     }
     return strongest, problems
 
 
 def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
-    """Return the parameters that an override is about, by the names that count."""
+    """Canonical names of the parameters that an override matches."""
     if override.name in known.names:
         return (known.counted(override.name),)
     if ":" in override.name:
@@ -357,7 +362,7 @@ def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
 
 
 def _matching_length(override: Override, known: KnownParameters) -> tuple[str, ...]:
-    """Return the distance of joints that an override is about; that of a rod is its length."""
+    """Return the distance of joints that an override matches; of both ends of a rod, its length."""
     if override.action != "prior":
         return ()
     joints = joints_of_length(override.name)
@@ -365,26 +370,26 @@ def _matching_length(override: Override, known: KnownParameters) -> tuple[str, .
         name = f"{joints[0][0]}.length"
         sides = {side for _, side in joints}
         return (name,) if name in known.by_name and sides == {"base", "platform"} else ()
-    one, _, other = override.name.partition(":")
-    pair = min(override.name, f"{other}:{one}")
+    first, _, second = override.name.partition(":")
+    pair = min(override.name, f"{second}:{first}")
     return (pair,) if pair in known.lengths else ()
 
 
 def _no_match(override: Override, known: KnownParameters) -> str:
-    """Return the sentence about a name that is no parameter's."""
+    """Describe an override that matches no parameter."""
     if ":" in override.name:
         return (
-            f"{override.where} could not be used: found no two joints whose distance is that, "
-            "needed LEG.base:LEG.base or LEG.platform:LEG.platform of different legs, or both ends "
-            f"of a rod, with a value and its sigma; {closest(override.name, known.lengths)}"
+            f"{override.where} could not be used: it is not a distance between two joints; write "
+            "LEG.base:LEG.base or LEG.platform:LEG.platform of different legs, or both ends of a "
+            f"rod, with a value and its sigma; {closest(override.name, known.lengths)}"
         )
     others = [
         name for name in known.others if name == override.name or fnmatchcase(name, override.name)
     ]
     if others:
         return (
-            f"{override.where} could not be used: found {others[0]}, {known.others[others[0]]}, "
-            "needed a parameter; leave it out."
+            f"{override.where} could not be used: {others[0]} is not a parameter but "
+            f"{known.others[others[0]]}; leave it out."
         )
     is_pattern = not set(override.name).isdisjoint("*?[")
     found = "a pattern that no name matches" if is_pattern else "an unknown name"
@@ -395,7 +400,7 @@ def _no_match(override: Override, known: KnownParameters) -> str:
 
 
 def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
-    """Return what is wrong with the value that an override states for a parameter, if anything."""
+    """Describe an implausible value of an override, if it is."""
     stated = override.stated
     if stated is None:
         return ""
@@ -424,7 +429,7 @@ def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
 
 
 def _decision(override: Override, name: str, parameter: KnownParameter) -> _Decision:
-    """Return what an override comes to for one parameter."""
+    """Decision of an override for one parameter."""
     if override.stated is None:
         return _Decision(override.action)
     value = override.stated.value
@@ -436,7 +441,7 @@ def _decision(override: Override, name: str, parameter: KnownParameter) -> _Deci
 def _contradiction(
     name: str, several: Sequence[tuple[Override, _Decision]], known: KnownParameters
 ) -> str:
-    """Return the sentence about overrides of one parameter that contradict each other, if any."""
+    """Describe contradictory overrides of one parameter, if they are."""
     fixed = [override for override, decision in several if decision.action == "fixed"]
     others = [override for override, decision in several if decision.action != "fixed"]
     stated = {(d.value, d.sigma): override for override, d in several if d.value is not None}
@@ -457,12 +462,12 @@ def _contradiction(
 
 
 def _quoted(override: Override) -> str:
-    """Return where an override was said, as part of a sentence."""
+    """Source of an override, inside a sentence."""
     return (
         override.where[:1].lower() + override.where[1:] if not override.in_file else override.where
     )
 
 
 def _with_unit(value: float, parameter: KnownParameter) -> str:
-    """Return a value and its unit."""
+    """Format a value with its unit."""
     return f"{value:.4g} {parameter.unit}".rstrip()

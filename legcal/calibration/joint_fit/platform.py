@@ -1,7 +1,7 @@
-"""What a fit means at the platform: what it changes there, and how well that is known.
+"""Accuracy of a fit at the platform: change of its poses, and their predicted errors.
 
-Errors over the workspace are those at a hundred poses all over the travel, the same at which
-``legcal evaluate`` compares two models.
+Errors over the workspace are at a hundred poses all over the travel, the poses at which ``legcal
+evaluate`` compares two models.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from legcal.machine.parameters import Parametrization, geometries
 
 @dataclass(frozen=True, eq=False)
 class PlatformError:
-    """How far the platform is off at poses, one number a pose.
+    """Errors of the platform at poses.
 
     Notes
     -----
@@ -80,48 +80,47 @@ def platform_by_parameters(
 
 
 def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:
-    """Return one standard deviation of the platform at poses."""
+    """Return the predicted error of the platform at poses, one standard deviation."""
     variance = np.sum((by_parameters @ covariance) * by_parameters, axis=2)
     return PlatformError(_root_of_sum(variance[:, 3:]), _root_of_sum(variance[:, :3]))
 
 
 def moved_by(by_parameters: Array, changes: Array) -> PlatformError:
-    """Return how far small changes of the parameters move the platform at poses."""
+    """Return the motion of the platform at poses by small changes of the parameters."""
     motion = np.sum((by_parameters @ changes) ** 2, axis=2)
     return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
 
 
 def _root_of_sum(squares: Array) -> Array:
-    """Return the root of sums of squares, (n_poses,), which rounding may leave below zero."""
+    """Root of sums of squares, (n_poses,), clipped against negative rounding."""
     return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))
 
 
-# Of the length of a leg
+# Leg lengths: residual of a pose that reaches its readings
 _REACHED = 2.5e-8
-_REACHED_BY_ALL = 0.03  # how far readings of redundant motors may disagree
+_REACHED_BY_ALL = 0.03  # with redundant motors, whose readings may disagree
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What a mistake in something that counts as known would do to the platform."""
+    """Effect of an error of a fixed quantity on the platform."""
 
-    what: str  # the mistake: ``a focal length 1 % longer``
-    # How far the platform would move, over the workspace; at the readings of the dataset where that
-    # is not known
+    what: str  # the error: ``a focal length 1 % longer``
+    # Motion of the platform over the workspace; at the readings of the dataset if that is unknown
     error: PlatformError
 
 
 @brief
 @dataclass(frozen=True, eq=False)
 class PlatformAccuracy:
-    """What a fit means at the platform; angles and distances as in :class:`PlatformError`."""
+    """Accuracy at the platform; angles and distances as in :class:`PlatformError`."""
 
     # From the nominal to the calibrated platform at the readings of every pose
     change: PlatformError
     sigma: PlatformError  # Predicted error of the calibrated platform there, one standard deviation
-    # The same at poses all over the travel; None where the model cannot reach them
+    # Predicted error over the travel; None where the model cannot reach it
     workspace: PlatformError | None
-    effects: tuple[Effect, ...]  # what mistakes in what counts as known would do
+    effects: tuple[Effect, ...]  # of errors of fixed quantities
 
 
 def platform_accuracy(
@@ -133,7 +132,7 @@ def platform_accuracy(
     T_Rb_Re: Sequence[RigidTransform],
     sensitivities: Sequence[Sensitivity] = (),
 ) -> PlatformAccuracy | None:
-    """Return what calibrated legs mean at the platform.
+    """Return the accuracy of calibrated legs at the platform.
 
     Raises
     ------
@@ -144,27 +143,31 @@ def platform_accuracy(
         return None
 
     def follow(poses: Sequence[RigidTransform]) -> Array:
-        """Return how calibrated poses move with the parameters."""
+        """Return derivatives (n_poses, 6, p) of calibrated poses by the parameters."""
         return platform_by_parameters(legs, parametrization, machine.frame_legs, poses)
 
     calibrated = poses_at_readings(machine, legs, q, T_Rb_Re)
     nominal = poses_at_readings(machine, geometries(machine), q, T_Rb_Re)
-    here, poses = follow(calibrated), _workspace_poses(machine, legs)
-    everywhere = None if poses is None else follow(poses)
-    judged = here if everywhere is None else everywhere
+    sensitivity_at_readings, poses = follow(calibrated), _workspace_poses(machine, legs)
+    sensitivity_in_workspace = None if poses is None else follow(poses)
+    judged_sensitivity = (
+        sensitivity_at_readings if sensitivity_in_workspace is None else sensitivity_in_workspace
+    )
     return PlatformAccuracy(
         PlatformError(*pose_differences(calibrated, nominal)),
-        expected_error(here, covariance),
-        None if everywhere is None else expected_error(everywhere, covariance),
-        tuple(Effect(s.what, moved_by(judged, s.steps)) for s in sensitivities),
+        expected_error(sensitivity_at_readings, covariance),
+        None
+        if sensitivity_in_workspace is None
+        else expected_error(sensitivity_in_workspace, covariance),
+        tuple(Effect(s.what, moved_by(judged_sensitivity, s.steps)) for s in sensitivities),
     )
 
 
 def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
-    """Return where calibrated legs put the platform at readings all over the travel."""
+    """Poses of the calibrated platform at readings all over the travel."""
     try:
         readings, drawn = workspace(machine)
-    except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
+    except DidNotConverge:  # of travel or home of the model; not needed for calibration
         return None
     poses = poses_at_readings(machine, legs, readings, platforms_in_base(machine, drawn))
     reached = np.flatnonzero(reach_readings(machine, legs, readings, poses))
@@ -174,9 +177,9 @@ def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTra
 def reach_readings(
     machine: Machine, legs: Sequence[Leg], q: Array, T_Rb_Re: Sequence[RigidTransform]
 ) -> BoolArray:
-    """Return at which poses (n_poses,) the legs have the lengths of their readings.
+    """Return a mask of poses (n_poses,) where the legs have the lengths of their readings.
 
-    Some lengths are possible nowhere, and :func:`poses_at_readings` then gives the nearest pose.
+    For readings without a pose, :func:`poses_at_readings` returns the nearest pose.
     """
     R, t = Frames.of(T_Rb_Re)
     reached = np.ones(len(t), dtype=np.bool_)

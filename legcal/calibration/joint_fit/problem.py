@@ -96,17 +96,17 @@ class FitProblem(Problem[State]):
     parameters: LegParameters
     choices: Choices
     observed: Observed
-    first_radii: Array  # (n_radii,) where radii, intrinsics and the board's size begin
+    first_radii: Array  # (n_radii,) starting values
     first_cameras: tuple[Camera, ...]
     first_board_scale: Array  # (2,)
-    keys: tuple[str, ...]  # what the unknown intrinsics are
-    images: Mapping[tuple[int, int], str]  # the name of an image of a view and a pose
+    keys: tuple[str, ...]  # names of the estimated intrinsics
+    images: Mapping[tuple[int, int], str]  # name of an image, by view and pose
     settings: RefinementSettings
     rejected_corners: tuple[tuple[int, int, int], ...] = ()  # view, pose (-1: all), number
 
     @property
     def loss(self) -> PseudoHuber:
-        """The loss of outlines."""
+        """Robust loss of outlines, axes and corners."""
         return PseudoHuber(self.settings.loss_width)
 
     @property
@@ -131,7 +131,7 @@ class FitProblem(Problem[State]):
 
     @property
     def boards(self) -> tuple[ObservedCorners, ...]:
-        """The corners of the calibration board on each link; none where it has no board."""
+        """Corners of the calibration board on each link; empty without a board."""
         return self.observed.boards
 
     @property
@@ -141,7 +141,7 @@ class FitProblem(Problem[State]):
 
     @property
     def calibrated(self) -> IntArray:
-        """Positions in x of the intrinsics that enter with the covariance of their camera files."""
+        """Columns in x of the intrinsics with the covariance of their camera files as prior."""
         block = self.block("cameras")
         names = [block.labels[i] for i in block.prior.unknown.tolist()]
         is_of_file = np.array([name not in self.choices.priors for name in names], dtype=np.bool_)
@@ -149,12 +149,12 @@ class FitProblem(Problem[State]):
 
     @property
     def n_kinematic(self) -> int:
-        """Number of kinematic parameters that are unknowns; they come first of all."""
+        """Number of estimated kinematic parameters, the first unknowns."""
         return int(self.free.sum())
 
     @property
     def n_unknowns(self) -> int:
-        """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
+        """Number of unknowns; a pose counts with its degrees of freedom under constraints."""
         d = self.d_element
         bound = 6 - len(freedoms(self.legs.frame_legs))
         bound += sum(leg.n_constraints for leg in self.legs.nominal)
@@ -172,18 +172,18 @@ class FitProblem(Problem[State]):
         equations = self.n_equations + len(self.priors.mean)
         if equations >= self.n_unknowns:
             return
-        shown = f"{len(self.outlines)} outlines"
+        observations = f"{len(self.outlines)} outlines"
         if len(self.axes):
-            shown = f"{len(self.axes)} axes" + f", {shown}" * bool(len(self.outlines))
+            observations = f"{len(self.axes)} axes" + f", {observations}" * bool(len(self.outlines))
         n_readings = len(self.readings) + len(self.observed.actuator_readings)
         raise NotIdentifiable(
-            f"The fit is not determined: {len(self.images)} images with {shown} and "
+            f"The fit is not determined: {len(self.images)} images with {observations} and "
             f"{n_readings} readings give {equations} equations for {self.n_unknowns} "
             "unknowns; add images."
         )
 
     def begin(self, start: Start) -> State:
-        """Return the state at a start, with everything that is fixed at its value."""
+        """Return the state at a start, fixed parameters at their values."""
         return State(
             self.parameters.at_fixed(start.legs),
             self.first_radii,
@@ -196,10 +196,10 @@ class FitProblem(Problem[State]):
         )
 
     def postures(self, legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
-        """Return postures at poses, with what was read of actuators where it was.
+        """Return postures at poses, with measured readings of actuators.
 
-        Elsewhere a reading is that at which rods reach the pose: a start only, since where a rod
-        stands square to the motion of its joint at A it has no derivative.
+        Missing readings are solved from the rods. These are starting values only: they have no
+        derivative where a rod is perpendicular to the motion of its joint at A.
         """
         R, t = Frames.of(T_Rb_Re)
         q, read = readings_of_rods(legs, R, t), self.observed.actuator_readings
@@ -207,16 +207,16 @@ class FitProblem(Problem[State]):
         return Postures(R, t, q)
 
     def offsets(self, state: State) -> Array:
-        """Return the distances of both ends of outlines from predicted ones, (n, 2) [px]."""
+        """Return the offsets of both ends of outlines from predicted ones, (n, 2) [px]."""
         return self.outlines.offsets(self.keys, state)
 
     def weighted(self, noise: NoiseModel, weight: Array | BoolArray | None = None) -> FitProblem:
-        """Return the problem with outlines of other noise, their squares weighted (n_outlines,)."""
+        """Set the noise of outlines, and weights (n_outlines,) of their squares."""
         whitening = noise.whitening(self.outlines.covariance, weight)
         return self.with_factors(replace(self.factor("outlines"), whitening=whitening))
 
     def with_biases(self, biases: EdgeBiases) -> FitProblem:
-        """Return the problem with these common-mode edge biases in place of those it had."""
+        """Replace the common-mode edge biases."""
         outlines = replace(self.outlines, bias_index=biases.index, bias_shift=biases.shift)
         factor = replace(outlines.factor(self.keys), whitening=self.factor("outlines").whitening)
         other = replace(self, observed=self.observed._replace(outlines=outlines))
@@ -225,7 +225,7 @@ class FitProblem(Problem[State]):
     def with_corners(
         self, corners: ObservedCorners, rejected: Sequence[tuple[int, int, int]]
     ) -> FitProblem:
-        """Return the problem with other corners of the calibration board on their link."""
+        """Replace the corners of a calibration board, and record rejected ones."""
         other = replace(
             self,
             observed=self.observed.with_corners(corners),
@@ -236,9 +236,9 @@ class FitProblem(Problem[State]):
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
-        """Return the same unknowns, and other images of the same views without axes and board.
+        """Replace the measurements by other images of the same views, without axes and boards.
 
-        The parts of the problem come first in those of *outlines*, others have known radii.
+        The parts of the problem come first in *outlines*; further parts have fixed radii.
         """
         observed = Observed(
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
@@ -260,12 +260,14 @@ class FitProblem(Problem[State]):
         )
 
     def with_choices(self, choices: Choices) -> FitProblem:
-        """Return a problem with the same measurements and cameras, and other unknowns."""
+        """Rebuild the problem for the same measurements with other choices of parameters."""
         owners = shared_cameras(self.outlines.views, self.first_cameras)
         observed = self.observed._replace(outlines=self.outlines.without_biases())
         cameras, n_poses = self.first_cameras, self.n_elements
-        given = _Given(self.legs, observed, cameras, owners, n_poses, self.images, self.settings)
-        return _built(given, choices)
+        given = _FitInputs(
+            self.legs, observed, cameras, owners, n_poses, self.images, self.settings
+        )
+        return _build_problem(given, choices)
 
 
 def build_fit(
@@ -280,8 +282,8 @@ def build_fit(
 ) -> FitProblem:
     """Build the joint fit without solving it; arguments as those of :func:`refine`.
 
-    The images need not determine it (:meth:`FitProblem.require_determined`): they may be some of
-    those that will be.
+    The images need not determine the parameters (:meth:`FitProblem.require_determined`); more may
+    follow.
 
     Raises
     ------
@@ -295,11 +297,13 @@ def build_fit(
     )
     observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
     n_poses, images = measurements.n_poses, _images(measurements)
-    return _built(_Given(legs, observed, cameras, owners, n_poses, images, settings), choices)
+    return _build_problem(
+        _FitInputs(legs, observed, cameras, owners, n_poses, images, settings), choices
+    )
 
 
 def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
-    """Return a camera with the intrinsics that are fixed at given values."""
+    """Set the intrinsics that are fixed at given values."""
     given = {
         key: choices.values[f"{owner}.{key}"]
         for key in intrinsic_names(camera)
@@ -314,26 +318,28 @@ def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
     return dict(zip(places, row_names(measurements), strict=True))
 
 
-class _Given(NamedTuple):
-    """What a fit is built of, whatever is chosen of its parameters."""
+class _FitInputs(NamedTuple):
+    """Inputs of a fit besides the choices of its parameters."""
 
     legs: FittedLegs
     observed: Observed
     cameras: tuple[Camera, ...]  # of the views
-    owners: tuple[str, ...]  # whose camera each view has
+    owners: tuple[str, ...]  # representative view of each view's camera
     n_poses: int
     images: Mapping[tuple[int, int], str]
     settings: RefinementSettings
 
 
-def _built(given: _Given, choices: Choices) -> FitProblem:
-    """Return the problem of measurements, with the unknowns and the priors of choices."""
+def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
+    """Build the problem of measurements with the unknowns and priors of choices."""
     legs, observed, cameras, settings = given.legs, given.observed, given.cameras, given.settings
     outlines, boards = observed.outlines, observed.boards
     parameters, kinematic = _kinematic(given, choices)
-    seen = np.concatenate([outlines.view, *(corners.view for corners in boards)])
-    shown = {given.owners[v] for v in np.unique(seen).tolist()}
-    intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, shown, choices)
+    views_with_outlines_or_corners = np.concatenate(
+        [outlines.view, *(corners.view for corners in boards)]
+    )
+    observed_owners = {given.owners[v] for v in np.unique(views_with_outlines_or_corners).tolist()}
+    intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, observed_owners, choices)
     camera_pose = fixed_at_start(len(cameras), 6)
     camera_pose[observed.views] = all_free(len(observed.views), 6)
     board_pose = fixed_at_start(len(boards), 6)
@@ -376,8 +382,8 @@ def _built(given: _Given, choices: Choices) -> FitProblem:
     )
 
 
-def _kinematic(given: _Given, choices: Choices) -> tuple[LegParameters, Variables]:
-    """Return the kinematic parameters that are unknown, and their block."""
+def _kinematic(given: _FitInputs, choices: Choices) -> tuple[LegParameters, Variables]:
+    """Estimated kinematic parameters, and their block."""
     legs, names = given.legs, given.legs.parametrization.names
     arms = _arm_priors(legs, given.observed.outlines, choices, given.settings)
     free = np.array(
@@ -410,23 +416,23 @@ def _kinematic(given: _Given, choices: Choices) -> tuple[LegParameters, Variable
 def _arm_priors(
     legs: FittedLegs, outlines: ObservedOutlines, choices: Choices, settings: RefinementSettings
 ) -> dict[str, float]:
-    """Return how well the lines of arms that are seen are known [rad, m], by parameter.
+    """Default priors of the lines of visible arms, by parameter [rad, m].
 
-    Those are left out of which something was chosen.
+    Parameters with a choice have no default prior.
     """
     seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
     chosen = {*choices.fixed, *choices.free, *choices.priors}
-    known = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
-    return {name: sigma for name, sigma in known.items() if name not in chosen}
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
+    return {name: sigma for name, sigma in sigmas.items() if name not in chosen}
 
 
 def arm_sigmas(
     parametrization: Parametrization,
     legs: Sequence[Leg],
-    seen: Iterable[int],  # those that have arms as parts
+    seen: Iterable[int],  # legs with visible arms
     settings: RefinementSettings = DEFAULT_SETTINGS,
 ) -> dict[str, float]:
-    """Return how well the lines of arms are known before a fit [rad, m], by parameter."""
+    """Return the prior standard deviations of the lines of arms, by parameter [rad, m]."""
     lengths = [leg.q0 for leg in legs if leg.actuator is not None]
     length = float(np.mean(lengths)) if lengths else 0.0
     sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma * length,) * 2
@@ -447,15 +453,15 @@ def _poses(n_poses: int, n_actuators: int) -> Variables:
 def _scalars(
     name: str, labels: Sequence[str], unit: str, mean: Array, sigma: Array, choices: Choices
 ) -> Variables:
-    """Return the block of numbers, with priors where they are not freed; some may be fixed."""
+    """Block of scalars with priors; freed ones have none, and some may be fixed."""
     is_free = np.array([not choices.holds(label) for label in labels], dtype=np.bool_)
     unknown = np.where(is_free, np.cumsum(is_free) - 1, -1).astype(np.intp)
-    known = [
+    with_prior = [
         i
         for i, label in enumerate(labels)
         if is_free[i] and label not in choices.free and label not in choices.priors
     ]
-    prior = GaussianPrior(unknown[known], mean[known], sigma[known])
+    prior = GaussianPrior(unknown[with_prior], mean[with_prior], sigma[with_prior])
     free = tuple(label for label, one in zip(labels, is_free, strict=True) if one)
     return Variables(name, unknown[:, None], labels=free, units=(unit,) * len(free), prior=prior)
 
@@ -463,35 +469,37 @@ def _scalars(
 def _with_edge_bias(
     priors: Mapping[str, Prior], radii: Sequence[str], nominal: Array, outlines: ObservedOutlines
 ) -> dict[str, Prior]:
-    """Return priors with those of radii as sure as edges that all lie inwards alike let them be.
+    """Widen stated priors of radii by a common-mode bias of edges.
 
-    Where readings carry no length, radii give the machine its size, and an error that all edges
-    share is not seen in the residuals: rods look thinner, as those of a larger machine do. Errors
-    of single radii average over the rods and this one does not, so that each variance has it as
-    many times as there are radii.
+    Where readings carry no length, radii determine the scale of the machine, and a common bias of
+    all edges does not show in residuals: rods look thinner, as in a larger machine. Errors of
+    single radii average out over the rods and the common bias does not, so that its variance is
+    added to each radius, times their number.
     """
     stated = [name for name in radii if name in priors]
-    common = _EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
-    of = dict(zip(radii, np.sqrt(len(stated)) * common * nominal, strict=True))
-    wider = {n: replace(priors[n], sigma=float(np.hypot(priors[n].sigma, of[n]))) for n in stated}
+    relative_bias = _EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
+    sigma_of = dict(zip(radii, np.sqrt(len(stated)) * relative_bias * nominal, strict=True))
+    wider = {
+        n: replace(priors[n], sigma=float(np.hypot(priors[n].sigma, sigma_of[n]))) for n in stated
+    }
     return {**priors, **wider}
 
 
 def _board_scales(
     boards: Sequence[ObservedCorners], settings: RefinementSettings, choices: Choices
 ) -> Variables:
-    """Return the block of the sizes of boards; that of a link without one does not move."""
+    """Block of scale factors of boards; fixed for a link without a board."""
     seen = [len(corners) > 0 for corners in boards]
     names = [board_scale(c.link) for c in boards if len(c)]
     sigma = np.full(len(names), settings.board_scale_sigma)
-    found = _scalars("board_scale", names, "", np.ones(len(names)), sigma, choices)
+    block = _scalars("board_scale", names, "", np.ones(len(names)), sigma, choices)
     unknown = np.full((len(boards), 1), -1, dtype=np.intp)
-    unknown[seen] = found.unknown
-    return replace(found, unknown=unknown)
+    unknown[seen] = block.unknown
+    return replace(block, unknown=unknown)
 
 
 def _stated(block: Variables, choices: Choices) -> Variables:
-    """Return a block with its stated priors."""
+    """Add the stated priors to a block."""
     which = [i for i, label in enumerate(block.labels) if label in choices.priors]
     if not which:
         return block
@@ -511,9 +519,9 @@ def _intrinsics(
     shown: Collection[str],  # owners that measurements depend on
     choices: Choices,
 ) -> tuple[Variables, tuple[str, ...]]:
-    """Return the block of intrinsics, shared by views of one camera, and what its columns are.
+    """Block of intrinsics, shared by views of one camera, and the names of its columns.
 
-    The prior is what camera files state of those of which nothing was chosen.
+    The prior of intrinsics without a choice is the covariance of the camera file.
     """
     chosen, stated = {*choices.free, *choices.priors}, dict(choices.cameras)
     for owner, covariance in stated_covariances(views, cameras).items():
@@ -523,40 +531,44 @@ def _intrinsics(
     for view, camera in zip(views, cameras, strict=True):
         if view not in owners:
             continue
-        own = [f"{view}.{key}" for key in intrinsic_names(camera)]
-        known = stated.get(view) if view in shown else None
-        variances = [0.0] * len(own) if known is None else np.diagonal(known.covariance).tolist()
-        is_known = [
+        names_of_view = [f"{view}.{key}" for key in intrinsic_names(camera)]
+        intrinsics = stated.get(view) if view in shown else None
+        variances = (
+            [0.0] * len(names_of_view)
+            if intrinsics is None
+            else np.diagonal(intrinsics.covariance).tolist()
+        )
+        has_prior = [
             v > 0.0 and name not in chosen | choices.fixed
-            for name, v in zip(own, variances, strict=True)
+            for name, v in zip(names_of_view, variances, strict=True)
         ]
-        free = [k for k, name in enumerate(own) if is_known[k] or name in chosen]
-        at = [k for k in free if is_known[k]]
-        if known is not None and at:
-            numbers = np.array([len(names) + free.index(k) for k in at], dtype=np.intp)
-            covariance = known.covariance[np.ix_(at, at)]
-            prior += GaussianPrior.from_covariance(numbers, known.mean[at], covariance)
-        names += [own[k] for k in free]
-    numbers_of = [ParameterId.parse(name) for name in names]
-    keys = tuple(dict.fromkeys(number.kind for number in numbers_of))
+        free = [k for k, name in enumerate(names_of_view) if has_prior[k] or name in chosen]
+        with_prior = [k for k in free if has_prior[k]]
+        if intrinsics is not None and with_prior:
+            numbers = np.array([len(names) + free.index(k) for k in with_prior], dtype=np.intp)
+            covariance = intrinsics.covariance[np.ix_(with_prior, with_prior)]
+            prior += GaussianPrior.from_covariance(numbers, intrinsics.mean[with_prior], covariance)
+        names += [names_of_view[k] for k in free]
+    parameters = [ParameterId.parse(name) for name in names]
+    keys = tuple(dict.fromkeys(number.kind for number in parameters))
     number = {name: i for i, name in enumerate(names)}
     index = [[number.get(f"{owner}.{key}", -1) for key in keys] for owner in owners]
     unknown = np.array(index, dtype=np.intp).reshape(len(views), len(keys))
-    where = [(views.index(number.owner), number.kind) for number in numbers_of]
+    view_and_key = [(views.index(number.owner), number.kind) for number in parameters]
     block = Variables(
         "cameras",
         unknown,
         partial(changed_cameras, keys=keys),
         tuple(names),
-        tuple(intrinsic_unit(key) for _, key in where),
-        lambda found: np.array([intrinsic_of(found[view], key) for view, key in where]),
+        tuple(intrinsic_unit(key) for _, key in view_and_key),
+        lambda found: np.array([intrinsic_of(found[view], key) for view, key in view_and_key]),
         prior=prior,
     )
     return block, keys
 
 
 def _bias_block(biases: EdgeBiases) -> Variables:
-    """Return the block of common-mode biases, random with known variances."""
+    """Block of common-mode biases, random with known variances."""
     b = len(biases)
     prior = GaussianPrior(np.arange(b, dtype=np.intp), np.zeros(b), biases.sigmas)
     return Variables("biases", all_free(b, 1), labels=biases.names, units=biases.units, prior=prior)

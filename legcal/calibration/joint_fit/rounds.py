@@ -1,11 +1,11 @@
-"""From a first minimum to the final one: outlines and corners rejected, their errors estimated.
+"""From the first minimum to the final one: outlier rejection and estimation of noise, in rounds.
 
-Rounds reject outliers until the set of inliers stays the same. They begin at the minimum that all
-outlines have together, wherever the search for it began, and outliers lose their weight smoothly
-with their distance: none stays out only because it was out before. Then the noise of outlines and
-the variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
-fitted again, until these converge. The last fit has the variances that are expected in place of the
-likeliest ones, which are too small on average.
+Rounds reject outliers until the set of inliers is stable. They start at the minimum of all
+outlines, and weights are a smooth function of the distance, so that an outline never stays rejected
+only because it was rejected before. Then the noise of outlines and the variances of common-mode
+edge biases are estimated by restricted maximum likelihood and the fit is repeated, until
+convergence. The last fit uses posterior means of these variances, since the likeliest values are
+too small on average.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ from legcal.vision.cylinder import EPSILON
 
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
-_READING_ROUNDS = 8  # in which one reading of each pose is left out at most
-_REJECTION_TOLERANCE = 0.005  # relative, of the cost, in rounds that reject outliers
-_PASSING = 1e-6  # squared sigmas from a minimum that rounds pass through and do not end at
-_TAPER = 0.2  # of the distance from which on outlines are rejected: where their weight falls
-_ACCEPTED = 0.5  # weight at that distance
-_MIN_REDUNDANCY = 0.05  # of the equations of corners, beyond what the fit absorbs
+_READING_ROUNDS = 8  # each rejects at most one reading per pose
+_REJECTION_TOLERANCE = 0.005  # relative decrease of the cost, in rounds that reject outliers
+_PASSING = 1e-6  # tolerance of intermediate minima, in squared sigmas
+_TAPER = 0.2  # relative half-width of the weight's transition at the rejection distance
+_ACCEPTED = 0.5  # weight at the rejection distance
+_MIN_REDUNDANCY = 0.05  # mean redundancy of corners
 _MIN_SCALE = 0.1
 _MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
 _MAX_ERROR_CHANGE = 0.5  # of the largest error of outlines, in the last round
@@ -67,53 +67,55 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 @dataclass(frozen=True, eq=False)
 class AtPlaces:
-    """Errors of edges that come back to places, which are not estimated."""
+    """Errors of edges that return to places; not estimated as biases."""
 
     sigma: Array  # (2,) of ``PLACES`` [px]
-    covariance: Array  # (n_kept, n_kept) what they add to that of the kept unknowns
+    covariance: Array  # (n_kept, n_kept) added to the covariance of the kept unknowns
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum with the errors and the outlines that it was fitted with."""
+    """A minimum with the noise, biases and weights of its outlines."""
 
-    problem: FitProblem  # with the biases that outlines share
+    problem: FitProblem  # with the common-mode biases
     minimum: Minimum[State]
     noise: NoiseModel
     edge_biases: EdgeBiases
-    weight: Array  # (n_outlines,) from 1 to 0, of outlines that agree with it and that do not
+    weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
     at_places: AtPlaces | None = None  # errors shared there, None where residuals show none
-    notes: tuple[str, ...] = ()  # what the last round still changed, if it did not converge
+    notes: tuple[str, ...] = ()  # changes of the last round, if not converged
 
     @property
     def state(self) -> State:
-        """Where the fit ended."""
+        """State at the minimum."""
         return self.minimum.state
 
     @cached_property
     def accepted(self) -> BoolArray:
-        """Which outlines agree with the fit, (n_outlines,)."""
+        """Mask of inlier outlines, (n_outlines,)."""
         return np.asarray(self.weight >= _ACCEPTED)
 
     def weighted(self, noise: NoiseModel) -> Fit:
-        """Return the same with outlines of another noise, those that disagree then left out."""
+        """Set the noise of outlines, and weight them anew."""
         weight = _weights(self.problem, self.state, noise)
         problem = self.problem.weighted(noise, weight)
         return replace(self, problem=problem, noise=noise, weight=weight)
 
     def with_edge_biases(self, biases: EdgeBiases) -> Fit:
-        """Return the same with these common-mode edge biases in place of others."""
+        """Replace the common-mode edge biases."""
         problem, state = with_edge_biases(self.problem, self.state, biases)
         minimum = replace(self.minimum, state=state)
         return replace(self, problem=problem, minimum=minimum, edge_biases=biases)
 
     def passed(self, relative_tolerance: float = 0.0) -> Fit:
-        """Return the same near the minimum of its problem, from one with other weights."""
-        return replace(self, minimum=_passed(self.problem, self.minimum, relative_tolerance))
+        """Approach the minimum of the problem from the minimum for other weights."""
+        return replace(
+            self, minimum=_approach_minimum(self.problem, self.minimum, relative_tolerance)
+        )
 
     @property
     def shared_px(self) -> dict[str, float]:
-        """Standard deviations of errors that outlines share, by what they are [px]."""
+        """Standard deviations of common-mode errors by kind [px]."""
         there = () if self.at_places is None else self.at_places.sigma.tolist()
         return self.edge_biases.sizes | dict(zip(PLACES, there, strict=False))
 
@@ -121,76 +123,79 @@ class Fit:
 def first_minimum(
     problem: FitProblem,
     begin: State,
-    known: Mapping[str, Residuals] | None = None,
+    computed_rows: Mapping[str, Residuals] | None = None,
     *,
     must_converge: bool = True,
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
 
-    Steps along open directions cost nothing, and without a hold they go on: axes of a 3-UPU that
-    only translates end half a radian off, where other directions seem to be known. No nominal
-    model is wrong by a large part of a leg. The cost and the derivatives that are returned are
-    without that knowledge. *known* are rows of factors at the begin, with claimed covariances.
-    Without *must_converge* the best state is returned where the steps do not come to an end.
+    Steps along open directions are free and would not stop: axes of a translational 3-UPU end half
+    a radian off, where other directions look determined. Nominal models are not wrong by a large
+    part of a leg. The returned cost and derivatives are without this prior. *computed_rows* are
+    rows of factors at *begin*, with claimed covariances. Without *must_converge*, the best state
+    is returned if the steps do not converge.
     """
-    given, every = problem, np.ones(len(problem.outlines), dtype=np.bool_)
+    original, all_outlines = problem, np.ones(len(problem.outlines), dtype=np.bool_)
     is_rough = problem.legs.is_redundant
     claimed = with_rough_readings(problem.weighted(NoiseModel()))
-    chosen = of_determined_poses(claimed, begin, every)
+    chosen = of_determined_poses(claimed, begin, all_outlines)
     problem, loss = claimed.weighted(NoiseModel(), chosen), claimed.loss
     legs, n = problem.legs, problem.n_kinematic
     nominal = legs.vector(legs.nominal)[problem.free]
     length = begin.mean_length
     metre = np.array([1.0 if unit == "m" else 1.0 / length for unit in problem.units[:n]])
-    near = GaussianPrior(np.arange(n, dtype=np.intp), nominal, _NOMINAL_SIGMA * length * metre)
+    nominal_prior = GaussianPrior(
+        np.arange(n, dtype=np.intp), nominal, _NOMINAL_SIGMA * length * metre
+    )
     block = problem.block("legs")
-    regularised = problem.with_parts((replace(block, prior=block.prior + near),), ())
-    found = minimise(
+    regularised = problem.with_parts((replace(block, prior=block.prior + nominal_prior),), ())
+    minimum = minimise(
         regularised,
         begin,
         loss,
         max_iterations=problem.settings.max_iterations,
         tolerance=_PASSING,
         relative_tolerance=_REJECTION_TOLERANCE,
-        computed_rows=known if chosen.all() and not is_rough else None,
+        computed_rows=computed_rows if chosen.all() and not is_rough else None,
         must_converge=must_converge,
     )
-    there = of_determined_poses(claimed, found.state, every)
-    problem = given.weighted(NoiseModel(), there)
-    same = bool(np.array_equal(there, chosen)) and not is_rough
-    linear = linearize(problem, found.state, found.linear.rows if same else None)
+    determined = of_determined_poses(claimed, minimum.state, all_outlines)
+    problem = original.weighted(NoiseModel(), determined)
+    same = bool(np.array_equal(determined, chosen)) and not is_rough
+    linear = linearize(problem, minimum.state, minimum.linear.rows if same else None)
     cost = robust_cost(problem, linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
         rough = with_rough_readings(problem)
-        cost = robust_cost(rough, linearize(rough, found.state), loss)
-    return Minimum(found.state, linear, cost, found.iterations)
+        cost = robust_cost(rough, linearize(rough, minimum.state), loss)
+    return Minimum(minimum.state, linear, cost, minimum.iterations)
 
 
 def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
-    """Reject outliers until hardly any changes, then estimate the noise and solve, in rounds.
+    """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    Of axes the claimed covariances are taken as they are, and the robust loss alone guards against
-    wrong ones. *first* is what :func:`first_minimum` found.
+    Axes keep their claimed covariances; only the robust loss guards against outliers among them.
+    *first* is the result of :func:`first_minimum`.
 
     Raises
     ------
     DidNotConverge
-        If a solve fails, most outlines or axes disagree with the fit, or the rounds do not
-        converge.
+        If a minimisation fails, most outlines or axes are outliers, or the rounds do not converge.
     """
     possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
     none = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
-    every = np.ones(len(problem.outlines))
-    begin = Fit(problem, first, NoiseModel(), none, every).with_edge_biases(none)
+    all_weights = np.ones(len(problem.outlines))
+    begin = Fit(problem, first, NoiseModel(), none, all_weights).with_edge_biases(none)
     fit, changes = _with_estimated_errors(_without_outliers(begin), possible, least)
-    known: Mapping[str, Residuals] | None = fit.minimum.linear.rows
+    computed_rows: Mapping[str, Residuals] | None = fit.minimum.linear.rows
     if fit.edge_biases.are_shown:
         scores = _scores_of_biases(fit, possible)
         fit = fit.with_edge_biases(expected_biases(possible, *scores, fit.edge_biases, least))
-        known = None
-    fit = replace(fit, minimum=_solved(fit.problem, fit.minimum, computed_rows=known))
+        computed_rows = None
+    fit = replace(
+        fit, minimum=_minimise_near(fit.problem, fit.minimum, computed_rows=computed_rows)
+    )
     _refuse_disagreement(fit)
     _refuse_wrong_axes(fit)
     return replace(
@@ -201,9 +206,9 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
 
 
 def _without_outliers(fit: Fit) -> Fit:
-    """Return a fit without wrong readings, outlines and corners, with a rough noise of outlines."""
+    """Reject outliers among readings, outlines and corners, with a robust noise estimate."""
     given, settings, claimed = fit.problem, fit.problem.settings, fit.problem.outlines.covariance
-    # Wrong readings go before they bend the fit: the first minimum is one with rough readings.
+    # Wrong readings go first, before they bias the fit: the first minimum has inflated noise.
     if given.legs.is_redundant:
         rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
@@ -212,11 +217,11 @@ def _without_outliers(fit: Fit) -> Fit:
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
         fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))
         if np.sum(before != fit.accepted) <= settings.error_tolerance * fit.accepted.sum():
-            break  # rounds of noise reject these
+            break  # left to the rounds of noise estimation
         fit = fit.passed(_REJECTION_TOLERANCE)
     _refuse_disagreement(fit)
     for _ in range(_BOARD_ROUNDS if any(map(len, given.boards)) else 0):
-        judged = _with_judged_corners(fit.problem, fit.state)
+        judged = _with_corner_noise(fit.problem, fit.state)
         fit = replace(fit, problem=judged).passed(_REJECTION_TOLERANCE)
     if given.legs.is_redundant:
         fit = fit.passed()
@@ -226,10 +231,9 @@ def _without_outliers(fit: Fit) -> Fit:
 
 
 def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tuple[Fit, Changes]:
-    """Return a fit with the errors of outlines that its residuals show, and the last changes.
+    """Estimate noise and common-mode biases and fit, until convergence; also return last changes.
 
-    Noise and sizes of common-mode biases, of the *possible* ones and of the *least* sizes
-    (N_KINDS,), are estimated and all is fitted again, until they converge.
+    *possible* are the candidate biases, *least* (N_KINDS,) lower bounds of their sizes.
     """
     settings, changes, are_white = fit.problem.settings, NO_CHANGES, False
     fit = _linearized(fit)
@@ -255,40 +259,40 @@ def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tupl
 
 
 def _linearized(fit: Fit) -> Fit:
-    """Return the same, linearised with the weights that it has now."""
+    """Linearise with the present weights."""
     linear = linearize(fit.problem, fit.state)
     return replace(fit, minimum=replace(fit.minimum, linear=linear))
 
 
 def _scores_of_biases(fit: Fit, possible: EdgeBiases) -> tuple[Array, Array]:
-    """Return the scores of all possible biases at the minimum that the noise of a fit leads to."""
+    """Scores of all candidate biases at the minimum for the noise of a fit."""
     return scores_of_block(*with_edge_biases(fit.problem, fit.state, possible), "biases")
 
 
 def _without_wrong_readings(
     problem: FitProblem,
-    every: FitProblem,
+    complete: FitProblem,
     minimum: Minimum[State],
     relative_tolerance: float = 0.0,
 ) -> tuple[FitProblem, Minimum[State]]:
-    """Return problem and minimum without readings that all else contradicts, from a minimum.
+    """Reject wrong readings and minimise, until none is left.
 
-    Those of *every* reading that agree once the others are out come back, once.
+    Readings of the *complete* problem that agree after the others are rejected are restored, once.
     """
     may_come_back = True
     for _ in range(_READING_ROUNDS):
         problem, is_changed = with_judged_readings(problem, minimum.state)
         if not is_changed and may_come_back:
-            problem, is_changed = with_agreeing_readings(problem, every, minimum.state)
+            problem, is_changed = with_agreeing_readings(problem, complete, minimum.state)
             may_come_back = False
         if not is_changed:
             break
-        minimum = _passed(problem, minimum, relative_tolerance)
+        minimum = _approach_minimum(problem, minimum, relative_tolerance)
     return problem, minimum
 
 
 def _at_places(fit: Fit) -> AtPlaces | None:
-    """Return the errors at places that the residuals of a fit show, and what they add."""
+    """Estimate errors at places from the residuals, and their effect on the covariance."""
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     shifts = shifts_at_places(problem.outlines, fit.accepted)
     if not shifts.size:
@@ -305,11 +309,11 @@ def _at_places(fit: Fit) -> AtPlaces | None:
     return AtPlaces(sigma, moved @ moved.T)
 
 
-def _passed(
+def _approach_minimum(
     problem: FitProblem, near: Minimum[State], relative_tolerance: float = 0.0
 ) -> Minimum[State]:
-    """Pass through the minimum of a problem *near* that of one with other weights."""
-    return _solved(
+    """Approach the minimum of a problem from the minimum for other weights."""
+    return _minimise_near(
         problem,
         near,
         tolerance=_PASSING,
@@ -318,9 +322,9 @@ def _passed(
     )
 
 
-def _solved(problem: FitProblem, near: Minimum[State], **options: Any) -> Minimum[State]:
-    """Return the minimum of a problem near another one, with the iterations of both."""
-    found = minimise(
+def _minimise_near(problem: FitProblem, near: Minimum[State], **options: Any) -> Minimum[State]:
+    """Minimise from a minimum nearby; iterations are added up."""
+    minimum = minimise(
         problem,
         near.state,
         problem.loss,
@@ -328,25 +332,25 @@ def _solved(problem: FitProblem, near: Minimum[State], **options: Any) -> Minimu
         max_iterations=problem.settings.max_iterations,
         **options,
     )
-    return replace(found, iterations=near.iterations + found.iterations)
+    return replace(minimum, iterations=near.iterations + minimum.iterations)
 
 
 def with_edge_biases(
     problem: FitProblem, state: State, biases: EdgeBiases
 ) -> tuple[FitProblem, State]:
-    """Return problem and state with these biases in place of others, known ones as they are."""
-    values = _values(problem, state, biases)
+    """Replace the biases of problem and state; biases of the same name keep their value."""
+    values = _values_of_biases(problem, state, biases)
     return problem.with_biases(biases), replace(state, biases=values)
 
 
-def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
-    """Return the values of biases at a state of a problem, zero where it has none of that name."""
-    known = dict(zip(problem.block("biases").labels, state.biases.tolist(), strict=True))
-    return np.array([known.get(name, 0.0) for name in biases.names])
+def _values_of_biases(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
+    """Values of biases at a state, zero for new ones."""
+    value_of = dict(zip(problem.block("biases").labels, state.biases.tolist(), strict=True))
+    return np.array([value_of.get(name, 0.0) for name in biases.names])
 
 
 def _noise(fit: Fit) -> NoiseModel:
-    """Return the noise of the accepted outlines at a fit with another noise."""
+    """Estimate the noise of outlines at a fit with its previous noise."""
     problem, linear, weight = fit.problem, fit.minimum.linear, fit.weight
     if not fit.accepted.any():
         return fit.noise
@@ -354,17 +358,16 @@ def _noise(fit: Fit) -> NoiseModel:
     normal = information(problem, fit.state, linear, problem.loss)
     L = np.linalg.cholesky(fit.noise.covariance(claimed))[used]
     share = explained_share(problem, linear, normal, "outlines")[used]
-    explained = L @ share @ np.swapaxes(L, -1, -2)  # both times the weight, as the squares are
+    explained = L @ share @ np.swapaxes(L, -1, -2)  # weighted, as the squares are
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
     return estimate_noise(offsets, explained, claimed[used], weight[used])
 
 
 def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
-    """Return the weights of outlines at a fit, zero of images that have no pose of their own.
+    """Weights of outlines at a fit; zero in images with an undetermined pose.
 
-    They fall smoothly about the distance from which on an outline is rejected. So nothing jumps
-    where an outline comes to be just beyond it, and none stays out only because it was out: what
-    it pulls is the same on both ways there.
+    The weight falls smoothly around the rejection distance, so that the fit is a continuous
+    function of the measurements, and rejection has no hysteresis.
     """
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
     begin, end = (
@@ -378,33 +381,33 @@ def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
 
 
 def _refuse_disagreement(fit: Fit) -> None:
-    """Raise DidNotConverge where the fit does not pass through most of the outlines."""
+    """Raise DidNotConverge if most outlines are outliers, or inliers have large residuals."""
     accepted, most_px = fit.accepted, fit.problem.settings.largest_rms_px
     n, n_accepted = len(accepted), int(accepted.sum())
     used = fit.problem.offsets(fit.state)[accepted]
     rms = float(np.sqrt(np.mean(used**2))) if n_accepted else 0.0
     if 2 * n_accepted < n or rms > most_px:
         raise DidNotConverge(
-            f"The joint fit ended where {n - n_accepted} of {n} outlines disagree with it "
-            f"and the others are {rms:.1f} px off; most must agree, to "
-            f"{most_px:g} px; check camera poses, readings and outlines."
+            f"The joint fit ended with {n - n_accepted} of {n} outlines rejected and an error of "
+            f"{rms:.1f} px (rms) of the others; most must agree, to {most_px:g} px; check camera "
+            "poses, readings and outlines."
         )
 
 
 def _refuse_wrong_axes(fit: Fit) -> None:
-    """Raise DidNotConverge where the fit does not agree with most of the axes."""
+    """Raise DidNotConverge if most axes are outliers."""
     n, most = len(fit.problem.axes), fit.problem.settings.axis_disagreement
     wrong = int(np.sum(fit.minimum.linear["axes"].squared_norms > most**2))
     if 2 * wrong > n:
         raise DidNotConverge(
-            f"The joint fit ended where {wrong} of {n} axes disagree with it by more than "
-            f"{most:g} of their standard deviations; most must agree; check the camera poses, the "
-            "readings, and the units (rad, m) of axes and their sigmas."
+            f"The joint fit ended with errors of {wrong} of {n} axes above {most:g} standard "
+            "deviations; most must agree; check the camera poses, the readings, and the units "
+            "(rad, m) of axes and their sigmas."
         )
 
 
-def _with_judged_corners(problem: FitProblem, state: State) -> FitProblem:
-    """Return a problem whose corners have errors by their residuals, outliers left out."""
+def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
+    """Estimate the noise of corners from their residuals, and reject outliers."""
     linear, settings = linearize(problem, state), problem.settings
     normal = information(problem, state, linear, problem.loss)
     judged = problem
@@ -412,34 +415,37 @@ def _with_judged_corners(problem: FitProblem, state: State) -> FitProblem:
         if not len(board):
             continue
         rows, share = linear[board.name], explained_share(problem, linear, normal, board.name)
-        left = 1.0 - 0.5 * np.einsum("nqq->n", share)
+        redundancies = 1.0 - 0.5 * np.einsum("nqq->n", share)
         norms = rows.squared_norms
-        redundancy = max(float(np.mean(left)), _MIN_REDUNDANCY)
+        redundancy = max(float(np.mean(redundancies)), _MIN_REDUNDANCY)
         variance = float(np.median(norms)) / MEDIAN_OF_2 / redundancy
         scale = max(float(np.sqrt(variance)), _MIN_SCALE)
         agrees = norms <= (scale * settings.rejection) ** 2
         judged = judged.with_corners(board.chosen(agrees, scale), board.keys(~agrees))
         rms = float(np.sqrt(np.mean((rows.r * board.sigma[:, None]) ** 2)))
-        too_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
+        is_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
         on_base = board.link == "base"
-        own = [pose for _, pose, _ in judged.rejected_corners if (pose < 0) == on_base]
-        if len(own) > int(agrees.sum()) or too_far:
-            which = "" if board.link == "base" else f" on the {board.link}"
+        rejected_of_board = [
+            pose for _, pose, _ in judged.rejected_corners if (pose < 0) == on_base
+        ]
+        if len(rejected_of_board) > int(agrees.sum()) or is_far:
+            board_name = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
-                f"The joint fit ended where the corners of the calibration board{which} are "
-                f"{rms:.1f} px off (rms), needed {settings.largest_rms_px:g} px for most; check "
-                "that the board stood still on its link, its dimensions, and the camera files."
+                f"The joint fit ended with an error of {rms:.1f} px (rms) of the corners of the "
+                f"calibration board{board_name}; most must agree to {settings.largest_rms_px:g} "
+                "px; check that the board did not move on its link, its dimensions, and the "
+                "camera files."
             )
     return judged
 
 
 def corner_notes(problem: FitProblem) -> tuple[str, ...]:
-    """Return a sentence on corners that were rejected, if any."""
+    """Return a note on rejected corners, if any."""
     rejected = problem.rejected_corners
     if not rejected:
         return ()
     views, images = problem.outlines.views, problem.images
-    named = few(
+    listed = few(
         [
             f"{corner} in {views[view]}" + (f", {images[view, pose]}" if pose >= 0 else "")
             for view, pose, corner in sorted(rejected)
@@ -447,19 +453,19 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     )
     n = len(rejected) + sum(map(len, problem.boards))
     return (
-        f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
-        f"left out: {named}.",
+        f"{len(rejected)} of {n} corners of the calibration board disagree with the fit and were "
+        f"rejected: {listed}.",
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What a round changed."""
+    """Changes between two rounds."""
 
     before: Array  # (n,) standard deviations of the errors of outlines: a factor, the others [px]
     after: Array
-    n_changed: int  # outlines that were accepted and are not, or the other way round
-    n_accepted: int  # after it
+    n_changed: int  # outlines newly accepted or rejected
+    n_accepted: int  # after the round
 
     @classmethod
     def of(cls, before: Fit, after: Fit) -> Changes:
@@ -468,7 +474,7 @@ class Changes:
         return cls(_sizes(before), _sizes(after), n_changed, int(after.accepted.sum()))
 
     def converged(self, settings: RefinementSettings) -> bool:
-        """Say whether another round would change nothing that matters."""
+        """Whether the rounds have converged."""
         near = np.allclose(
             self.after, self.before, rtol=settings.error_tolerance, atol=_MIN_ERROR_PX
         )
@@ -479,7 +485,7 @@ NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
 
 
 def _sizes(fit: Fit) -> Array:
-    """Return all standard deviations of errors in one vector: a factor, the others [px]."""
+    """All standard deviations of errors: a factor, the others [px]."""
     noise, biases = fit.noise, fit.edge_biases
     return np.array([noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]])
 
@@ -487,14 +493,14 @@ def _sizes(fit: Fit) -> Array:
 def check_convergence(
     changes: Changes, claimed: Array, settings: RefinementSettings
 ) -> tuple[str, ...]:
-    """Return a note on what the last round still changed, none where it converged.
+    """Return a note on the changes of the last round, none if it converged.
 
     *claimed* are the covariances (n, 2, 2) of the outlines [px^2].
 
     Raises
     ------
     DidNotConverge
-        If that is a lot.
+        If these changes are large.
     """
     if changes.converged(settings):
         return ()
@@ -502,7 +508,7 @@ def check_convergence(
     unit[0] = np.sqrt(0.5 * np.mean(np.trace(claimed, axis1=1, axis2=2)))
     before, after = unit * changes.before, unit * changes.after
     i = int(np.argmax(np.abs(after - before)))
-    found = (
+    last_change = (
         f"the last round accepted or rejected {changes.n_changed} outlines anew, with "
         f"{changes.n_accepted} accepted, and changed the standard deviation of one kind of error "
         f"from {before[i]:.3f} px to {after[i]:.3f} px"
@@ -511,29 +517,28 @@ def check_convergence(
     most_changed = _MAX_CHANGED * changes.n_accepted
     if abs(after[i] - before[i]) > _MAX_ERROR_CHANGE * largest or changes.n_changed > most_changed:
         raise DidNotConverge(
-            "The joint fit did not converge on which outlines are right and how large their "
-            f"errors are: found that {found}, needed hardly any change; add images, or correct "
-            "outlines that are wrong."
+            "The joint fit did not converge on the inliers and the noise of outlines: "
+            f"{last_change}; add images, or correct wrong outlines."
         )
     return (
         "The noise of the outlines has not converged; the stated uncertainty may be wrong: "
-        f"{found}.",
+        f"{last_change}.",
     )
 
 
 _ON_EDGE_PX = 1.5  # [px] at both ends
-_NEARER = 0.25  # of the distance from the outline that it was taken for
+_NEARER = 0.25  # of the distance from the edge that it was assigned to
 
 
 def rejection_reasons(
     problem: FitProblem, state: State, rejected: IntArray, offsets: Array
 ) -> list[Rejection]:
-    """Return the reasons of rejection of outlines (m,): how far off, and which edge they lie on.
+    """Return the reasons of rejection of outlines (m,): their offset, and another edge nearby.
 
-    *offsets* (n, 2) of all outlines are from where the fit puts them [px].
+    *offsets* (n, 2) of all outlines are from their prediction [px].
     """
-    away = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
-    details = [f"{distance:.1f} px" for distance in away.tolist()]
+    offset_sizes = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
+    details = [f"{distance:.1f} px" for distance in offset_sizes.tolist()]
     o, names = problem.outlines, problem.legs.names
     part = np.repeat(np.arange(len(o.parts)), len(EPSILON))
     edges = [
@@ -541,7 +546,7 @@ def rejection_reasons(
         for leg, link in o.parts
         for edge in range(len(EPSILON))
     ]
-    # Every rejected outline as each of all edges.
+    # Every rejected outline, assigned to every edge.
     outline, edge = np.repeat(rejected, len(edges)), np.tile(np.arange(len(edges)), len(rejected))
     as_others = o.at(outline)
     constants = as_others.constants.copy()
@@ -549,9 +554,9 @@ def rejection_reasons(
     legs = np.array([leg for leg, _ in o.parts], dtype=np.intp)
     radius = part[edge]
     as_others = replace(as_others, leg=legs[radius], radius=radius, constants=constants)
-    found = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
-    for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
+    distances_to_edges = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
+    for i, distances in enumerate(distances_to_edges.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
-        if distances[nearest] < min(_ON_EDGE_PX, _NEARER * away[i]):
+        if distances[nearest] < min(_ON_EDGE_PX, _NEARER * offset_sizes[i]):
             details[i] += f", lies on {edges[nearest]}"
     return [Rejection(Reason.DISAGREES, detail) for detail in details]

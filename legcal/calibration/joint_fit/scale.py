@@ -1,7 +1,8 @@
-"""What says how large a machine is: a measured length, or radii alone.
+"""Absolute scale of a machine: from a measured length, or from radii alone.
 
-Encoders of arms know angles, and passive legs have none: without a measured length such a machine,
-twice as large with rods twice as thick and cameras twice as far, gives the same measurements.
+Encoders of arms measure angles, and passive legs have none. Without a measured length, such a
+machine at twice the size, with rods twice as thick and cameras twice as far, gives the same
+measurements.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
 
-SCALE = "the scale, which radii alone say, by one standard deviation"
+SCALE = "the scale, known from radii alone, by one standard deviation"
 _FEWEST = 3  # radii
 _SPREAD = 0.25  # of their common difference
-_OTHER_LENGTH = 0.0075  # of rods, from which on a stated distance may be another one
-_LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters that say how large it is
+_OTHER_LENGTH = 0.0075  # relative change of rods, above which a stated distance is doubted
+_LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters with a length
 
 
 def has_length(problem: FitProblem) -> bool:
-    """Say whether something measured is a length: a reading, a board or what was stated.
+    """Whether a length was measured or stated: a reading, a board, a parameter.
 
-    A list and no rank, as ``is_scale_open`` of identify is: it must serve where a fit failed.
+    A list, not a rank test as ``is_scale_open`` of identify, since it is used after failed fits.
     """
     stated = {
         ParameterId.parse(name).kind for name in stated_parameters(problem) if ":" not in name
@@ -45,7 +46,7 @@ def has_length(problem: FitProblem) -> bool:
 
 
 def _images_have_length(problem: FitProblem) -> bool:
-    """Say whether what was measured with the images is a length: a reading, or a board."""
+    """Whether the images come with a measured length: a reading, or a board."""
     actuators = actuators_of(problem.legs.nominal)
     read = problem.observed.actuator_readings.actuator.tolist()
     return (
@@ -57,7 +58,7 @@ def _images_have_length(problem: FitProblem) -> bool:
 
 @contextmanager
 def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
-    """Say first, where a fit fails, that radii alone say how large its machine is, if they do."""
+    """Prepend to a failure that radii alone determine the scale, if they do."""
     try:
         yield
     except (DidNotConverge, NotIdentifiable) as failure:
@@ -65,9 +66,9 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
             raise
         raise type(failure)(
             [
-                "The joint fit could not be made: found no measured length, neither a reading of a "
-                "leg nor a board, so that radii alone say how large the machine is, and hardly "
-                "where its platform joints are; "
+                "The joint fit failed, and no measured length fixes the scale: there is neither a "
+                "reading of a leg nor a board, and radii alone hardly determine the platform "
+                "joints; "
                 + (
                     "measure a distance of two joints and state it (--length), or put a "
                     "calibration board on the base."
@@ -83,35 +84,35 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
 def sensitivity_to_scale(
     problem: FitProblem, state: State, covariance: Array
 ) -> tuple[Sensitivity, ...]:
-    """Return how parameters change with the scale, one standard deviation, if radii alone say it.
+    """Return the change of parameters with one sigma of a scale that is known from radii alone.
 
-    *covariance* is that of the kept unknowns. The scale is the mean length of the rods, over what
-    it is: what it explains of the covariance is what one measured length would take away.
+    *covariance* is of the kept unknowns. The scale is the relative change of the mean length of
+    rods; its share of the covariance would vanish with one measured length.
     """
-    every = problem.legs.parametrization
-    column = every.place[:, LegColumns.LENGTH]
+    parametrization = problem.legs.parametrization
+    column = parametrization.place[:, LegColumns.LENGTH]
     rods = np.flatnonzero(column >= 0)
     if not len(rods) or has_length(problem):
         return ()
-    by_scale = np.zeros(len(every))
+    by_scale = np.zeros(len(parametrization))
     by_scale[column[rods]] = 1.0 / (len(rods) * np.array([state.legs[j].q0 for j in rods]))
     n = problem.n_kinematic
     by_scale = by_scale[problem.free]
     moved = covariance[:n, :n] @ by_scale
-    step = np.zeros((len(every), 1))
+    step = np.zeros((len(parametrization), 1))
     step[problem.free, 0] = moved / np.sqrt(by_scale @ moved)
     return (Sensitivity(SCALE, step),)
 
 
 def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return notes where a machine comes out larger or smaller than its model by one factor."""
+    """Return notes on a fitted machine that is a scaled version of its model."""
     return (*_of_stated_lengths(problem, state), *_of_radii(problem, state))
 
 
 def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return a note where stated distances alone say the scale, and make rods another length.
+    """Note on rods of another length, where the scale comes from stated distances alone.
 
-    Images agree with a machine of any size: nothing else tells that another distance was measured.
+    Images agree with a machine of any size, so that only the nominal model can reveal a wrong one.
     """
     priors = problem.choices.priors
     stated = [n for n in priors if ":" in n or ParameterId.parse(n).kind == "length"]
@@ -127,15 +128,14 @@ def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
         return ()
     way = "shorter" if common < 0.0 else "longer"
     return (
-        f"Rods come out {1e2 * abs(common):.1f} % {way} than the model's, since "
-        f"{list_in_words(stated)} says how large the machine is, and images suit any size; if the "
-        "model is not that far off, another distance was measured: measure it once more, or a "
-        "second one.",
+        f"Rods come out {1e2 * abs(common):.1f} % {way} than the model's: the scale comes from "
+        f"{list_in_words(stated)} alone, and images fit any size; if the model is not that far "
+        "off, the stated distance is wrong: measure it again, or a second one.",
     )
 
 
 def _of_radii(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return a note where all radii come out larger or smaller than the model's by one factor."""
+    """Note on radii that are all larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
     change = (state.radii / nominal - 1.0)[free]

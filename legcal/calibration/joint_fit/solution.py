@@ -1,4 +1,4 @@
-"""The result of the joint fit, put together from a minimum, and put into the files' order."""
+"""The result of the joint fit, assembled at a minimum, and reordered to the files' order."""
 
 from __future__ import annotations
 
@@ -69,37 +69,36 @@ ParameterStatus = Literal["estimated", "fixed", "weak"]
 @brief
 @dataclass(frozen=True, eq=False)
 class KinematicUncertainty:
-    """How well all p kinematic parameters are known; covariances are zero of what is fixed."""
+    """Covariances of all p kinematic parameters; zero for fixed ones."""
 
     parametrization: Parametrization
-    # (p, p) of steps, as moved_legs and pose_sensitivity have them (axes turn about the vectors of
-    # where they are); zero along what is held
+    # (p, p) of steps, as in moved_legs and pose_sensitivity (rotation vectors for axes); zero along
+    # held directions
     covariance: Array
-    # (p, p) how far steps may be off along what is held, if the nominal model is as wrong there as
-    # the fit found it to be elsewhere
+    # (p, p) of steps along held directions, if the nominal model is as wrong there as elsewhere
     held_covariance: Array
-    value_covariance: Array  # (p, p) covariance of the values
-    held_basis: Array  # (w, p) how values change along each held direction, by a metre
-    held: tuple[str, ...]  # the directions that are held at nominal, in words
+    value_covariance: Array  # (p, p) of values
+    held_basis: Array  # (w, p) change of values along each held direction, by a metre
+    held: tuple[str, ...]  # descriptions of the held directions
 
     @property
     def total_covariance(self) -> Array:
-        """Of steps, (p, p): as far as the fit knows them, and along what is held."""
+        """Covariance (p, p) of steps, with held directions."""
         return self.covariance + self.held_covariance
 
     def of_values(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """Return covariance (n, n) and held basis (w, n) of the values of some parameters."""
-        at = _places(names, self.parametrization.names)
-        return self.value_covariance[np.ix_(at, at)], self.held_basis[:, at]
+        """Return covariance (n, n) and held basis (w, n) of the values of named parameters."""
+        indices = _indices_of(names, self.parametrization.names)
+        return self.value_covariance[np.ix_(indices, indices)], self.held_basis[:, indices]
 
     def in_order(self, parametrization: Parametrization) -> KinematicUncertainty:
-        """Return the same in the order of another parametrization of these parameters."""
-        at = _places(parametrization.names, self.parametrization.names)
+        """Reorder to another parametrization of the same parameters."""
+        indices = _indices_of(parametrization.names, self.parametrization.names)
         value_covariance, held_basis = self.of_values(parametrization.names)
         return KinematicUncertainty(
             parametrization,
-            self.covariance[np.ix_(at, at)],
-            self.held_covariance[np.ix_(at, at)],
+            self.covariance[np.ix_(indices, indices)],
+            self.held_covariance[np.ix_(indices, indices)],
             value_covariance,
             held_basis,
             self.held,
@@ -113,11 +112,11 @@ class Estimates:
 
     values: Mapping[str, float]  # [m, rad, px]
     units: Mapping[str, str]
-    status: Mapping[str, ParameterStatus]  # weak: part of a direction that is held at nominal
+    status: Mapping[str, ParameterStatus]  # weak: part of a held direction
     names: tuple[str, ...]  # the estimated ones, in the order of ``values``
-    covariance: Array  # (n, n) of these, with cameras and poses unknown
-    prior_sigma: Mapping[str, float]  # of the intrinsics that camera files state one of
-    # the estimated directions known worst, worst first, of what no camera file states
+    covariance: Array  # (n, n) of these, cameras and poses marginalised out
+    prior_sigma: Mapping[str, float]  # of intrinsics, from camera files
+    # estimated directions of largest variance, worst first, without intrinsics of camera files
     weak: tuple[WorstDirection, ...]
 
     @property
@@ -126,30 +125,30 @@ class Estimates:
         return np.sqrt(np.diagonal(self.covariance))
 
     def vector(self, names: Sequence[str]) -> Array:
-        """Return the values of some parameters, (len(names),)."""
+        """Return the values of named parameters, (len(names),)."""
         return np.array([self.values[name] for name in names])
 
     def in_order(self, names: Sequence[str]) -> Estimates:
-        """Return the same in the order in which these names, and others, stand."""
-        every = [name for name in names if name in self.values]
-        estimated = tuple(name for name in every if name in self.names)
-        at = _places(estimated, self.names)
+        """Reorder by *names*, which may have further names."""
+        ordered = [name for name in names if name in self.values]
+        estimated = tuple(name for name in ordered if name in self.names)
+        indices = _indices_of(estimated, self.names)
         return replace(
             self,
-            values={name: self.values[name] for name in every},
-            units={name: self.units[name] for name in every},
-            status={name: self.status[name] for name in every},
+            values={name: self.values[name] for name in ordered},
+            units={name: self.units[name] for name in ordered},
+            status={name: self.status[name] for name in ordered},
             names=estimated,
-            covariance=self.covariance[np.ix_(at, at)],
+            covariance=self.covariance[np.ix_(indices, indices)],
         )
 
 
 @brief
 @dataclass(frozen=True, eq=False)
 class GoodnessOfFit:
-    """How large the residuals of a fit are, and the noise that they show."""
+    """Residuals of a fit, and the noise estimated from them."""
 
-    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
+    cost: float  # of all observations, rejected too, with claimed covariances: comparable
     chi2: float  # of used outlines, axes, readings and priors
     dof: int
     rms_px: float | None  # of the offsets of used outlines [px]
@@ -162,14 +161,14 @@ class GoodnessOfFit:
 
 @dataclass(frozen=True, eq=False)
 class CameraDoubts:
-    """The cameras that the measurements contradict."""
+    """Cameras that contradict the measurements."""
 
-    tested: Sequence[WrongIntrinsic]  # whose residuals show one error, the clearest
-    others: Sequence[DoubtedCamera]  # that are moved too far for what their files state
+    tested: Sequence[WrongIntrinsic]  # by score tests
+    others: Sequence[DoubtedCamera]  # by the covariances of their files
 
     @classmethod
     def of(cls, cameras: CameraResiduals, covariance: Array) -> CameraDoubts:
-        """Return the doubts where a fit ended, with the covariance of its kept unknowns."""
+        """Test the cameras at a minimum with the *covariance* of its kept unknowns."""
         tested = cameras.contradicted()
         views = {test.view for test in tested}
         doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
@@ -177,14 +176,14 @@ class CameraDoubts:
 
     @property
     def views(self) -> tuple[str, ...]:
-        """The views that stand for these cameras."""
-        views = [one.view for one in self.tested] + [one.view for one in self.others]
+        """Representative views of these cameras."""
+        views = [doubt.view for doubt in self.tested] + [doubt.view for doubt in self.others]
         return tuple(dict.fromkeys(views))
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A sentence on each."""
-        return tuple(str(one) for one in (*self.tested, *self.others))
+        """One sentence per camera."""
+        return tuple(str(doubt) for doubt in (*self.tested, *self.others))
 
 
 @brief
@@ -193,28 +192,27 @@ class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
     legs: tuple[Leg, ...]  # in R_b and R_e
-    T_camera_Rb: tuple[RigidTransform, ...]  # one a view; of the start where it shows nothing
+    T_camera_Rb: tuple[RigidTransform, ...]  # one a view; of the start for a view without data
     cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were estimated
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
     estimates: Estimates
     kinematic: KinematicUncertainty
     quality: GoodnessOfFit
-    # View, pose (-1 on the base: in all images of the view) and number; poses as the fit counts
-    # them
+    # view, pose in the fit (-1 on the base: in all images of the view), and number
     rejected_corners: tuple[tuple[str, int, int], ...]
     # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
     T_frame_board: dict[Link, RigidTransform]
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
-    sensitivities: tuple[Sensitivity, ...]  # to mistakes in what was taken as known
-    outlines: Outlines  # the table that came in, with what the fit rejected and why
-    start: str  # label of the start that led here
+    sensitivities: tuple[Sensitivity, ...]  # to errors of fixed quantities
+    outlines: Outlines  # the input table, with the rejections of the fit
+    start: str  # label of the start
     iterations: int  # of the solver, all rounds
     camera_doubts: CameraDoubts
-    posterior: Posterior  # what it predicts of other images; in the order that was fitted
+    posterior: Posterior  # to predict other images; in the order of the fit
     notes: tuple[str, ...] = ()  # one sentence each
-    details: tuple[str, ...] = ()  # how it was found, the same
-    left_out: tuple[str, ...] = ()  # legs of views most of whose outlines disagree, unconfirmed
+    details: tuple[str, ...] = ()  # on the starts, one sentence each
+    left_out: tuple[str, ...] = ()  # legs in views with most outlines rejected, unconfirmed
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -222,7 +220,7 @@ class Solution:
         return parameters_of_legs(self.legs)
 
     def cameras_in_base(self, T_base_Rb: RigidTransform) -> tuple[RigidTransform, ...]:
-        """Return T_base_camera of every view, R_b laid where the nominal model has it."""
+        """Return T_base_camera of every view, with R_b at its nominal pose in the base."""
         return tuple(T_base_Rb * T.inv() for T in self.T_camera_Rb)
 
 
@@ -233,19 +231,19 @@ def assemble_solution(
     outlines: Outlines,
     label: str,
 ) -> Solution:
-    """Put together what was found; *normal* is the information where the fit ended.
+    """Assemble the solution; *normal* is the information at the minimum.
 
     Raises
     ------
     NotIdentifiable
-        If the outlines that are left do not determine the parameters.
+        If the inliers do not determine the parameters.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     kept = normal.kept_covariance()
     if fit.at_places is not None:
         kept = kept + fit.at_places.covariance
     covariance = named_covariance(problem, state, kept)
-    quality = _quality(fit, normal, len(held.basis))
+    quality = _goodness_of_fit(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
     doubts = CameraDoubts.of(cameras, kept)
     gammas = _gammas(problem, state, kept, outlines)
@@ -294,8 +292,8 @@ def assemble_solution(
     )
 
 
-def _quality(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
-    """Return how well a fit agrees with its data; *n_held* directions are not estimated."""
+def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
+    """Residual statistics of a fit with *n_held* held directions."""
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     offsets = problem.offsets(state)
     used = offsets[fit.accepted]
@@ -321,7 +319,7 @@ def _quality(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
 
 
 def _comparable_cost(problem: FitProblem, state: State) -> float:
-    """Return the robust cost of all observations with their claimed covariances."""
+    """Robust cost of all observations with their claimed covariances."""
     claimed = problem.weighted(NoiseModel())
     return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
@@ -329,47 +327,51 @@ def _comparable_cost(problem: FitProblem, state: State) -> float:
 def _gammas(
     problem: FitProblem, state: State, covariance: Array, outlines: Outlines
 ) -> tuple[EstimatedGamma, ...]:
-    """Return the estimated gammas; *covariance* is that of the kept unknowns."""
+    """Estimated gammas; *covariance* is of the kept unknowns."""
     o = problem.outlines
-    found = []
+    gammas = []
     for k, position in enumerate(problem.where("biases").tolist()):
         camera = problem.named[position].removesuffix(GAMMA_SUFFIX)
         if camera == problem.named[position]:
             continue
         of_camera = np.array([name == camera for name in o.cameras], dtype=np.bool_)
-        moved = of_camera[o.view] & (o.by_gamma != 0.0)
-        measured_with = float(outlines.gamma[o.index[moved]][0])
+        moving = of_camera[o.view] & (o.by_gamma != 0.0)
+        measured_with = float(outlines.gamma[o.index[moving]][0])
         views = tuple(name for name, is_one in zip(o.views, of_camera, strict=True) if is_one)
         gamma = measured_with * float(np.exp(state.biases[k]))
         sigma = float(np.sqrt(covariance[position, position]))
-        found.append(EstimatedGamma(views, gamma, sigma, measured_with))
-    return tuple(found)
+        gammas.append(EstimatedGamma(views, gamma, sigma, measured_with))
+    return tuple(gammas)
 
 
 def _estimates(
     problem: FitProblem, state: State, held: HeldDirections, covariance: Array
 ) -> Estimates:
-    """Return all parameters; *covariance* is that of the named unknowns."""
-    legs, biases, found = problem.legs, problem.block("biases").labels, problem.legs.parametrization
+    """Estimates of all parameters; *covariance* is of the named unknowns."""
+    legs, biases, parametrization = (
+        problem.legs,
+        problem.block("biases").labels,
+        problem.legs.parametrization,
+    )
     radii = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
     unknown = [name for name in problem.named if name not in biases]
-    of_unknowns = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
-    values = dict(zip(found.names, legs.vector(state.legs).tolist(), strict=True))
+    unknown_values = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
+    values = dict(zip(parametrization.names, legs.vector(state.legs).tolist(), strict=True))
     values |= dict(zip(radii, state.radii.tolist(), strict=True))
-    values |= {name: of_unknowns[name] for name in unknown}
+    values |= {name: unknown_values[name] for name in unknown}
     units = dict.fromkeys(radii, "m") | dict(zip(problem.named, problem.units, strict=True))
-    units |= dict(zip(found.names, found.units, strict=True))
-    status: dict[str, ParameterStatus] = dict.fromkeys((*found.names, *radii), "fixed")
+    units |= dict(zip(parametrization.names, parametrization.units, strict=True))
+    status: dict[str, ParameterStatus] = dict.fromkeys((*parametrization.names, *radii), "fixed")
     status |= dict.fromkeys(unknown, "estimated")
     status |= dict.fromkeys(held.names, "weak")
     names = tuple(name for name in values if status[name] == "estimated")
-    at = [problem.named.index(name) for name in names]
-    estimated, prior_sigma = covariance[np.ix_(at, at)], _prior_sigma(problem)
-    shown = [i for i, name in enumerate(names) if name not in prior_sigma]
+    indices = [problem.named.index(name) for name in names]
+    estimated, prior_sigma = covariance[np.ix_(indices, indices)], _prior_sigma(problem)
+    ranked = [i for i, name in enumerate(names) if name not in prior_sigma]
     weak = worst_directions(
-        estimated[np.ix_(shown, shown)],
-        tuple(names[i] for i in shown),
-        named_units(problem, state)[at][shown],
+        estimated[np.ix_(ranked, ranked)],
+        tuple(names[i] for i in ranked),
+        named_units(problem, state)[indices][ranked],
     )
     return Estimates(
         values,
@@ -383,7 +385,7 @@ def _estimates(
 
 
 def _prior_sigma(problem: FitProblem) -> dict[str, float]:
-    """Return the standard deviations that camera files state, by the name of the intrinsic."""
+    """Return standard deviations of intrinsics in camera files, by name."""
     priors, of_files = problem.priors, set(problem.calibrated.tolist())
     stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
     return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
@@ -392,11 +394,11 @@ def _prior_sigma(problem: FitProblem) -> dict[str, float]:
 def _kinematic(
     problem: FitProblem, state: State, held: HeldDirections, kept: Array, named: Array
 ) -> KinematicUncertainty:
-    """Return the uncertainty of kinematic parameters from that of *kept* and *named* unknowns."""
+    """Uncertainty of kinematic parameters from covariances of *kept* and *named* unknowns."""
     free, n = problem.free, problem.n_kinematic
 
     def of_every(covariance: Array) -> Array:
-        """Return of the covariance of unknowns that of all these, fixed ones too."""
+        """Expand to all kinematic parameters, zero for fixed ones."""
         wide = np.zeros((len(free), len(free)))
         wide[np.ix_(free, free)] = covariance[:n, :n]
         return wide
@@ -414,51 +416,54 @@ def _kinematic(
 
 
 def _rms(values: Array) -> float | None:
-    """Return the root mean square of values, None of none."""
+    """Root mean square of values; None without any."""
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
 def _misfit_of_axes(quality: GoodnessOfFit) -> tuple[str, ...]:
-    """Return a note where axes, whose errors are not estimated, are worse than they claim."""
+    """Note on axes with errors above their claimed standard deviations."""
     chi2, dof = quality.chi2, quality.dof
     if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
         return ()
     return (
-        f"The axes are worse than their standard deviations claim: chi2 is {chi2:.0f} for {dof} "
-        "degrees of freedom, so that the uncertainty of the result is about "
-        f"{np.sqrt(chi2 / max(dof, 1)):.1f} times what is stated; correct them.",
+        f"The errors of axes are larger than their standard deviations: chi2 is {chi2:.0f} for "
+        f"{dof} degrees of freedom, so that the uncertainty of the result is about "
+        f"{np.sqrt(chi2 / max(dof, 1)):.1f} times the stated one; correct the standard "
+        "deviations.",
     )
 
 
 def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
-    """Return the table with what the fit rejected, and why."""
+    """Mark the outlines rejected by the fit in the table, with reasons."""
     used, reason, problem = outlines.used.copy(), list(outlines.reason), fit.problem
     rejected = np.flatnonzero(~fit.accepted)
-    words = rejection_reasons(problem, fit.state, rejected, problem.offsets(fit.state))
-    every = np.ones_like(fit.accepted)
-    placed = of_determined_poses(problem.weighted(fit.noise), fit.state, every)[rejected]
-    for row, why, has_pose in zip(problem.outlines.index[rejected], words, placed, strict=True):
+    reasons = rejection_reasons(problem, fit.state, rejected, problem.offsets(fit.state))
+    all_outlines = np.ones_like(fit.accepted)
+    placed = of_determined_poses(problem.weighted(fit.noise), fit.state, all_outlines)[rejected]
+    for row, rejection, has_pose in zip(
+        problem.outlines.index[rejected], reasons, placed, strict=True
+    ):
         used[row] = False
-        reason[row] = why if has_pose else Rejection(Reason.FEW_LEGS)
+        reason[row] = rejection if has_pose else Rejection(Reason.FEW_LEGS)
     return replace(outlines, used=used, reason=tuple(reason))
 
 
 def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
-    """Return a solution found in the order of work, in the order of the dataset's files.
+    """Reorder a solution from the order of work to the order of the dataset's files.
 
     Parameters
     ----------
     solution : Solution
         In the order of work.
     order : Order
-        What that order is.
+        The order of work.
     dataset : Dataset
         In the order of the files.
 
     Returns
     -------
     Solution
-        B of legs that are fixed to the platform is where models put it.
+        B of legs fixed to the platform is at the point that model files use.
     """
     machine, measurements = dataset.machine, dataset.measurements
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
@@ -466,11 +471,11 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     geometry = with_platform_points([solution.legs[j] for j in legs], machine.frame_legs, origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    known = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
+    parameters = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
-    steps = _places(parametrization.names, solution.kinematic.parametrization.names)
-    poses = _poses(order, dataset).tolist()
+    steps = _indices_of(parametrization.names, solution.kinematic.parametrization.names)
+    poses = _pose_order(order, dataset).tolist()
     file_pose = {worked: pose for pose, worked in enumerate(poses)}
     readings = solution.quality.redundant_readings
     return replace(
@@ -480,7 +485,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
-        estimates=solution.estimates.in_order(tuple(known)),
+        estimates=solution.estimates.in_order(tuple(parameters)),
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
@@ -491,15 +496,15 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     )
 
 
-def _places(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
-    """Return where names stand among the same ones in another order."""
+def _indices_of(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
+    """Return the indices of names in a permutation of them."""
     return np.array([among.index(name) for name in names], dtype=np.intp)
 
 
-def _poses(order: Order, dataset: Dataset) -> IntArray:
-    """Return for every pose of the dataset its number in the order of work."""
+def _pose_order(order: Order, dataset: Dataset) -> IntArray:
+    """Index in the order of work of every pose of the dataset."""
     pose = dataset.measurements.pose
-    worked = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
-    found = np.empty(dataset.measurements.n_poses, dtype=np.intp)
-    found[pose] = worked
-    return found
+    pose_in_work_order = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
+    work_pose = np.empty(dataset.measurements.n_poses, dtype=np.intp)
+    work_pose[pose] = pose_in_work_order
+    return work_pose

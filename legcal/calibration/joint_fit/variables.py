@@ -1,4 +1,4 @@
-"""The variables of the joint fit: its state, where it starts, the manifolds, exact constraints.
+"""The variables of the joint fit: state, start, manifolds, exact constraints.
 
 The kinematic parameters are the vector of :mod:`legcal.machine` (``Parametrization``);
 :class:`LegParameters` is its manifold with some of them fixed. Platform poses obey the constraints
@@ -41,9 +41,9 @@ from legcal.machine.ties import Ties, independent, ties_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
-_TIED, _TIE_STEPS = 2.5e-13, 20  # mean leg lengths, and steps towards it
-_MET = 2.5e-12  # mean leg lengths by which constraints are missed that are met
-_STEP_TOLERANCE = 1e-6  # mean leg lengths, [rad]: last step where they cannot all be met
+_TIED, _TIE_STEPS = 2.5e-13, 20  # residual of ties [mean leg lengths], and Newton steps
+_MET = 2.5e-12  # residual of satisfied constraints [mean leg lengths]
+_STEP_TOLERANCE = 1e-6  # last step where constraints contradict each other [mean leg lengths, rad]
 
 
 @dataclass(frozen=True)
@@ -51,18 +51,18 @@ class RefinementSettings:
     """Settings of the joint fit; distances of outlines and axes are whitened."""
 
     radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
-    arm_axis_sigma: float = 0.02  # of that on the line of an arm where the model draws it [rad],
-    arm_point_sigma: float = 0.01  # and across it, of the mean length of the rods
-    board_scale_sigma: float = 0.001  # of the dimensions of a board: what printers and paper do
+    arm_axis_sigma: float = 0.02  # of the prior on the direction of an arm [rad]
+    arm_point_sigma: float = 0.01  # of its position across, in mean rod lengths
+    board_scale_sigma: float = 0.001  # relative, of the dimensions of a board: printers, paper
     loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
-    rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
+    rejection: float = 4.5  # distance of rejection; false for one outline in 25,000
     rejection_rounds: int = 6  # at most, until the rejected outlines stay the same
-    noise_rounds: int = 10  # at most, in which the errors of outlines are estimated after that
+    noise_rounds: int = 10  # at most, of noise estimation after that
     error_tolerance: float = 0.02  # relative change of these errors at which the rounds end
-    axis_disagreement: float = 20.0  # beyond, an axis disagrees; if most do, the fit is refused
+    axis_disagreement: float = 20.0  # distance of outlier axes; if most are, the fit is refused
     largest_rms_px: float = 3.0  # of the offsets of accepted outlines [px]
-    other_starts: int = 8  # where a fit leaves out a leg of a view, at most
-    judges_stated_values: bool = True  # whether those that measurements contradict are refused
+    other_starts: int = 8  # at most, if a fit rejects a leg of a view
+    judges_stated_values: bool = True  # refuse values that contradict the measurements
     max_iterations: int = 200  # steps to try in each solve
 
 
@@ -71,7 +71,7 @@ DEFAULT_SETTINGS = RefinementSettings()
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a fit begins."""
+    """Starting values of a fit."""
 
     legs: tuple[Leg, ...]  # in R_b and R_e
     T_camera_Rb: tuple[RigidTransform, ...]  # one a view
@@ -83,9 +83,9 @@ class Start:
 
 
 class Postures(NamedTuple):
-    """Platform poses T_Rb_Re with the readings of actuators, which are unknowns beside each.
+    """Platform poses T_Rb_Re with the readings of actuators at each.
 
-    They move by 6 + n numbers each: those of ``Frames``, then readings.
+    Tangent steps have 6 + n coordinates: those of ``Frames``, then readings.
     """
 
     R: Array  # (n_poses, 3, 3)
@@ -99,15 +99,15 @@ class Postures(NamedTuple):
 
     @property
     def motions(self) -> tuple[RigidTransform, ...]:
-        """The same as rigid motions."""
+        """Poses as ``RigidTransform`` objects."""
         return self.frames.motions
 
     def moved(self, change: Array) -> Postures:
-        """Return them after changes (n_poses, 6 + n)."""
+        """Apply tangent steps (n_poses, 6 + n)."""
         return Postures(*self.frames.moved(change[:, :6]), self.q + change[:, 6:])
 
     def where(self, chosen: BoolArray, other: Postures) -> Postures:
-        """Return them with the chosen ones (n_poses,) of others."""
+        """Replace the chosen postures (n_poses,) by others."""
         R = np.where(chosen[:, None, None], other.R, self.R)
         t = np.where(chosen[:, None], other.t, self.t)
         return Postures(R, t, np.where(chosen[:, None], other.q, self.q))
@@ -133,7 +133,7 @@ class State:
 
     @cached_property
     def actuated(self) -> dict[int, JointMotion]:
-        """How the joint at A of each leg on an actuator moves at all poses."""
+        """Motion of the joint at A at all poses, by leg on an actuator."""
         on, q = actuator_index(self.legs), self.platform_pose.q
         return {
             j: leg.actuator.motion(leg.A, q[:, on[j]])
@@ -143,7 +143,7 @@ class State:
 
     @cached_property
     def arm_ends(self) -> dict[int, tuple[JointMotion, ...]]:
-        """How both ends of the arm move at all poses, by the leg that has it as a part."""
+        """Motion of both ends of the arm at all poses, by the leg of the arm."""
         on, q = actuator_index(self.legs), self.platform_pose.q
         return {
             j: tuple(leg.actuator.motion(end, q[:, on[j]]) for end in leg.arm.ends)
@@ -171,19 +171,19 @@ class State:
 
     @cached_property
     def arms(self) -> Array:
-        """From the origin of R_e to B in R_b, (n_poses, n_legs, 3) [m]."""
+        """Vectors from the origin of R_e to B in R_b, (n_poses, n_legs, 3) [m]."""
         shape = 3, len(self.platform_pose.t), len(self.legs)
         return self.ends_at_poses[0].reshape(shape).transpose(1, 2, 0)
 
     @cached_property
     def ends_at_poses(self) -> tuple[Array, Array]:
-        """B of all legs at all poses, (3, n_poses * n_legs): from the origin of R_e, and of R_b."""
+        """B at all poses, (3, n_poses * n_legs) each: from the origin of R_e, and of R_b."""
         arms = self.platform_pose.R.transpose(1, 0, 2) @ self.B.T
         ends = arms + self.platform_pose.t.T[..., None]
         return arms.reshape(3, -1), ends.reshape(3, -1)
 
     def with_chosen(self, chosen: BoolArray, poses: Postures) -> State:
-        """Return the state with the chosen ones (n_poses,) of other poses."""
+        """Replace the chosen poses (n_poses,)."""
         return replace(self, platform_pose=self.platform_pose.where(chosen, poses))
 
     @property
@@ -194,9 +194,9 @@ class State:
 
     @property
     def posture_scale(self) -> Array:
-        """What steps of a posture (6 + n,) are large beside: 1 rad, or a mean leg length [m].
+        """Scale of steps of a posture (6 + n,): 1 rad, a mean leg length [m].
 
-        Of readings it is how far they move the joint at A of a rod so far.
+        For readings, the step that moves the joint at A of a rod by a mean leg length.
         """
         length = self.mean_length
         readings = [self.legs[j].reading_of(length) for j in first_rods(self.legs)]
@@ -205,10 +205,10 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class FittedLegs:
-    """The legs of a mechanism as the joint fit sees them."""
+    """The legs of a mechanism, as inputs of the joint fit."""
 
     names: tuple[str, ...]
-    nominal: tuple[Leg, ...]  # in R_b and R_e: what axes count from, what fixed ones keep
+    nominal: tuple[Leg, ...]  # in R_b and R_e: reference of axis angles, values of fixed ones
     frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
@@ -236,7 +236,7 @@ class FittedLegs:
 
     @cached_property
     def n_actuators(self) -> int:
-        """Number of actuators on which rods hang."""
+        """Number of actuators that move joints at A."""
         return len(actuators_of(self.nominal))
 
     @cached_property
@@ -246,18 +246,18 @@ class FittedLegs:
 
     @cached_property
     def ties(self) -> Ties:
-        """What ties the parameters to each other."""
+        """Ties between the parameters, by exact constraints of the mechanism."""
         tied = self.home is not None and not self.n_actuators
         home = self.home.as_matrix()[:3] if tied and self.home is not None else None
         return ties_of(self.nominal, self.frame_legs, home)
 
     def vector(self, legs: tuple[Leg, ...]) -> Array:
-        """Return the kinematic parameters of legs [m, rad]; axes count from the nominal ones."""
+        """Return the kinematic parameters of legs [m, rad]; axes as angles from nominal."""
         return vector_of(self.parametrization, legs, self.nominal)
 
 
 def fitted_legs(machine: Machine) -> FittedLegs:
-    """Return the fit's view of the legs of a mechanism."""
+    """Return the legs of a mechanism as inputs of the joint fit."""
     return FittedLegs(
         tuple(leg.name for leg in machine.legs),
         geometries(machine),
@@ -274,7 +274,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
 
 @dataclass(frozen=True, eq=False)
 class LegParameters:
-    """The manifold of the legs: which parameters move, where the others are fixed."""
+    """The manifold of the legs: free parameters, and values of the fixed ones."""
 
     legs: FittedLegs
     free: BoolArray  # (p,) which kinematic parameters are unknowns
@@ -283,13 +283,13 @@ class LegParameters:
 
     @cached_property
     def unknown(self) -> IntArray:
-        """The unknown that moves each of the numbers of each leg, -1 for none."""
+        """Index of the unknown of each coordinate of each leg, -1 for fixed."""
         number = np.append(np.where(self.free, np.cumsum(self.free) - 1, -1), -1)
         return np.asarray(number[self.legs.parametrization.place], dtype=np.intp)
 
     @cached_property
     def fixed(self) -> dict[int, float]:
-        """The values of the parameters that are no unknowns, by their number."""
+        """Values of the fixed parameters, by index."""
         nominal, names = self.legs.vector(self.legs.nominal), self.legs.parametrization.names
         return {
             int(i): self.values.get(names[i], float(nominal[i])) for i in np.flatnonzero(~self.free)
@@ -297,40 +297,42 @@ class LegParameters:
 
     @cached_property
     def turns(self) -> bool:
-        """Whether an axis is free, whose angles from nominal are not just added up."""
+        """Whether an axis is free; its angles from nominal are not additive."""
         axes = self.unknown[:, LegColumns.BASE_AXIS.start : LegColumns.TWIST]
         return bool(np.any(axes >= 0) or np.any(self.unknown[:, LegColumns.OWN :] >= 0))
 
     @cached_property
     def _half_fixed(self) -> dict[int, float]:
-        """The fixed angles of axes whose other angle is free."""
-        place, found = self.legs.parametrization.place, dict[int, float]()
-        for own, unknown in zip(place, self.unknown, strict=True):
+        """Fixed angles of axes with another angle free, by index."""
+        columns_of_legs, values = self.legs.parametrization.place, dict[int, float]()
+        for columns_of_leg, unknown in zip(columns_of_legs, self.unknown, strict=True):
             for axis in (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS):
-                is_fixed = (own[axis] >= 0) & (unknown[axis] < 0)
+                is_fixed = (columns_of_leg[axis] >= 0) & (unknown[axis] < 0)
                 if is_fixed.sum() == 1:
-                    number = int(own[axis][is_fixed][0])
-                    found[number] = self.fixed[number]
+                    number = int(columns_of_leg[axis][is_fixed][0])
+                    values[number] = self.fixed[number]
             for columns in (ActuatorColumns.LINE, ActuatorColumns.ARM):
-                is_fixed = (own[columns] >= 0) & (unknown[columns] < 0)
+                is_fixed = (columns_of_leg[columns] >= 0) & (unknown[columns] < 0)
                 if np.any(unknown[columns] >= 0):
-                    found |= {int(i): self.fixed[int(i)] for i in own[columns][is_fixed]}
-        return found
+                    values |= {
+                        int(i): self.fixed[int(i)] for i in columns_of_leg[columns][is_fixed]
+                    }
+        return values
 
     def at_fixed(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
-        """Return legs with everything that is fixed at its value."""
+        """Set fixed parameters to their values."""
         return self.tied(with_values(geometry, self.legs, self.fixed))
 
     def retract(self, geometry: tuple[Leg, ...], change: Array) -> tuple[Leg, ...]:
-        """Return legs after a change (n_legs, 21) of their numbers."""
+        """Apply tangent steps (n_legs, 21)."""
         place = np.arange(change.size, dtype=np.intp).reshape(change.shape)
         return self.tied(moved_legs(geometry, place, change.ravel()))
 
     def tied(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
-        """Return legs whose fixed angles are where they are fixed, whatever turned the axes.
+        """Restore fixed angles after steps of free axes.
 
-        Turning an axis away and back on another way leaves what is tied to it turned about it, and
-        turning it by one of its angles changes the other a little.
+        Turning an axis by one of its angles changes the other to second order, and turning it along
+        a loop leaves a twist about it.
         """
         moved = with_values(geometry, self.legs, self._half_fixed) if self._half_fixed else geometry
         names = self.legs.names
@@ -349,19 +351,19 @@ class LegParameters:
         )
 
     def _ties_at(self, geometry: tuple[Leg, ...], n: int | None) -> tuple[Array, Array]:
-        """Return *n* ties (w,) and their derivatives by the unknowns (w, p_free)."""
-        found = self.legs.ties.at(geometry)
-        by_local = found.by_local.copy()
+        """Residuals (w,) of *n* ties and their derivatives by the unknowns (w, p_free)."""
+        ties = self.legs.ties.at(geometry)
+        by_local = ties.by_local.copy()
         for leg, nominal, unknown, rows in zip(
             geometry, self.legs.nominal, self.unknown, np.moveaxis(by_local, 1, 0), strict=True
         ):
             if unknown[LegColumns.TWIST] < 0:
                 slope = tied_twist_slope(leg, nominal)
                 rows[:, LegColumns.PLATFORM_AXIS] += rows[:, [LegColumns.TWIST]] * slope
-        rows = np.zeros((len(found.values), int(self.free.sum())))
+        rows = np.zeros((len(ties.values), int(self.free.sum())))
         is_unknown = self.unknown >= 0
         rows[:, self.unknown[is_unknown]] = by_local[:, is_unknown]
-        return independent(found, rows, n)
+        return independent(ties, rows, n)
 
     @cached_property
     def n_tied(self) -> int:
@@ -369,15 +371,15 @@ class LegParameters:
         return len(self._ties_at(self.legs.nominal, None)[1]) if self.legs.ties else 0
 
     def tie_rows(self, geometry: tuple[Leg, ...]) -> tuple[Array, Array]:
-        """Return what is left of each tie (w,) and its derivative by the unknowns (w, p_free)."""
+        """Return residuals (w,) of ties and their derivatives by the unknowns (w, p_free)."""
         if self._last is None or self._last[0] is not geometry:
-            found = geometry, self._ties_at(geometry, self.n_tied)
-            object.__setattr__(self, "_last", found)
-            return found[1]
+            cached = geometry, self._ties_at(geometry, self.n_tied)
+            object.__setattr__(self, "_last", cached)
+            return cached[1]
         return self._last[1]
 
     def on_ties(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
-        """Return legs moved, as little as possible, to where all ties hold."""
+        """Project legs onto the ties."""
         for _ in range(_TIE_STEPS if self.n_tied else 0):
             left, rows = self.tie_rows(geometry)
             if np.abs(left).max() < _TIED * self.legs.length_at_home:
@@ -391,7 +393,7 @@ class LegParameters:
         return np.asarray(self.legs.vector(geometry)[self.free])
 
     def jacobian(self, geometry: tuple[Leg, ...]) -> Array:
-        """Return their derivative by steps (p_free, p_free): one but for axes."""
+        """Return the derivative of the coordinates by steps (p_free, p_free): one but for axes."""
         J = np.eye(int(self.free.sum()))
         for leg, nominal, unknown, number in zip(
             geometry, self.legs.nominal, self.unknown, self.legs.parametrization.place, strict=True
@@ -402,20 +404,20 @@ class LegParameters:
             ):
                 if axis is None or start is None or np.all(unknown[columns] < 0):
                     continue
-                by = np.zeros((len(self.free), 2))
-                by[number[columns]] = axis_angles_slope(axis, start)
+                slope_of_axis = np.zeros((len(self.free), 2))
+                slope_of_axis[number[columns]] = axis_angles_slope(axis, start)
                 if columns is LegColumns.PLATFORM_AXIS and number[LegColumns.TWIST] >= 0:
-                    by[number[LegColumns.TWIST]] = -tied_twist_slope(leg, nominal)
-                for x, column in zip(unknown[columns], by.T, strict=True):
+                    slope_of_axis[number[LegColumns.TWIST]] = -tied_twist_slope(leg, nominal)
+                for x, column in zip(unknown[columns], slope_of_axis.T, strict=True):
                     if x >= 0:
                         J[:, x] = column[self.free]
             if leg.actuator is not None and nominal.actuator is not None:
                 slope = leg.actuator.numbers_slope(nominal.actuator)
-                own = number[LegColumns.ACTUATOR]
+                parameter = number[LegColumns.ACTUATOR]
                 for x, column in zip(unknown[LegColumns.ACTUATOR], slope.T, strict=True):
                     if x >= 0:
                         turned = np.zeros(len(self.free))
-                        turned[own[own >= 0]] = column[own >= 0]
+                        turned[parameter[parameter >= 0]] = column[parameter >= 0]
                         J[:, x] = turned[self.free]
         return J
 
@@ -423,21 +425,21 @@ class LegParameters:
 def with_values(
     geometry: tuple[Leg, ...], legs: FittedLegs, values: Mapping[int, float]
 ) -> tuple[Leg, ...]:
-    """Return legs some of whose parameters, by their number, have given values [m, rad]."""
-    wanted, place = np.append(legs.vector(geometry), 0.0), legs.parametrization.place
-    wanted[list(values)] = list(values.values())
-    return with_numbers(geometry, legs.nominal, wanted[place], np.isin(place, list(values)))
+    """Set parameters of legs, by index, to values [m, rad]."""
+    numbers, place = np.append(legs.vector(geometry), 0.0), legs.parametrization.place
+    numbers[list(values)] = list(values.values())
+    return with_numbers(geometry, legs.nominal, numbers[place], np.isin(place, list(values)))
 
 
 def intrinsic_of(camera: Camera, key: str) -> float:
-    """Return one number of a camera by its name."""
+    """Return an intrinsic of a camera by name."""
     return float(intrinsic_values(camera)[intrinsic_names(camera).index(key)])
 
 
 def changed_cameras(
     cameras: tuple[Camera, ...], change: Array, keys: tuple[str, ...]
 ) -> tuple[Camera, ...]:
-    """Return cameras whose intrinsics *keys* have changed by (n_views, n_keys)."""
+    """Add changes (n_views, n_keys) to the intrinsics *keys* of cameras."""
     if not np.any(change):
         return cameras
     changed = []
@@ -448,8 +450,8 @@ def changed_cameras(
     return tuple(changed)
 
 
-def _binding(legs: Sequence[Leg], poses: Postures) -> tuple[PoseEquations, Array]:
-    """Return what holds whatever was measured, and its derivatives (k, m, 6 + n) by postures."""
+def _constraint_equations(legs: Sequence[Leg], poses: Postures) -> tuple[PoseEquations, Array]:
+    """Constraint equations without readings, and their derivatives (k, m, 6 + n) by postures."""
     rows = posture_constraints(legs, *poses, by_local=True)
     return rows, np.concatenate([rows.by_pose, rows.by_q], axis=2)
 
@@ -467,65 +469,62 @@ class LegConstraints:
 
     @cached_property
     def binds(self) -> bool:
-        """Whether legs have equations that hold without a reading."""
+        """Whether legs have equations without a reading."""
         return any(leg.n_constraints for leg in self.legs.nominal)
 
     def project(self, state: State) -> State:
-        """Return the state with every pose moved, as little as possible, to where they hold.
-
-        Where they contradict each other a pose goes where they are met best.
-        """
+        """Project every pose onto the constraints; least squares if they are contradictory."""
         if np.any(state.radii <= 0.0):
-            raise DidNotConverge("The joint fit came to a radius that is not positive.")
-        there, step = self._closed(state)
+            raise DidNotConverge("The joint fit reached a radius that is not positive.")
+        projected, step = self._closed(state)
         size = float(step.max(initial=0.0))
         if size < _STEP_TOLERANCE:
-            return there
+            return projected
         raise DidNotConverge(
-            "The joint fit could not keep the platform on what its joints allow: found a pose that "
-            f"still moves by {size:.2g} leg lengths or rad, needed rest; start nearer to the truth "
-            "(joints to 1 % of a leg length, axes to 3 deg)."
+            "The joint fit could not satisfy the constraints of the joints: the projection of a "
+            f"pose did not converge (last step {size:.2g} leg lengths or rad); start nearer to the "
+            "truth (joints to 1 % of a leg length, axes to 3 deg)."
         )
 
     def with_poses(self, state: State, poses: Postures) -> State:
-        """Return the state with the poses (n_poses,) that can be projected; others stay."""
+        """Set and project poses (n_poses,); those that cannot be projected stay."""
         finite: BoolArray = np.isfinite(poses.t + poses.R.sum(axis=2)).all(axis=1)
         finite &= np.isfinite(poses.q).all(axis=1)
-        there, step = self._closed(state.with_chosen(finite, poses))
-        return state.with_chosen(finite & (step < _STEP_TOLERANCE), there.platform_pose)
+        projected, step = self._closed(state.with_chosen(finite, poses))
+        return state.with_chosen(finite & (step < _STEP_TOLERANCE), projected.platform_pose)
 
     def _closed(self, state: State) -> tuple[State, Array]:
-        """Return the state where constraints hold, and how far poses still move (n_poses,)."""
+        """Project the state; also return the last step of each pose (n_poses,), 0 if met."""
         if not self.binds:
             return state, np.zeros(len(state.platform_pose.t))
         state = replace(state, legs=self.parameters.on_ties(state.legs))
         frame_legs, (R, t, q) = self.legs.frame_legs, state.platform_pose
         scale = state.posture_scale
         if self.legs.n_actuators:
-            found, q = solve_postures(state.legs, frame_legs, R, t, q, scale)
+            solved, q = solve_postures(state.legs, frame_legs, R, t, q, scale)
         else:
-            found = solve_poses(state.legs, frame_legs, R, t, scale=scale)
-        # The last step to where they hold may be long.
-        step = np.where(found.missed < _MET * state.mean_length, 0.0, found.size)
-        return replace(state, platform_pose=Postures(found.R, found.t, q)), step
+            solved = solve_poses(state.legs, frame_legs, R, t, scale=scale)
+        # The last step of a converged projection may be long.
+        step = np.where(solved.missed < _MET * state.mean_length, 0.0, solved.size)
+        return replace(state, platform_pose=Postures(solved.R, solved.t, q)), step
 
     @cached_property
     def _free(self) -> list[int]:
-        """The numbers of a posture that move."""
+        """Free coordinates of a posture."""
         d = 6 + self.legs.n_actuators
         return [*freedoms(self.legs.frame_legs), *range(6, d)]
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
-        """Return the motions of poses that the constraints leave; None where all are free.
+        """Return the tangent space of poses; None without constraints.
 
-        One radian of them, or the mean leg length, counts as one.
+        The basis is scaled to one radian or the mean leg length.
         """
         if self.legs.spatial and not self.binds:
             return None
         free, d = self._free, problem.d_element
         scale = state.posture_scale[free]
         n_poses, n_kept = problem.n_elements, problem.n_kept
-        rows, by_posture = _binding(state.legs, state.platform_pose)
+        rows, by_posture = _constraint_equations(state.legs, state.platform_pose)
         Q = np.zeros((n_kept + 1, n_poses, d))
         if len(rows.leg) == 0:
             Z = np.broadcast_to(np.eye(d)[:, free] * scale, (n_poses, d, len(free))).copy()
@@ -556,9 +555,9 @@ class LegConstraints:
         return Tangent(Z, Q[:-1], ties)
 
     def following(self, state: State, leg: int, column: int) -> Array:
-        """Return how postures (n_poses, 6 + n) follow a number of a leg, all else at rest."""
+        """Return the derivative of postures (n_poses, 6 + n) by a coordinate of a leg."""
         free, scale = self._free, state.posture_scale[self._free]
-        rows, by_posture = _binding(state.legs, state.platform_pose)
+        rows, by_posture = _constraint_equations(state.legs, state.platform_pose)
         inverse = scale[:, None] * np.linalg.pinv(by_posture[:, :, free] * scale, rcond=_RANK)
         by_number = np.where(rows.leg == leg, rows.by_local[:, :, column], 0.0)
         motion = np.zeros((len(state.platform_pose.t), by_posture.shape[2]))
@@ -574,10 +573,9 @@ def start_from(
     T_Rb_Re: Sequence[RigidTransform],
     label: str,
 ) -> Start:
-    """Return a start whose platform poses fit the legs *geometry* and the readings.
+    """Return a start with platform poses by forward kinematics of *geometry* at the readings.
 
-    *T_Rb_Re* has a pose nearby for each, in the right assembly mode: the nominal forward
-    kinematics.
+    *T_Rb_Re* are poses nearby, in the right assembly mode: the nominal forward kinematics.
     """
     lengthening = legs.sign * measurements.q_of_poses
     poses = platform_poses(geometry, lengthening, T_Rb_Re, legs.frame_legs)
@@ -613,10 +611,10 @@ def platform_poses(
     T_Rb_Re: Sequence[RigidTransform],
     frame_legs: Sequence[int],
 ) -> tuple[RigidTransform, ...]:
-    """Return the platform poses at which the legs have given readings, all at once.
+    """Solve the forward kinematics for all poses.
 
-    Where no pose has these (parameters far from the truth) the pose with the least
-    squares of the residuals of legs is returned: a fit can still start there.
+    Where no pose has the readings (parameters far from the truth), the least-squares pose is
+    returned: a fit can still start there.
 
     Parameters
     ----------
@@ -630,5 +628,5 @@ def platform_poses(
     frame_legs : sequence of int
         The legs that define R_b and R_e.
     """
-    found = solve_poses(geometry, frame_legs, *Frames.of(T_Rb_Re), lengthening)
-    return Frames(found.R, found.t).motions
+    solved = solve_poses(geometry, frame_legs, *Frames.of(T_Rb_Re), lengthening)
+    return Frames(solved.R, solved.t).motions
