@@ -288,7 +288,7 @@ def test_the_legs_of_a_datasets_views_count(
 
 def test_choices_determine_what_they_say_and_no_more() -> None:
     names = parametrization_of(two_images().machine).names
-    with pytest.raises(NotIdentifiable, match="or state what is known of them with --set"):
+    with pytest.raises(NotIdentifiable, match="or state known values with --set"):
         check_identifiable(two_images())
     known, vague = (
         Choices(priors={name: Prior(0.3, sigma) for name in names}) for sigma in (1e-4, 100.0)

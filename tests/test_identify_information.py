@@ -22,7 +22,7 @@ from legcal.calibration.identify.information import (
     expected_intrinsics,
     image_rows,
     intrinsics_changes,
-    problem_of,
+    session_problem,
     whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import (
@@ -281,7 +281,7 @@ def test_the_square_root_is_that_of_the_information_of_the_problem() -> None:
     """Where nothing is exact, so that squares do not lose it in rounding."""
     session = planned_observations(legcal.load_mechanism("hexapod"), [range(6)] * 2, 8)
     analysis = Analysis(replace(session, sigma_q=1e-4))
-    problem, state = problem_of(
+    problem, state = session_problem(
         analysis.predicted, analysis.images, analysis.equations, analysis.prior
     )
     parameters = problem.where("parameters")

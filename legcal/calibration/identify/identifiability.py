@@ -1,4 +1,4 @@
-"""Whether planned views, or a dataset, can determine the parameters: ``legcal identify``."""
+"""Identifiability of the parameters from planned views, or a dataset: ``legcal identify``."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ from legcal.paper.conditions import (
 )
 
 MOST_VIEWS = 50
-MOST_IMAGES = 2000  # of a session; more says nothing new and takes minutes
+MOST_IMAGES = 2000  # of a session; more add nothing and take minutes
 _IMAGES = 15
-_ROUGH = 0.1  # mean leg lengths: calibrations do not accept directions known to no better
+_ROUGH = 0.1  # mean leg lengths: above, a calibration rejects a direction
 
 
 def answer(
@@ -66,15 +66,14 @@ def answer(
     views: Sequence[Sequence[str]],  # legs of each view; none for a dataset
     images: int | None,  # images a view; None for 15, and for a dataset
     *,
-    # board, platform_board, hand_held: whether there is a calibration board on the base, one on the
-    # platform, and whether every image has a place of its own
+    # calibration board on the base, on the platform; another camera pose for every image
     board: bool = False,
     platform_board: bool = False,
     hand_held: bool = False,
 ) -> Identifiability:
     """Return the report on a model with views, or on a dataset.
 
-    Raises UsageError if any of these is given for a dataset, or does not fit the model.
+    Raises UsageError if an option is given for a dataset, or does not fit the model.
     """
     path = Path(source)
     if not (path.name == DATASET_YAML or (path / DATASET_YAML).is_file()):
@@ -86,29 +85,28 @@ def answer(
             platform_board=platform_board,
             hand_held=hand_held,
         )
-    given = {
+    options = {
         "--view": bool(views),
         "--images": images is not None,
         "--board": board,
         "--platform-board": platform_board,
         "--hand-held": hand_held,
     }
-    for option in (name for name, is_given in given.items() if is_given):
+    for option in (name for name, is_given in options.items() if is_given):
         raise UsageError(
-            f"{source}: the dataset could not be judged with {option}: found a dataset, which has "
-            f"its own views and images, needed a model for that; leave {option} out, or name the "
-            "model."
+            f"{source}: the dataset could not be judged with {option}: a dataset has its own views "
+            f"and images; leave {option} out, or name a model instead."
         )
     from legcal.data.dataset import load_dataset
 
     dataset = load_dataset(path, check_images=False)
-    known = known_parameters(
+    parameters = known_parameters(
         dataset.machine,
         dataset.measurements.views,
         axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
-    return identifiability_of_dataset(dataset, resolve(dataset.overrides, known))
+    return identifiability_of_dataset(dataset, resolve(dataset.overrides, parameters))
 
 
 def identifiability(
@@ -120,23 +118,23 @@ def identifiability(
     hand_held: bool = False,
     platform_board: bool = False,
 ) -> Identifiability:
-    """Judge what images of some views determine of a mechanism's parameters.
+    """Judge the identifiability of a mechanism's parameters from planned views.
 
     Parameters
     ----------
     mechanism : Machine
         The nominal model.
     views : sequence of sequences of str
-        Names of the legs that each camera position shows; without any, the smallest sets of
-        views that suffice are recommended and the first of them is judged.
+        Names of the legs visible from each camera position; without any, the smallest
+        sufficient sets of views are recommended and the first one is judged.
     images : int
         Images a view, each of another pose.
     board : bool
-        A calibration board on the base is seen in every image and ties the cameras to each other.
+        A calibration board on the base, visible in every image, relates the cameras.
     platform_board : bool
-        A calibration board on the platform is seen in every image; where it is fixed is unknown.
+        A calibration board on the platform, visible in every image, at an unknown pose.
     hand_held : bool
-        Every image of a view is taken from a place of its own.
+        Hand-held camera: a new camera pose for every image.
 
     Returns
     -------
@@ -152,15 +150,17 @@ def identifiability(
 
     Notes
     -----
-    Counts are the paper's. Ranks are those of linearised observations of a machine that is nearly
-    the nominal one, from cameras in default places and at random poses inside the travel: a
-    direction counts as determined if its predicted standard deviation is less than the
-    mean leg length (angles count at that length). Well-determined directions lie below a
-    tenth of it, undetermined ones above a multiple.
+    Counts are the paper's. Ranks are of linearised observations of a machine close to the nominal
+    one, with cameras at default places and random poses inside the travel: a direction is
+    determined if its predicted standard deviation is less than the mean leg length (angles times
+    that length). Well-determined directions lie below a tenth of it, undetermined ones above a
+    multiple.
     """
     legs = read_views(views, mechanism.leg_names, images)
     if hand_held:
-        return _judge_hand_held(mechanism, legs, images, board=board, platform_board=platform_board)
+        return _report_on_hand_held(
+            mechanism, legs, images, board=board, platform_board=platform_board
+        )
     recommendation = None
     boards = {"board": board, "platform_board": platform_board}
     if not legs:
@@ -172,23 +172,23 @@ def identifiability(
         lambda more: planned_observations(mechanism, legs, more, **boards),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), **boards),
     )
-    return _judge(mechanism, Analysis(predicted), recommendation, replanning)
+    return _report_on(mechanism, Analysis(predicted), recommendation, replanning)
 
 
 def identifiability_of_dataset(
-    # nothing is detected: every view is taken to show the legs that it names, or all
+    # images are not read: every view shows the legs that it names, or all
     dataset: Dataset,
-    # parameters that are fixed or known from elsewhere, and twists that are looked for
+    # fixed parameters, priors, and estimated twists
     choices: Choices = NO_CHOICES,
 ) -> Identifiability:
-    """Judge what a dataset determines: its readings, its cameras and the legs of its views.
+    """Judge the identifiability from the readings, cameras and visible legs of a dataset.
 
-    Raises DidNotConverge if the readings do not lead to closed poses.
+    Raises DidNotConverge if the forward kinematics at the readings fail.
     """
     analysis = _analysis_of(dataset, choices)
-    predicted, report = analysis.predicted, _judge(dataset.machine, analysis, None, None)
+    predicted, report = analysis.predicted, _report_on(dataset.machine, analysis, None, None)
     if dataset.axes is None:
-        found = expected_intrinsics(
+        intrinsics = expected_intrinsics(
             predicted,
             analysis.images,
             analysis.equations,
@@ -197,42 +197,40 @@ def identifiability_of_dataset(
             cameras_of(dataset),
             analysis.arms,
         )
-        report = replace(report, intrinsics=found)
+        report = replace(report, intrinsics=intrinsics)
     if dataset.machine.is_determined:
         return report
-    note = "The readings do not give the poses of the images: random ones stand for them."
+    note = "The readings do not determine the poses of the images; random poses are used instead."
     return replace(report, notes=(*report.notes, note))
 
 
 def ranks_of_dataset(
     dataset: Dataset, choices: Choices = NO_CHOICES
 ) -> tuple[tuple[Condition, ...], Ranks, Ranks]:
-    """Return conditions, and ranks step by step and at once, of what a dataset records.
+    """Return the paper's conditions, and the ranks of the steps and of the joint fit.
 
-    They are those of :func:`identifiability_of_dataset`, without what would change them.
+    As in :func:`identifiability_of_dataset`, without remedies.
     """
     analysis = _analysis_of(dataset, choices)
     return conditions_of(dataset.machine, analysis.predicted), analysis.staged, analysis.full
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
-    """Return the analysis of what a dataset records."""
+    """Analysis of the recorded observations of a dataset."""
     chosen = (*choices.free, *choices.priors)
     twists = any(is_held_by_default(name) for name in chosen)
     return Analysis(recorded_observations(dataset, twists=twists), choices)
 
 
 def check_identifiable(
-    # its views are taken to show the legs that they name, or all: what even then stays open cannot
-    # be found
+    # every view shows the legs that it names, or all: an optimistic assumption
     dataset: Dataset,
-    # parameters that are fixed or known from elsewhere: they are no longer open
+    # fixed parameters and priors
     choices: Choices = NO_CHOICES,
 ) -> tuple[str, ...]:
-    """Return what a dataset leaves open that does no harm, one sentence each.
+    """Return notes on undetermined directions that do not move the platform.
 
-    Raises NotIdentifiable if a direction that moves the platform is not determined by everything at
-    once.
+    Raises NotIdentifiable if the joint fit cannot determine a direction that moves the platform.
     """
     analysis = _analysis_of(dataset, choices)
     staged, full = analysis.staged, analysis.full
@@ -244,10 +242,10 @@ def check_identifiable(
     notes = [] if tied is None else [tied]
     if any(not weak.harmless for weak in staged.weak):
         notes.append(
-            f"The four steps alone leave open {_directions(staged, harmless=False)}; the "
-            "joint fit does not."
+            "The four steps alone do not determine "
+            f"{_directions(staged, harmless=False)}; the joint fit does."
         )
-    if full.weak:  # what is left is harmless
+    if full.weak:  # only harmless ones are left
         notes.append(
             "Not determined, and without effect on the platform: "
             f"{_directions(full, harmless=True)}."
@@ -255,7 +253,7 @@ def check_identifiable(
     return tuple(notes)
 
 
-def _judge_hand_held(
+def _report_on_hand_held(
     machine: Machine,
     legs: tuple[tuple[int, ...], ...],
     images: int,
@@ -263,26 +261,26 @@ def _judge_hand_held(
     board: bool,
     platform_board: bool,
 ) -> Identifiability:
-    """Return the report on images each of which has a place of its own."""
+    """Report on hand-held images, each with its own camera pose."""
     if not board or not legs:
-        found = "no board" if not board else "no views"
+        missing = "no board" if not board else "no views"
         raise UsageError(
-            f"Hand-held images could not be judged: found {found}, needed a calibration board on "
-            "the base in every image, which alone tells where a hand-held camera was, and the legs "
-            "that the images show; give --board and --view."
+            f"Hand-held images could not be judged: found {missing}; the camera poses come from a "
+            "calibration board on the base in every image, and the visible legs from the views; "
+            "give --board and --view."
         )
-    each = tuple(view for view in legs for _ in range(images))
-    predicted = planned_observations(machine, each, 1, board=True, platform_board=platform_board)
-    return _judge(machine, Analysis(predicted), None, None)
+    views = tuple(view for view in legs for _ in range(images))
+    predicted = planned_observations(machine, views, 1, board=True, platform_board=platform_board)
+    return _report_on(machine, Analysis(predicted), None, None)
 
 
-def _judge(
+def _report_on(
     machine: Machine,
     analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
     replanning: Replanning | None,
 ) -> Identifiability:
-    """Return the report on a session."""
+    """Report on a session."""
     predicted = analysis.predicted
     conditions = conditions_of(machine, predicted)
     board = judge_board(
@@ -291,13 +289,13 @@ def _judge(
     )
     platform_board = judge_board(analysis, (), (), link="platform")
     staged, full = analysis.staged, analysis.full
-    enough = staged.complete and full.complete
+    is_complete = staged.complete and full.complete
     notes = []
     if analysis.motion.why_not:
-        why = "the machine is singular at poses inside its travel"
+        reason = "the machine is singular at poses inside its travel"
         if not machine.is_determined:
-            why = machine.undetermined
-        notes.append(f"Platform errors are not predicted: {why}.")
+            reason = machine.undetermined
+        notes.append(f"Platform errors are not predicted: {reason}.")
     notes += _machine_notes(machine)
     if full.complete:
         notes += _rough_notes(analysis)
@@ -318,7 +316,7 @@ def _judge(
         board=board,
         platform_board=platform_board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
-        remedies=() if enough else find_remedies(analysis, replanning),
+        remedies=() if is_complete else find_remedies(analysis, replanning),
         recommendation=recommendation,
         notes=tuple(notes),
         scale=scale_sources(analysis),
@@ -326,30 +324,31 @@ def _judge(
 
 
 def _rough_notes(analysis: Analysis) -> list[str]:
-    """Return which directions are determined so roughly that a fit may be refused."""
+    """Note on directions known so roughly that calibrate may reject the dataset."""
     predicted, motion = analysis.predicted, analysis.motion
     rough = undetermined(predicted, analysis.information, _ROUGH)
-    found = [w for w in weak_directions(predicted, motion, rough) if not w.harmless]
-    if not found:
+    harmful = [w for w in weak_directions(predicted, motion, rough) if not w.harmless]
+    if not harmful:
         return []
-    words = min((weak.direction for weak in found), key=len)
-    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    direction = min((weak.direction for weak in harmful), key=len)
+    others = f" and {len(harmful) - 1} more" if len(harmful) > 1 else ""
     known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
     return [
-        f"calibrate may refuse this dataset: outlines good to 0.1 px determine {words}{more} no "
-        f"better than {known}. Add images from other directions, or at poses that differ more."
+        f"calibrate may reject this dataset: with outlines good to 0.1 px, the predicted error of "
+        f"{direction}{others} exceeds {known}. Add images from other directions, or at poses that "
+        "differ more."
     ]
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    """Return what is odd about a machine, whatever views show of it."""
+    """Return notes on a machine, independent of the views."""
     hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
     notes = []
     if hidden:
         which = legs_in_words(hidden, machine.leg_names)
         notes.append(
-            f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
-            f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
+            f"The model has no <visual> cylinder along {which}: visible cylinders with a radius of "
+            f"{100 * THIN:g} % of the mean leg length are assumed; add one to each."
         )
     outside = list(legs_outside(machine, TRAVEL_MARGIN))
     if outside:
@@ -357,8 +356,8 @@ def _machine_notes(machine: Machine) -> list[str]:
         stand = "stand outside their" if len(outside) > 1 else "stands outside its"
         notes.append(
             f"At home {which} {stand} travel by more than {100 * TRAVEL_MARGIN:g} % of it: "
-            "poses between home and travel were judged too, which the machine may not reach; "
-            "correct legcal.home or the limits."
+            "the judged poses include some between home and travel, which the machine may not "
+            "reach; correct legcal.home or the limits."
         )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
@@ -369,8 +368,8 @@ def _machine_notes(machine: Machine) -> list[str]:
 def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[Condition, ...]:
     """Return the paper's conditions for a session.
 
-    Counts are those of the views, as printed. Directions of a leg may differ between views that
-    show a board: they are known in one frame.
+    Counts are by views, as printed. Views of a board count as one frame for the directions of a
+    leg.
     """
     image, leg = predicted.seen[predicted.view].nonzero()
     counts = count_conditions(
@@ -399,13 +398,13 @@ def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[C
 
 
 def read_views(
-    views: Sequence[Sequence[str]],  # names of the legs that each camera position shows
+    views: Sequence[Sequence[str]],  # names of the legs visible from each camera position
     leg_names: Sequence[str],
     images: int,  # number of images a view
 ) -> tuple[tuple[int, ...], ...]:
     """Return the legs of each view as indices.
 
-    Raises UsageError with one sentence for each thing that is wrong.
+    Raises UsageError with one sentence for each problem.
     """
     problems = []
     if images < 1:
@@ -461,7 +460,7 @@ def read_views(
 
 
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
-    """Return why a dataset cannot be calibrated, and the remedies."""
+    """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
     unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
     if unseen and dataset.axes is None:
@@ -469,17 +468,17 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
         remedies.insert(0, f"add a <visual> cylinder along {names}, which no image shows without")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
-        f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
-        f"determine {report.full.rank} of {report.full.of} at best and leave open "
-        f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
-        f"{remedy}, or state what is known of them with --set."
+        f"{dataset.folder}: the parameters cannot be identified: these views and poses determine "
+        f"at most {report.full.rank} of {report.full.of}, and not "
+        f"{_directions(report.full, harmless=False)}, which moves the platform; {remedy}, or state "
+        "known values with --set."
     )
 
 
 def _directions(ranks: Ranks, *, harmless: bool) -> str:
-    """Return the simplest direction that stays open, in words, and how many there are."""
+    """Describe the simplest undetermined direction, and count them."""
     words = [weak.direction for weak in ranks.weak if weak.harmless == harmless]
     simplest = min(words, key=len)
     if len(words) == 1:
         return simplest
-    return f"{len(words)} independent changes of them, such as {simplest}"
+    return f"{len(words)} independent combinations of them, such as {simplest}"

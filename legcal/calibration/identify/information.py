@@ -1,9 +1,9 @@
-"""The problem of the joint fit at predicted observations, and what these determine.
+"""The joint fit linearised at predicted observations, and its information.
 
-Platform poses, cameras, parameters and lines of arms are variables; images, the equations of
-readings and legs are factors, linearised at the nominal machine. Unknowns are in metres (angles
-count at the mean leg length) and rows in standard deviations, so that a singular value is one over
-a standard deviation [1/m]. Radii and intrinsics come as further variables where these are judged.
+Variables are platform poses, cameras, parameters and lines of arms; factors are images and the
+equations of readings and legs, linearised at the nominal machine. Unknowns are in metres (angles
+times the mean leg length) and rows are whitened, so that a singular value is the inverse of a
+standard deviation [1/m]. Radii and intrinsics are optional further variables.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, parametrize
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
-_MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
-_WHOLE = slice(None)  # all numbers of a variable are touched
-_BOARD = 0.5  # half the side of a board on the platform, of how far its joints are apart
-_OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
+_MAX_INTRINSICS_SIGMA = 0.1  # focal lengths: above, intrinsics are not determined
+_WHOLE = slice(None)  # all coordinates of a variable
+_BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
+_OPEN = 0.05  # least component of an intrinsic in an open direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,40 +66,42 @@ class _Nominal:
 class WhitenedEquations:
     """The whitened equations of all legs at the poses of a session."""
 
-    # (k, m, f): by the possible motions of the platform: turns [m at the leg's length],
-    # displacements; and by readings of actuators, in metres
+    # (k, m, f): by the degrees of freedom of the platform: rotations [m at the leg's length] and
+    # displacements, then by readings of actuators, in metres
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
     leg: IntArray  # (m,): the leg of each row
-    demand: tuple[EquationKind, ...]  # (m,): what it is about
+    demand: tuple[EquationKind, ...]  # (m,): kind of each row
     reading: BoolArray  # (m,): rows of the readings of actuators, of the first leg on each
 
     def at(self, poses: IntArray) -> WhitenedEquations:
-        """Return the equations at some of the poses, in that order."""
+        """Select the equations of poses."""
         return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
 
 
 def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquations:
-    """Return what readings and legs demand of the poses of a session."""
+    """Return the whitened equations of readings and legs at the poses of a session."""
     actuators, n_poses = predicted.actuators, len(predicted.t)
     q = predicted.q if actuators else None
     equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
-    # The readings that move rods are rows of their own
-    read = equations.measured & (predicted.carried_by < 0)[equations.leg]
-    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], predicted.sigma_exact)[:, None]
+    # Readings of actuators are separate rows
+    is_reading = equations.measured & (predicted.carried_by < 0)[equations.leg]
+    sigma = np.where(is_reading, predicted.sigma_of_legs[equations.leg], predicted.sigma_exact)[
+        :, None
+    ]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
     leg, kinds = equations.leg, equations.kinds
-    if actuators:  # what moves joints is unknown at each pose, of actuators it is measured
+    if actuators:  # their positions are unknowns at each pose, with a measured reading each
         unit, n = predicted.unit_of_q, len(actuators)
         first = by_pose.shape[2]
         by_pose = np.concatenate([by_pose, equations.by_q / sigma * unit], axis=2)
         rows = np.zeros((n_poses, n, by_pose.shape[2]))
         rows[:, :, first : first + n] = np.diag(unit / predicted.sigma_of_q)
         by_pose = np.concatenate([by_pose, rows], axis=1)
-        none = np.zeros((n_poses, n, by_parameters.shape[2]))
-        by_parameters = np.concatenate([by_parameters, none], axis=1)
+        zeros = np.zeros((n_poses, n, by_parameters.shape[2]))
+        by_parameters = np.concatenate([by_parameters, zeros], axis=1)
         leg = np.append(leg, [int(np.argmax(predicted.carried_by == a)) for a in range(n)])
         kinds = (*kinds, *[EquationKind.LENGTH] * n)
     reading = np.arange(len(leg)) >= len(equations.leg)
@@ -107,10 +109,10 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
 
 
 def image_rows(predicted: PredictedObservations) -> Array:
-    """Return the whitened derivatives (n_images, n_bodies, 4, f + 6 + p) of what images show.
+    """Return whitened derivatives (n_images, n_bodies, 4, f + 6 + p) of the measured bodies.
 
-    They are derivatives by the motion of the platform, the readings of actuators, the motion of the
-    camera, and the parameters.
+    Columns are the motion of the platform, the readings of actuators, the motion of the camera, and
+    the parameters.
     """
     base, platform = at_base_joints(predicted), at_platform_joints(predicted)
     turns = pose_unit(predicted)
@@ -122,80 +124,87 @@ def image_rows(predicted: PredictedObservations) -> Array:
     by_pose[:, :n, 2:] = np.concatenate([turn, at_B], axis=3) * turns
     scatter = predicted.local_to_parameters
     in_platform = at_B @ predicted.R[predicted.pose][:, None]
-    of_A, of_B = at_A @ scatter[:, :3], in_platform @ scatter[:, 3:6]
+    A_by_parameters, B_by_parameters = at_A @ scatter[:, :3], in_platform @ scatter[:, 3:6]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = by_pose[..., columns]
     if predicted.actuators:
-        of_A = at_A @ (predicted.A_by_local @ scatter)[predicted.pose]
+        A_by_parameters = at_A @ (predicted.A_by_local @ scatter)[predicted.pose]
         ends = zip((base, platform), predicted.ends_by_reading, strict=True)
-        by_reading = [end.gradient @ by[predicted.pose] for end, by in ends]
+        by_reading = [end.gradient @ by_numbers[predicted.pose] for end, by_numbers in ends]
         by_pose = np.concatenate([by_pose, np.concatenate(by_reading, axis=2)], axis=3)
-    by_parameters = np.concatenate([of_A, of_B], axis=2)
+    by_parameters = np.concatenate([A_by_parameters, B_by_parameters], axis=2)
     if predicted.arms:
-        by = predicted.arms_by_local @ scatter[list(predicted.arms)][:, None]
-        of_arms = _of_arms(predicted, by)
+        by_numbers = predicted.arms_by_local @ scatter[list(predicted.arms)][:, None]
+        of_arms = _arm_rows(predicted, by_numbers)
         by_parameters = np.concatenate([by_parameters, of_arms], axis=1)
     return np.concatenate([by_pose, by_camera, by_parameters], axis=3)
 
 
-def _of_arms(predicted: PredictedObservations, by: Array) -> Array:
-    """Return whitened derivatives (n_images, n_arms, 4, d) by those of both ends (k, ..., 3, d)."""
-    n, by = predicted.n_legs, by[predicted.pose]
+def _arm_rows(predicted: PredictedObservations, by_ends: Array) -> Array:
+    """Whitened derivatives (n_images, n_arms, 4, d) from those of both ends (k, ..., 3, d)."""
+    n, by_ends = predicted.n_legs, by_ends[predicted.pose]
     ends = at_base_joints(predicted), at_platform_joints(predicted)
-    return np.concatenate([e.gradient[:, n:] @ by[:, :, k] for k, e in enumerate(ends)], axis=2)
+    return np.concatenate(
+        [e.gradient[:, n:] @ by_ends[:, :, k] for k, e in enumerate(ends)], axis=2
+    )
 
 
 def _line_unit(predicted: PredictedObservations) -> Array:
-    """Return a metre of each number of the line of an arm in its own unit, (4,)."""
+    """Equivalent of a metre in the unit of each coordinate of the line of an arm, (4,)."""
     return np.repeat([1.0 / predicted.mean_length, 1.0], 2)
 
 
 def pose_unit(predicted: PredictedObservations) -> Array:
-    """Return what a metre of the six components of a motion is: turns count at the leg's length."""
+    """Return the equivalent of a metre for the six coordinates of a motion [rad, m]."""
     return np.repeat([1.0 / predicted.mean_length, 1.0], 3)
 
 
 def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrior:
-    """Return what is known of the parameters of a session: fixed ones, and those with priors."""
+    """Return the prior of the parameters; fixed ones have a negligible standard deviation."""
     sigma: dict[int, float] = {}
     for i, name in enumerate(predicted.parametrization.names):
-        is_arm = ParameterId.parse(name).kind in ARMS  # :func:`prior_of_arms` knows of it
+        is_arm = ParameterId.parse(name).kind in ARMS  # in :func:`prior_of_arms`
         if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
         elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):
             sigma[i] = predicted.sigma_exact * predicted.unit[i]
-    known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
-    return GaussianPrior(known, np.zeros(len(sigma)), values)
+    index, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
+    return GaussianPrior(index, np.zeros(len(sigma)), values)
 
 
 def prior_of_arms(
     predicted: PredictedObservations, choices: Choices, *, stated: bool = False
 ) -> GaussianPrior:
-    """Return what is known of the lines of arms, four numbers each; *stated*: by somebody."""
-    named = parametrize(predicted.leg_names, predicted.legs, predicted.frame_legs, twists=True)
-    sigmas, unit = arm_sigmas(named, predicted.legs, predicted.arms), _line_unit(predicted)
-    known = {}
+    """Return the prior of the lines of arms, four coordinates each; *stated*: without defaults."""
+    parametrization = parametrize(
+        predicted.leg_names, predicted.legs, predicted.frame_legs, twists=True
+    )
+    sigmas, unit = (
+        arm_sigmas(parametrization, predicted.legs, predicted.arms),
+        _line_unit(predicted),
+    )
+    sigma_of = {}
     for i, (name, sigma) in enumerate(sigmas.items()):
         if name in choices.priors:
-            known[i] = choices.priors[name].sigma / unit[i % 4]
+            sigma_of[i] = choices.priors[name].sigma / unit[i % 4]
         elif name in choices.fixed:
-            known[i] = predicted.sigma_exact
+            sigma_of[i] = predicted.sigma_exact
         elif name not in choices.free and not stated:
-            known[i] = sigma / unit[i % 4]
-    of = np.array(list(known), dtype=np.intp)
-    return GaussianPrior(of, np.zeros(len(of)), np.array(list(known.values())))
+            sigma_of[i] = sigma / unit[i % 4]
+    index = np.array(list(sigma_of), dtype=np.intp)
+    return GaussianPrior(index, np.zeros(len(index)), np.array(list(sigma_of.values())))
 
 
 def length_rows(predicted: PredictedObservations, choices: Choices) -> Array:
-    """Return measured distances of joints by the parameters, whitened, (n, p)."""
+    """Return whitened derivatives (n, p) of measured distances of joints by the parameters."""
     rows, names = [np.zeros((0, len(predicted.unit)))], predicted.leg_names
     scatter = predicted.local_to_parameters
     for name, prior in choices.priors.items():
         joints = joints_of_length(name)
         if joints is None:
             continue
-        (one, side), (other, _) = joints
-        j, k = names.index(one), names.index(other)
+        (first, side), (second, _) = joints
+        j, k = names.index(first), names.index(second)
         columns = LegColumns.A if side == "base" else LegColumns.B
         points = [leg.A if side == "base" else leg.B for leg in predicted.legs]
         u = points[j] - points[k]
@@ -204,7 +213,7 @@ def length_rows(predicted: PredictedObservations, choices: Choices) -> Array:
     return np.concatenate(rows)
 
 
-def problem_of(
+def session_problem(
     predicted: PredictedObservations,
     images: Array,  # of image_rows
     equations: WhitenedEquations,
@@ -213,16 +222,15 @@ def problem_of(
     lengths: Array | None = None,  # of length_rows
     arms: GaussianPrior = NO_PRIOR,  # of prior_of_arms
 ) -> tuple[Problem[_Nominal], _Nominal]:
-    """Return the problem of a session and the state that it is linearised at.
+    """Return the problem of a session and the state where it is linearised.
 
-    Views that show a board on the base share one camera: that of the board. One on the platform is
-    a factor of its own. *more* has variables that images depend on too: the element that each body
-    in each image depends on (n_images, n_bodies), and the derivatives (n_images, n_bodies, 4, d) of
-    what it shows.
+    Views of a board on the base share one camera frame, that of the board. A board on the platform
+    has its own factor. *more* are further variables of images: for each, the element that each body
+    in each image depends on (n_images, n_bodies), and derivatives (n_images, n_bodies, 4, d).
     """
     if predicted.arms:
-        more = (*more, _lines(predicted, arms))
-    on_platform = _platform_board(predicted)
+        more = (*more, _arm_lines(predicted, arms))
+    on_platform = _platform_board_factor(predicted)
     n_f, n_p, n_poses = predicted.n_motions, len(predicted.unit), len(predicted.t)
     parameters = Variables(
         "parameters",
@@ -242,9 +250,9 @@ def problem_of(
         ),
         eliminated=Variables("pose", all_free(n_poses, n_f)),
         factors=(
-            _images(predicted, images, more),
-            _legs(equations, n_poses),
-            _ties(predicted, lengths),
+            _image_factor(predicted, images, more),
+            _leg_factor(equations, n_poses),
+            _tie_factor(predicted, lengths),
             *on_platform,
         ),
     )
@@ -252,60 +260,60 @@ def problem_of(
     return problem, _Nominal(pose=np.zeros((n_poses, n_f)), **zeros)
 
 
-def _images(
+def _image_factor(
     predicted: PredictedObservations,
     images: Array,
     more: Sequence[tuple[Variables, IntArray, Array]],
 ) -> Factor[_Nominal]:
-    """Return the factor of what images show of bodies."""
+    """Build the factor of bodies in images."""
     n_f, (n_images, n_bodies) = predicted.n_motions, images.shape[:2]
     n = n_images * n_bodies
     J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
-    shown = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
+    residuals = Residuals.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
     touches = (
         ("camera", np.repeat(predicted.frame[predicted.view], n_bodies), _WHOLE),
         ("parameters", np.zeros(n, dtype=np.intp), _WHOLE),
         *((variables.name, element.ravel(), _WHOLE) for variables, element, _ in more),
     )
-    return Factor("images", lambda _: shown, touches, n, 4, np.repeat(predicted.pose, n_bodies))
+    return Factor("images", lambda _: residuals, touches, n, 4, np.repeat(predicted.pose, n_bodies))
 
 
-def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
-    """Return the factor of what legs demand of poses, readings among it."""
+def _leg_factor(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
+    """Build the factor of the equations of legs and readings."""
     m = len(equations.leg)
-    demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
+    residuals = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     touches = (("parameters", np.zeros(n_poses, dtype=np.intp), _WHOLE),)
-    return Factor("legs", lambda _: demanded, touches, n_poses, m, np.arange(n_poses))
+    return Factor("legs", lambda _: residuals, touches, n_poses, m, np.arange(n_poses))
 
 
-def _ties(predicted: PredictedObservations, lengths: Array | None) -> Factor[_Nominal]:
-    """Return the factor of what ties parameters to each other, and of measured lengths."""
+def _tie_factor(predicted: PredictedObservations, lengths: Array | None) -> Factor[_Nominal]:
+    """Build the factor of ties between parameters, and of measured lengths."""
     ties = predicted.ties[None] / predicted.sigma_exact
     if lengths is not None:
         ties = np.concatenate([ties, lengths[None]], axis=1)
-    tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
+    residuals = Residuals.of(np.zeros(ties.shape[:2]), ties)
     touches = (("parameters", np.zeros(1, dtype=np.intp), _WHOLE),)
-    return Factor("ties", lambda _: tied, touches, 1, ties.shape[1])
+    return Factor("ties", lambda _: residuals, touches, 1, ties.shape[1])
 
 
-def _lines(
+def _arm_lines(
     predicted: PredictedObservations, prior: GaussianPrior
 ) -> tuple[Variables, IntArray, Array]:
-    """Return the lines of arms as further variables of :func:`problem_of`."""
+    """Lines of arms as further variables of :func:`session_problem`."""
     n_images, n, n_arms = len(predicted.view), predicted.n_legs, len(predicted.arms)
     by_line = np.zeros((n_images, predicted.n_bodies, 4, 4))
     slopes = predicted.arms_by_local[..., ActuatorColumns.ARM] * _line_unit(predicted)
-    by_line[:, n:] = _of_arms(predicted, slopes)
-    arm = np.maximum(np.arange(predicted.n_bodies) - n, 0)  # legs depend on none
+    by_line[:, n:] = _arm_rows(predicted, slopes)
+    arm = np.maximum(np.arange(predicted.n_bodies) - n, 0)  # no derivative for legs
     element = np.broadcast_to(arm, (n_images, predicted.n_bodies))
     return Variables("arm", all_free(n_arms, 4), prior=prior), element, by_line
 
 
-def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal], ...]:
-    """Return the factor of the outer corners of a board on the platform; none if there is none.
+def _platform_board_factor(predicted: PredictedObservations) -> tuple[Factor[_Nominal], ...]:
+    """Build the factor of a board on the platform, if any, from its outer corners.
 
-    It lies among the joints of the platform, where it is fixed is unknown, and corners are seen as
-    well as an outline.
+    The board is centred on the platform joints, its pose is unknown, and corners have the standard
+    deviation of outlines.
     """
     image = np.flatnonzero(predicted.platform_board)
     if not len(image):
@@ -316,31 +324,34 @@ def _platform_board(predicted: PredictedObservations) -> tuple[Factor[_Nominal],
     half = _BOARD * float(spread[0]) / np.sqrt(len(B))
     corners = middle + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ axes[:2]
     view, pose = (np.repeat(x[image], len(corners)) for x in (predicted.view, predicted.pose))
-    R, y = predicted.R[pose], np.tile(corners, (len(image), 1))
-    arm = np.einsum("nij,nj->ni", R, y)
-    place = arm + predicted.t[pose]
-    ray = place - predicted.camera[view]
+    R, on_platform = predicted.R[pose], np.tile(corners, (len(image), 1))
+    arm = np.einsum("nij,nj->ni", R, on_platform)
+    corner_points = arm + predicted.t[pose]
+    ray = corner_points - predicted.camera[view]
     depth = np.linalg.norm(ray, axis=1)
     across = np.array([normal_basis(u) for u in ray / depth[:, None]])  # (n, 2, 3)
-    by_place = across * (predicted.focal[view] / (SIGMA_PX * depth))[:, None, None]
-    turns, by_y = pose_unit(predicted), by_place @ R
+    by_corner = across * (predicted.focal[view] / (SIGMA_PX * depth))[:, None, None]
+    turns, by_y = pose_unit(predicted), by_corner @ R
 
-    def moved(at: Array, by: Array) -> Array:
-        """Return derivatives by a turn about the origin and a displacement."""
-        return np.concatenate([cross(at[:, None], by), by], axis=2) * turns
+    def moved(point: Array, by_point: Array) -> Array:
+        """Return derivatives by a rotation about the origin and a displacement."""
+        return np.concatenate([cross(point[:, None], by_point), by_point], axis=2) * turns
 
-    columns, one = list(freedoms(predicted.frame_legs)), np.zeros(len(place), dtype=np.intp)
-    none = np.zeros((*by_place.shape[:2], len(predicted.actuators)))
-    shown = Residuals.of(
-        np.zeros(by_place.shape[:2]),
-        np.concatenate([moved(place, by_place), moved(y, by_y)], axis=2),
-        np.concatenate([moved(arm, by_place)[..., columns], none], axis=2),
+    columns, board = (
+        list(freedoms(predicted.frame_legs)),
+        np.zeros(len(corner_points), dtype=np.intp),
+    )
+    by_readings = np.zeros((*by_corner.shape[:2], len(predicted.actuators)))
+    residuals = Residuals.of(
+        np.zeros(by_corner.shape[:2]),
+        np.concatenate([moved(corner_points, by_corner), moved(on_platform, by_y)], axis=2),
+        np.concatenate([moved(arm, by_corner)[..., columns], by_readings], axis=2),
     )
     touches = (
         ("camera", predicted.frame[view], _WHOLE),
-        ("platform_board", one, _WHOLE),
+        ("platform_board", board, _WHOLE),
     )
-    return (Factor("platform_board", lambda _: shown, touches, len(place), 2, pose),)
+    return (Factor("platform_board", lambda _: residuals, touches, len(corner_points), 2, pose),)
 
 
 def expected_intrinsics(
@@ -349,40 +360,40 @@ def expected_intrinsics(
     equations: WhitenedEquations,
     prior: GaussianPrior,
     orientation: Array,  # (n_views, 3, 3): R of every camera in R_b, its optical axis last
-    # (n_views): the camera of every view: views with the same one share their intrinsics
+    # (n_views): the camera of every view; views of one camera share intrinsics
     owners: Sequence[str],
     arms: GaussianPrior = NO_PRIOR,  # of prior_of_arms
 ) -> tuple[CameraIntrinsics, ...]:
-    """Return what the legs determine of the intrinsics of cameras, estimated with all else."""
+    """Return the expected uncertainty of intrinsics, estimated jointly with all other unknowns."""
     cameras = tuple(dict.fromkeys(owners))
     of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
     n, n_cameras = predicted.n_bodies, len(cameras)
     by_radius, by_intrinsics = _radii_and_intrinsics(predicted, orientation)
     sigma_radius = RefinementSettings.radius_sigma * predicted.body_radius
-    known = GaussianPrior(np.arange(n), np.zeros(n), sigma_radius)
+    prior_of_radii = GaussianPrior(np.arange(n), np.zeros(n), sigma_radius)
     body = np.broadcast_to(np.arange(n), images.shape[:2])
     camera = np.broadcast_to(of_view[predicted.view][:, None], images.shape[:2])
-    numbers = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))
-    problem, state = problem_of(
+    intrinsics = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))
+    problem, state = session_problem(
         predicted,
         images,
         equations,
         prior,
         (
-            (Variables("radius", all_free(n, 1), prior=known), body, by_radius),
-            (numbers, camera, by_intrinsics),
+            (Variables("radius", all_free(n, 1), prior=prior_of_radii), body, by_radius),
+            (intrinsics, camera, by_intrinsics),
         ),
         arms=arms,
     )
-    left = marginal_rows(information_rows(problem, state), problem.where("intrinsics"))
-    _, singular, basis = np.linalg.svd(left)
-    # An unknown of one metre is one of as many pixels as a leg's length is long from afar.
-    is_seen = singular > 1.0 / (_MAX_INTRINSICS_SIGMA * predicted.mean_length)
-    spread = np.sqrt(np.sum((basis[is_seen].T / singular[is_seen]) ** 2, axis=1))
-    is_open = np.sqrt(np.sum(basis[~is_seen] ** 2, axis=0)) > _OPEN
+    rows = marginal_rows(information_rows(problem, state), problem.where("intrinsics"))
+    _, singular, basis = np.linalg.svd(rows)
+    # A metre of an intrinsic is the focal length over the mean leg length, in pixels.
+    is_determined = singular > 1.0 / (_MAX_INTRINSICS_SIGMA * predicted.mean_length)
+    spread = np.sqrt(np.sum((basis[is_determined].T / singular[is_determined]) ** 2, axis=1))
+    is_open = np.sqrt(np.sum(basis[~is_determined] ** 2, axis=0)) > _OPEN
     first = np.unique(of_view, return_index=True)[1]
-    metre = predicted.focal[first] / predicted.mean_length  # of each camera [px]
-    sigma = spread.reshape(n_cameras, -1) * metre[:, None]
+    pixels_per_metre = predicted.focal[first] / predicted.mean_length  # of each camera [px]
+    sigma = spread.reshape(n_cameras, -1) * pixels_per_metre[:, None]
     return tuple(
         CameraIntrinsics(
             camera,
@@ -398,13 +409,13 @@ def expected_intrinsics(
 def _radii_and_intrinsics(
     predicted: PredictedObservations, orientation: Array
 ) -> tuple[Array, Array]:
-    """Return derivatives (n_images, n_bodies, 4, d) of what images show by radii and intrinsics."""
+    """Return derivatives (n_images, n_bodies, 4, d) of bodies by radii and intrinsics."""
     shape = len(predicted.view), predicted.n_bodies, 4
     by_radius, by_intrinsics = np.zeros((*shape, 1)), np.zeros((*shape, len(INTRINSICS)))
     unit = (predicted.focal / predicted.mean_length)[predicted.view][:, None, None, None]
     for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
         lateral, widening = intrinsics_changes(predicted, across, orientation)
-        sigma_lateral, towards = _scales(predicted, across)
+        sigma_lateral, towards = _edge_weights(predicted, across)
         rows = [lateral / sigma_lateral[..., None], widening * towards[..., None]]
         by_intrinsics[:, :, 2 * k : 2 * k + 2] = np.stack(rows, 2) * unit
         by_radius[:, :, 2 * k + 1, 0] = towards / predicted.body_radius
@@ -413,10 +424,10 @@ def _radii_and_intrinsics(
 
 
 def radius_rows(predicted: PredictedObservations) -> Array:
-    """Return the derivatives of what images show by the radius of each body, (..., 4, 1) [1/m].
+    """Return derivatives (..., 4, 1) of measured bodies by their radius [1/m].
 
-    A thicker one looks nearer, by as much as makes a scene that is larger in all, cameras and radii
-    included, look the same.
+    A thicker body looks nearer, such that scaling the scene with cameras and radii changes no
+    image.
     """
     by_radius = np.zeros((len(predicted.view), predicted.n_bodies, 4, 1))
     for k, across in enumerate((at_base_joints(predicted), at_platform_joints(predicted))):
@@ -429,34 +440,37 @@ def radius_rows(predicted: PredictedObservations) -> Array:
 def intrinsics_changes(
     predicted: PredictedObservations, across: Across, orientation: Array
 ) -> tuple[Array, Array]:
-    """Return what a pixel more of each intrinsic does, both (n_images, n_bodies, 4).
+    """Return the effects of one pixel of each intrinsic, both (n_images, n_bodies, 4).
 
-    How far it moves the axis across the body [m/px], and how much wider it makes this [1/px].
+    The lateral shift of the axis of a body [m/px], and its relative change of width [1/px].
     """
     R = orientation[predicted.view]
-    at = (across.point - predicted.camera[predicted.view][:, None]) @ R  # in the camera frame
+    in_camera = (
+        across.point - predicted.camera[predicted.view][:, None]
+    ) @ R  # in the camera frame
     lateral = across.gradient[:, :, 0] @ R
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
     focal = predicted.focal[predicted.view][:, None, None]
-    depth = np.maximum(at[..., 2:], 1e-6 * predicted.mean_length)
-    xy = at[..., :2] / depth
+    depth = np.maximum(in_camera[..., 2:], 1e-6 * predicted.mean_length)
+    xy = in_camera[..., :2] / depth
     u = predicted.body_u[predicted.pose] @ R
     along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m
     normal = np.stack([-along[..., 1], along[..., 0]], axis=2)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
-    by_metre = np.sum(normal * imaged, axis=2, keepdims=True)
-    shift = np.concatenate([normal * xy, normal], axis=2) / np.where(by_metre, by_metre, 1.0)
+    pixels_per_metre = np.sum(normal * imaged, axis=2, keepdims=True)
+    shift = np.concatenate([normal * xy, normal], axis=2) / np.where(
+        pixels_per_metre, pixels_per_metre, 1.0
+    )
     return shift, np.concatenate([normal**2 / focal, np.zeros_like(normal)], axis=2)
 
 
-def _scales(predicted: PredictedObservations, across: Across) -> tuple[Array, Array]:
-    """Return, both (n_images, n_bodies), what weighs such changes.
+def _edge_weights(predicted: PredictedObservations, across: Across) -> tuple[Array, Array]:
+    """Lateral standard deviation [m], and weight of the width, both (n_images, n_bodies).
 
-    The standard deviation of the axis across the body [m], and by how many standard deviations one
-    as wide again looks nearer, as what is seen towards the camera counts it.
+    The weight is the change of depth by doubling the width, in standard deviations of depth.
     """
     lateral, depth = across.gradient[:, :, 0], across.gradient[:, :, 1]
     ray = across.point - predicted.camera[predicted.view][:, None]
     sigma = 1.0 / np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)
-    away = np.sign(np.sum(depth * ray, axis=2))
-    return sigma, -away * np.linalg.norm(ray, axis=2) * np.linalg.norm(depth, axis=2)
+    sign = np.sign(np.sum(depth * ray, axis=2))
+    return sigma, -sign * np.linalg.norm(ray, axis=2) * np.linalg.norm(depth, axis=2)

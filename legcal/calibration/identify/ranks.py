@@ -13,7 +13,7 @@ from legcal.calibration.identify.information import (
     length_rows,
     prior_of,
     prior_of_arms,
-    problem_of,
+    session_problem,
     whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import PredictedObservations
@@ -40,25 +40,25 @@ from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, s
 from legcal.machine.equations import pose_sensitivity
 from legcal.vision.board import Link
 
-_ERROR = 0.0025  # mean leg lengths: the largest component of a direction whose effect is reported
-_HARMLESS = 1e-3  # of that: the platform does not move
+_ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
+_HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What a session determines, computed where it is needed."""
+    """Identifiability analysis of a session, computed lazily."""
 
     predicted: PredictedObservations
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
 
     def elsewhere(self, predicted: PredictedObservations, poses: IntArray) -> Analysis:
-        """Return the analysis of other images of the same machine, at some of the same poses."""
+        """Analyse other images of the same machine, at a subset of its poses."""
         other = Analysis(predicted, self.choices)
         other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
         return other
 
     def with_board(self, *, board: bool = True, link: Link = "base") -> Analysis:
-        """Return the analysis of the same images with a board on a link in all or in none."""
+        """Analyse the same images with a board on a link in all of them, or in none."""
         predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
         other.__dict__.update(images=self.images)
@@ -68,7 +68,7 @@ class Analysis:
 
     @cached_property
     def images(self) -> Array:
-        """Whitened derivatives of what images show."""
+        """Whitened derivatives of the measured bodies."""
         return image_rows(self.predicted)
 
     @cached_property
@@ -78,12 +78,12 @@ class Analysis:
 
     @cached_property
     def prior(self) -> GaussianPrior:
-        """What is known of the parameters without images."""
+        """Prior of the parameters."""
         return prior_of(self.predicted, self.choices)
 
     @cached_property
     def arms(self) -> GaussianPrior:
-        """What is known of the lines of arms without images."""
+        """Prior of the lines of arms."""
         return prior_of_arms(self.predicted, self.choices)
 
     @cached_property
@@ -124,7 +124,7 @@ class Analysis:
     def of_cameras(self) -> Array:
         """The joint fit: rows by parameters and cameras, (m, p + 6 n_frames)."""
         return information_rows(
-            *problem_of(
+            *session_problem(
                 self.predicted,
                 self.images,
                 self.equations,
@@ -141,7 +141,7 @@ class Analysis:
 
     @cached_property
     def motion(self) -> PlatformMotion:
-        """How the platform follows the parameters."""
+        """Sensitivity of the platform to the parameters."""
         return PlatformMotion(self.predicted)
 
     @cached_property
@@ -184,7 +184,7 @@ class Analysis:
 
 
 class PlatformMotion:
-    """How the platform moves with the parameters, over the poses that a session reaches."""
+    """Sensitivity of the platform to the parameters, over the poses of a session."""
 
     def __init__(self, predicted: PredictedObservations) -> None:
         self.predicted = predicted
@@ -204,7 +204,7 @@ class PlatformMotion:
         self.by_metres = moved * predicted.unit
 
     def effect(self, direction: Array) -> RmsMotion | None:
-        """Return what a direction (p,) in metres does."""
+        """Motion of the platform by a direction (p,) in metres."""
         if self.by_metres is None:
             return None
         moved = self.by_metres @ direction
@@ -212,7 +212,7 @@ class PlatformMotion:
         return RmsMotion(shift, turn)
 
     def sigma(self, information: Array) -> RmsMotion | None:
-        """Return the standard deviation of the platform that information leaves."""
+        """Return the standard deviation of the platform for the information of parameters."""
         if self.by_metres is None:
             return None
         _, singular, basis = np.linalg.svd(information)
@@ -224,12 +224,12 @@ class PlatformMotion:
         return RmsMotion(shift, turn)
 
     def split(self, basis: Array) -> tuple[Array, Array]:
-        """Return a space (w, p) as that which moves the platform and that which does not."""
+        """Split a space (w, p) into directions that move the platform and harmless ones."""
         return split_by_motion(self.by_metres, basis, self.predicted.mean_length, _HARMLESS)
 
 
 def determined(predicted: PredictedObservations, information: Array) -> int:
-    """Return the rank of whitened rows: directions known to better than a leg's length."""
+    """Return the rank of whitened rows: directions with a sigma below a leg's length."""
     singular = np.linalg.svd(compress(information), compute_uv=False)
     return int(np.sum(singular > _limit(predicted)))
 
@@ -245,7 +245,7 @@ def undetermined(
 
 
 def missing(predicted: PredictedObservations, rows: Array, motion: PlatformMotion) -> int:
-    """Return how many directions that move the platform rows of all parameters leave open."""
+    """Count the open directions of rows that move the platform."""
     return len(motion.split(undetermined(predicted, rows))[0])
 
 
@@ -255,7 +255,7 @@ def weak_directions(
     basis: Array,  # (w, c): the space, in metres
     columns: IntArray | None = None,  # (c,): which parameters; all without it
 ) -> tuple[WeakDirection, ...]:
-    """Return the directions of a space in words, those that move the platform first."""
+    """Describe the directions of a space, those that move the platform first."""
     wide = basis
     if columns is not None:
         wide = np.zeros((len(basis), len(predicted.unit)))
@@ -271,7 +271,7 @@ def weak_directions(
 def _direction(
     predicted: PredictedObservations, motion: PlatformMotion, row: Array, harmless: bool
 ) -> WeakDirection:
-    """Return a direction with its largest component at a small part of the leg length."""
+    """Describe a direction, scaled to a small largest component."""
     row = row / row[np.argmax(np.abs(row))]
     shown = np.flatnonzero(np.abs(row) > SHOWN)
     shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
@@ -289,5 +289,5 @@ def _direction(
 
 
 def _limit(predicted: PredictedObservations, sigma: float = MAX_SIGMA) -> float:
-    """Return the least singular value that counts [1/m]."""
+    """Least singular value of a determined direction [1/m]."""
     return 1.0 / (sigma * predicted.mean_length)

@@ -1,7 +1,7 @@
-"""What would help: the smallest sets of views that suffice, a board, and remedies, each tried.
+"""Remedies: the smallest sufficient sets of views, calibration boards, and other changes.
 
 Views are recommended by the paper's counts and the ranks. A calibration board is judged for every
-session; the other remedies are candidates, tried by computing the ranks again.
+session; other remedies are candidates, tested by computing the ranks again.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from legcal.vision.board import Link
 
 _CAMERA = 6  # unknowns of its pose
 _MOST_VIEWS = 4
-_MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
-_MENDED = 1e-6  # part of a direction outside of what stays open
+_MOST_WINDOWS = 12  # tested views of one size, evenly around the base
+_COMPLEMENT = 1e-6  # least component outside the open space
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
@@ -61,34 +61,34 @@ def recommend(
     machine: Machine,
     images: int,
     *,
-    board: bool = False,  # whether a calibration board on the base ties the cameras to each other
-    platform_board: bool = False,  # and whether one on the platform shows its poses
+    board: bool = False,  # a calibration board on the base relates the cameras
+    platform_board: bool = False,  # a calibration board on the platform shows its poses
 ) -> tuple[Recommendation, ...]:
-    """Return the smallest sets of views that suffice, fewest camera positions first.
+    """Return the smallest sufficient sets of views, fewest camera positions first.
 
-    For each number of camera positions the fewest legs a view; of all sets of that size the one
-    with the smallest standard deviation of the platform. More positions are listed only where fewer
-    legs a view suffice then: which legs one camera can see, the user knows.
+    For each number of camera positions, the fewest legs per view; of sets of that size, the one
+    with the smallest standard deviation of the platform. More positions are listed only if fewer
+    legs per view suffice; the user knows how many legs one camera can see.
 
-    Empty where no set was found.
+    Empty if no set suffices.
     """
-    found = list[Recommendation]()
+    recommendations = list[Recommendation]()
     candidates = _Candidates(machine, images, board=board, platform_board=platform_board)
-    most = machine.n_legs + 1
-    if machine.actuators:  # rods in parallel have no lengths that the steps could find
+    size_limit = machine.n_legs + 1
+    if machine.actuators:  # the steps cannot find lengths of parallel rods
         candidates.by_steps = candidates.best(_MOST_VIEWS, machine.n_legs) is not None
     for n_views in range(1, _MOST_VIEWS + 1):
-        for size in range(1, most):
+        for size in range(1, size_limit):
             best = candidates.best(n_views, size)
             if best is not None:
-                found.append(best)
-                most = size
+                recommendations.append(best)
+                size_limit = size
                 break
-    return tuple(found)
+    return tuple(recommendations)
 
 
 class _Candidates:
-    """Views of neighbouring legs, and what each says."""
+    """Candidate views of neighbouring legs, with their information."""
 
     def __init__(self, machine: Machine, images: int, *, board: bool, platform_board: bool) -> None:
         self.machine, self.images = machine, images
@@ -100,10 +100,10 @@ class _Candidates:
         self.motion = self.every.motion
         self.ring = legs_around(self.predicted)
         self.of_size: dict[int, list[Analysis]] = {}
-        self.by_steps = True  # whether the steps must determine everything too
+        self.by_steps = True  # whether the steps must suffice too
 
     def best(self, n_views: int, size: int) -> Recommendation | None:
-        """Return the best set of so many views of so many legs, or None if none suffices."""
+        """Return the best set of *n_views* views of *size* legs; None if none suffices."""
         windows = self.windows(size)
         best: tuple[float, Recommendation] | None = None
         for which in combinations(range(len(windows)), n_views):
@@ -123,14 +123,14 @@ class _Candidates:
         return None if best is None else best[1]
 
     def windows(self, size: int) -> list[tuple[int, ...]]:
-        """Return neighbours around the base; several cameras where all legs are neighbours."""
+        """Return groups of neighbours around the base, or several views of all legs."""
         if size >= self.machine.n_legs:
             return [tuple(range(self.machine.n_legs))] * _MOST_VIEWS
         views = neighbours(self.ring, size)
         return views[:: -(-len(views) // _MOST_WINDOWS)]
 
     def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
-        """Say whether the paper's counts hold."""
+        """Whether the paper's counts hold."""
         s = self.predicted
         counts = count_conditions(
             views,
@@ -145,9 +145,9 @@ class _Candidates:
         return not any(c.fails for c in (*counts, at_once))
 
     def together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say of the parameters at once.
+        """Combine the information of views on the parameters.
 
-        A board on the base makes them one camera, one on the platform has one place in all.
+        Views of a board on the base share one camera frame; a board on the platform has one pose.
         """
         n_p = len(self.predicted.unit)
         by_view = [a.of_cameras for a in chosen]
@@ -159,7 +159,7 @@ class _Candidates:
         return marginal_rows(np.concatenate(by_view), np.arange(n_p))
 
     def base_together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say in step 2."""
+        """Combine the information of views in step 2."""
         if not self.predicted.board.all():
             return np.concatenate([a.default_steps[0].information for a in chosen])
         by_view = [base_by_frames(a.predicted, a.located)[1] for a in chosen]
@@ -167,7 +167,7 @@ class _Candidates:
         return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
 
     def analyses(self, size: int) -> list[Analysis]:
-        """Analyse every possible view of *size* legs by itself."""
+        """Analyse every candidate view of *size* legs by itself."""
         if size not in self.of_size:
             views = self.windows(size)
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
@@ -184,7 +184,7 @@ class _Candidates:
         return self.of_size[size]
 
     def suffices(self, chosen: Sequence[Analysis], information: Array) -> bool:
-        """Say whether views determine all that moves the platform, at once and step by step."""
+        """Whether views determine the platform, in the joint fit and step by step."""
         predicted, n_p = self.predicted, len(self.predicted.unit)
         if missing(predicted, information, self.motion):
             return False
@@ -203,76 +203,90 @@ class _Candidates:
 
 
 def judge_board(
-    analysis: Analysis,  # the session, as it is
+    analysis: Analysis,  # of the session
     # without, with_board: the paper's conditions without a board and with one in every view
     without: Sequence[Condition],
     with_board: Sequence[Condition],
     *,
     link: Link = "base",
 ) -> BoardReport:
-    """Return what a board on a link does for a session, whether it has one or not."""
+    """Report the effect of a board on a link, whether the session has one or not."""
     predicted = analysis.predicted
-    shown = predicted.board if link == "base" else predicted.platform_board
-    none = analysis.with_board(board=False, link=link) if shown.any() else analysis
-    every = analysis if len(shown) and shown.all() else analysis.with_board(link=link)
-    views = np.flatnonzero(shown) if link == "base" else predicted.view[np.flatnonzero(shown)]
+    is_visible = predicted.board if link == "base" else predicted.platform_board
+    without_board = analysis.with_board(board=False, link=link) if is_visible.any() else analysis
+    with_boards = (
+        analysis if len(is_visible) and is_visible.all() else analysis.with_board(link=link)
+    )
+    views = (
+        np.flatnonzero(is_visible) if link == "base" else predicted.view[np.flatnonzero(is_visible)]
+    )
     is_present = len(np.unique(views)) == predicted.n_views
     needed = [
         before.name
         for before, after in zip(without, with_board, strict=True)
         if before.fails and not after.fails
     ]
-    if every.staged.complete and not none.staged.complete:
+    if with_boards.staged.complete and not without_board.staged.complete:
         needed.append("staged")
-    if every.full.complete and not none.full.complete:
+    if with_boards.full.complete and not without_board.full.complete:
         needed.append("full")
-    return BoardReport(is_present, tuple(needed), _ranks(none), _ranks(every), _mended(none, every))
+    return BoardReport(
+        is_present,
+        tuple(needed),
+        _ranks(without_board),
+        _ranks(with_boards),
+        _determined_by_board(without_board, with_boards),
+    )
 
 
 def _ranks(analysis: Analysis) -> BoardRanks:
-    """Return the ranks of an analysis."""
+    """Ranks of an analysis."""
     return BoardRanks(analysis.staged.rank, analysis.full.rank, analysis.full.complete)
 
 
-def _mended(none: Analysis, every: Analysis) -> tuple[str, ...]:
-    """Return the directions that move the platform and that only a board determines, in words."""
-    n_p = len(none.predicted.unit)
+def _determined_by_board(without_board: Analysis, with_boards: Analysis) -> tuple[str, ...]:
+    """Describe directions that move the platform and that only a board determines."""
+    n_p = len(without_board.predicted.unit)
     pairs = [
         (by_all_parameters(a, n_p), by_all_parameters(b, n_p))
-        for a, b in zip(none.default_steps, every.default_steps, strict=True)
+        for a, b in zip(without_board.default_steps, with_boards.default_steps, strict=True)
     ]
-    found: list[str] = []
-    for before, after in [*pairs, (none.information, every.information)]:
-        open_before, open_after = (undetermined(none.predicted, rows) for rows in (before, after))
-        mended = _outside(open_before, open_after)
-        directions = weak_directions(none.predicted, none.motion, mended)
-        found += [d.direction for d in directions if not d.harmless]
-    return tuple(dict.fromkeys(found))
+    directions_found: list[str] = []
+    for before, after in [*pairs, (without_board.information, with_boards.information)]:
+        open_before, open_after = (
+            undetermined(without_board.predicted, rows) for rows in (before, after)
+        )
+        newly_determined = _complement(open_before, open_after)
+        directions = weak_directions(
+            without_board.predicted, without_board.motion, newly_determined
+        )
+        directions_found += [d.direction for d in directions if not d.harmless]
+    return tuple(dict.fromkeys(directions_found))
 
 
-def _outside(space: Array, part: Array) -> Array:
-    """Return an orthonormal basis of what a space (w, p) has outside of a part of it (k, p)."""
+def _complement(space: Array, part: Array) -> Array:
+    """Orthonormal basis of the complement of a subspace (k, p) in a space (w, p)."""
     _, singular, basis = np.linalg.svd(space - space @ part.T @ part, full_matrices=False)
-    return np.asarray(basis[singular > _MENDED])
+    return np.asarray(basis[singular > _COMPLEMENT])
 
 
 @dataclass(frozen=True)
 class Replanning:
-    """Other sessions of the same machine."""
+    """Planners of other sessions of the same machine."""
 
-    images: Callable[[int], PredictedObservations]  # the same with other numbers of images a view
-    # return the smallest sets of views that suffice
+    images: Callable[[int], PredictedObservations]  # with another number of images a view
+    # the smallest sufficient sets of views
     views: Callable[[], tuple[Recommendation, ...]]
 
 
 def find_remedies(
-    analysis: Analysis,  # what is known so far
-    replanning: Replanning | None,  # how to plan the session anew; None for what was recorded
+    analysis: Analysis,  # of the session
+    replanning: Replanning | None,  # None for a recorded session
 ) -> tuple[Remedy, ...]:
-    """Return what would help where directions are not determined.
+    """Return remedies for undetermined directions.
 
-    Only what raises a rank: what determines everything, else what is enough for the platform, else
-    what helps.
+    Remedies that determine all parameters, else those sufficient for the platform, else those that
+    raise a rank.
     """
     n_parameters = analysis.full.of
     before = _score(analysis)
@@ -283,15 +297,15 @@ def find_remedies(
         _board(analysis),
         _known_parameters(analysis),
     ]
-    found = tuple(r for kind in kinds for r in _try_kind(kind, before, n_parameters))
-    enough = tuple(r for r in found if r.enough) or _other_views(analysis, replanning)
-    everything = tuple(r for r in enough if r.staged_rank == r.full_rank == n_parameters)
-    return everything or enough or found
+    helpful = tuple(r for kind in kinds for r in _try_kind(kind, before, n_parameters))
+    sufficient = tuple(r for r in helpful if r.enough) or _other_views(analysis, replanning)
+    everything = tuple(r for r in sufficient if r.staged_rank == r.full_rank == n_parameters)
+    return everything or sufficient or helpful
 
 
 @dataclass(frozen=True)
 class _Score:
-    """How many directions are open, step by step and at once; those that move the platform."""
+    """Numbers of open directions, by steps and in the joint fit, and of harmful ones."""
 
     staged: int
     full: int
@@ -300,7 +314,7 @@ class _Score:
 
 
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
-    """Return what is open when some parameters are known."""
+    """Count the open directions with some parameters *known*."""
     predicted, motion = analysis.predicted, analysis.motion
     extra = np.zeros((len(known), len(predicted.unit)))
     extra[np.arange(len(known)), list(known)] = _KNOWN / predicted.mean_length
@@ -320,8 +334,8 @@ def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
 def _try_kind(
     kind: Iterable[tuple[str, Callable[[], _Score]]], before: _Score, n_parameters: int
 ) -> list[Remedy]:
-    """Return the first few candidates of a kind that are enough, else the best that helps."""
-    enough, helps = list[Remedy](), list[tuple[int, Remedy]]()
+    """Return the first few sufficient candidates of a kind, else the most helpful one."""
+    sufficient, helpful = list[Remedy](), list[tuple[int, Remedy]]()
     for tried, (text, score) in enumerate(kind):
         after = score()
         gain = before.staged_harm - after.staged_harm, before.full_harm - after.full_harm
@@ -330,12 +344,12 @@ def _try_kind(
         complete = after.staged_harm == 0 and after.full_harm == 0
         remedy = Remedy(text, n_parameters - after.staged, n_parameters - after.full, complete)
         if complete:
-            enough.append(remedy)
+            sufficient.append(remedy)
         else:
-            helps.append((sum(gain), remedy))
-        if len(enough) == _MOST_OF_A_KIND or tried + 1 >= _MOST_TRIED:
+            helpful.append((sum(gain), remedy))
+        if len(sufficient) == _MOST_OF_A_KIND or tried + 1 >= _MOST_TRIED:
             break
-    return enough or [r for _, r in sorted(helps, key=lambda pair: -pair[0])[:1]]
+    return sufficient or [r for _, r in sorted(helpful, key=lambda pair: -pair[0])[:1]]
 
 
 def _more_images(
@@ -351,7 +365,7 @@ def _more_images(
 
 
 def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield views with one leg more or two, so that weak legs are seen with others."""
+    """Yield views with one or two more legs, including a weak one."""
     predicted, weak = analysis.predicted, _weak_legs(analysis)
     ring = legs_around(predicted)
     for more in (1, 2):
@@ -365,11 +379,11 @@ def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]
             legs = tuple(sorted((*predicted.views[v], *added)))
             text = f"see {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
             wider = _widened(predicted, v, legs)
-            yield text, partial(_more, analysis, wider, np.arange(len(predicted.t)))
+            yield text, partial(_score_with_more, analysis, wider, np.arange(len(predicted.t)))
 
 
 def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield camera positions that show neighbours, among them weak legs."""
+    """Yield further camera positions that show weak legs and their neighbours."""
     predicted, weak = analysis.predicted, _weak_legs(analysis)
     ring = legs_around(predicted)
     largest = max(len(view) for view in predicted.views)
@@ -382,11 +396,11 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
             named = legs_in_words(legs, predicted.leg_names)
             text = f"add {article} {which} camera position ({named})"
             poses = np.append(np.arange(len(predicted.t)), predicted.pose[predicted.view == 0])
-            yield text, partial(_more, analysis, _extended(predicted, legs), poses)
+            yield text, partial(_score_with_more, analysis, _extended(predicted, legs), poses)
 
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield a calibration board that ties the cameras to each other, and one on the platform."""
+    """Yield a calibration board on the base, and one on the platform."""
     if analysis.predicted.n_frames > 1:
         text = "put a calibration board on the base that every camera sees"
         yield text, lambda: _score(analysis.with_board())
@@ -396,7 +410,7 @@ def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield parameters to measure otherwise and to hold: one of each direction, or all of them."""
+    """Yield parameters to measure otherwise and fix: one of each direction, or all of them."""
     names = analysis.predicted.parametrization.names
     first = list(dict.fromkeys(d.parameters[0] for d in _harmful(analysis)))
     choices: list[tuple[str, ...]] = [(name,) for name in first[:_MOST_FIXED]]
@@ -408,7 +422,7 @@ def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _S
 
 
 def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:
-    """Return the smallest set of views that suffices, in place of the given ones."""
+    """Recommend the smallest sufficient set of views in place of the given ones."""
     sets = () if replanning is None else replanning.views()
     if not sets:
         return ()
@@ -418,30 +432,32 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
     return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, n_p, True),)
 
 
-def _more(analysis: Analysis, predicted: PredictedObservations, poses: IntArray) -> _Score:
-    """Return what is open in a session that shows more, at these of the poses of another."""
+def _score_with_more(
+    analysis: Analysis, predicted: PredictedObservations, poses: IntArray
+) -> _Score:
+    """Count the open directions in a session with more observations, at a subset of poses."""
     other = analysis.elsewhere(predicted, poses)
-    if len(analysis.full.weak) == 0:  # nothing to gain: more images take nothing away
+    if len(analysis.full.weak) == 0:  # complete already
         other.__dict__.update(information=analysis.information)
     return _score(other)
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
-    """Return the legs whose parameters are not determined."""
+    """Legs with undetermined parameters."""
     touched = {p for d in _harmful(analysis) for p in d.parameters}
     names = analysis.predicted.leg_names
     return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
-    """Return the directions that move the platform, those of the joint fit first."""
+    """Open directions that move the platform, those of the joint fit first."""
     return [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
 
 
 def _widened(
     predicted: PredictedObservations, v: int, legs: Sequence[int]
 ) -> PredictedObservations:
-    """Return a session in which a view shows other legs."""
+    """Change the legs of a view."""
     seen = predicted.seen.copy()
     seen[v] = False
     seen[v, list(legs)] = True
@@ -449,7 +465,7 @@ def _widened(
 
 
 def _extended(predicted: PredictedObservations, legs: Sequence[int]) -> PredictedObservations:
-    """Return a session with one more camera, for as many images as the first."""
+    """Add a camera with as many images as the first."""
     images = predicted.pose[predicted.view == 0]
     new = len(predicted.t) + np.arange(len(images))
     seen = np.zeros((1, predicted.n_legs), dtype=np.bool_)

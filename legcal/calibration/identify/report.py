@@ -19,7 +19,7 @@ class Ranks:
 
     rank: int  # rank, of: directions of the parameter space that are determined, and all of them
     of: int
-    weak: tuple[WeakDirection, ...]  # the others
+    weak: tuple[WeakDirection, ...]  # undetermined directions
 
     @property
     def complete(self) -> bool:
@@ -59,7 +59,7 @@ class WeakDirection:
 
 @dataclass(frozen=True)
 class RmsMotion:
-    """How far the platform moves, root mean square over poses."""
+    """Motion of the platform, root mean square over poses."""
 
     dX_m: float  # displacement of the origin of R_e [m]
     dE_rad: float  # rotation [rad]
@@ -71,7 +71,7 @@ class Recommendation:
 
     # the legs that each camera position shows: neighbours around the base
     views: tuple[tuple[str, ...], ...]
-    legs_a_view: int  # how many these are
+    legs_a_view: int
     # predicted standard deviation of the platform; None where the motors do not determine its pose
     platform_sigma: RmsMotion | None
 
@@ -88,7 +88,7 @@ class BoardRanks:
 
 @dataclass(frozen=True)
 class BoardReport:
-    """What a calibration board does for a session."""
+    """Effect of a calibration board on a session."""
 
     present: bool  # whether the session has one, in every view
     # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``staged`` (the
@@ -102,7 +102,7 @@ class BoardReport:
 
 @dataclass(frozen=True)
 class ScaleSource:
-    """Something that fixes the scale of a machine whose readings carry no length."""
+    """A possible source of scale for a machine whose readings carry no length."""
 
     source: str  # ``length``, ``base_board``, ``platform_board`` or ``radii``
     assumed: str  # what was taken to be known, in words
@@ -113,7 +113,7 @@ class ScaleSource:
 
 @dataclass(frozen=True)
 class Remedy:
-    """Something that would help, with the ranks that it gives."""
+    """A change of the session, with the resulting ranks."""
 
     remedy: str  # what to do
     # staged_rank, full_rank: the ranks that it gives, of all parameters; what is fixed counts as
@@ -126,7 +126,7 @@ class Remedy:
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """What the legs determine of one camera, its four numbers estimated with all others."""
+    """Expected uncertainty of a camera's intrinsics, estimated jointly from the legs."""
 
     camera: str  # the view after whose name the intrinsics are called
     determined: bool  # whether the legs determine all four
@@ -165,7 +165,7 @@ class Identifiability:
     remedies: tuple[Remedy, ...]  # changes that would determine what is missing; each was tried
     # the smallest sets of views, fewest first; None where views were given
     recommendation: tuple[Recommendation, ...] | None
-    notes: tuple[str, ...]  # what the reader should know
+    notes: tuple[str, ...]
     # what the legs determine of the cameras of a dataset with images; empty without them
     intrinsics: tuple[CameraIntrinsics, ...] = ()
     # what would fix the scale where radii alone do: where readings carry no length

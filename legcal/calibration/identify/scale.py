@@ -1,8 +1,8 @@
-"""What fixes the scale of a machine whose readings carry no length.
+"""Sources of scale for a machine whose readings carry no length.
 
-Encoders of arms know angles: such a machine, twice as large with rods twice as thick and cameras
-twice as far, gives the same images and readings. A measured length, a board, or radii fix its
-scale; a prior on radii, or on lines of arms, that nobody has stated must not do so silently.
+Encoders of arms measure angles: such a machine at twice the size, with rods twice as thick and
+cameras twice as far, gives the same images and readings. A measured length, a board, or radii fix
+the scale; a default prior on radii, or on lines of arms, must not do so silently.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from legcal.calibration.identify.information import (
     length_rows,
     prior_of_arms,
-    problem_of,
     radius_rows,
+    session_problem,
 )
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
@@ -34,7 +34,7 @@ _LINKS: tuple[Link, ...] = ("base", "platform")
 
 
 def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
-    """Return what would fix the scale, and how well; nothing where readings or data do so."""
+    """Return possible sources of scale with their accuracy; empty if the scale is known."""
     if not analysis.predicted.actuators or not is_scale_open(analysis):
         return ()
     names = analysis.predicted.parametrization.names
@@ -64,11 +64,11 @@ def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
 
 
 def is_scale_open(analysis: Analysis) -> bool:
-    """Say whether radii alone fix something that they were taken to be known for.
+    """Whether the scale comes from default priors on radii alone.
 
-    Of radii those count as known that are fixed or have a stated prior. A stated length or radius
-    that says no more of the scale than half of what all radii are taken to be known to does not
-    count: these would set it in silence.
+    Fixed radii and radii with a stated prior count as known. A stated length or radius that fixes
+    the scale no better than half of the default prior of radii does not count: the default prior
+    would dominate silently.
     """
     stated = _stated_radii(analysis)
     if _n_open(analysis, stated) > _n_open(analysis, 0.0):
@@ -83,27 +83,27 @@ def is_scale_open(analysis: Analysis) -> bool:
 
 
 def _n_open(analysis: Analysis, sigma_radius: Array | float) -> int:
-    """Return how many directions are open where radii are known so well [m]."""
+    """Count the open directions for standard deviations *sigma_radius* of radii [m]."""
     return len(undetermined(analysis.predicted, _information(analysis, sigma_radius)))
 
 
 def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
-    """Return what a source gives: nothing where images leave lengths open all the same."""
+    """Accuracy of the scale and the platform with a source; None where lengths stay open."""
     sigma = _sigma(analysis, information)
     motion = None if sigma is None else analysis.motion.sigma(information)
     return ScaleSource(name, words, sigma, motion)
 
 
 def _sigma(analysis: Analysis, information: Array) -> float | None:
-    """Return the standard deviation of the scale as a part of it, None where it is open."""
+    """Relative standard deviation of the scale; None if it is open."""
     predicted = analysis.predicted
     columns = predicted.columns(LegColumns.LENGTH)
     lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
     mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
-    hidden = undetermined(predicted, information)
-    leaves_more = len(hidden) > _n_open(analysis, 0.0)
-    if leaves_more or np.linalg.norm(hidden @ mean) > _OPEN * np.linalg.norm(mean):
+    open_directions = undetermined(predicted, information)
+    leaves_more = len(open_directions) > _n_open(analysis, 0.0)
+    if leaves_more or np.linalg.norm(open_directions @ mean) > _OPEN * np.linalg.norm(mean):
         return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
     seen = singular > 0.0
@@ -113,19 +113,19 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
 def _information(
     analysis: Analysis, sigma_radius: Array | float = np.inf, *, common: float | None = None
 ) -> Array:
-    """Return rows by the parameters with radii known so well [m], or wrong alike by a part of them.
+    """Information rows by parameters, for priors *sigma_radius* [m] or a *common* relative error.
 
-    Of lines of arms that counts which somebody has stated.
+    Lines of arms have stated priors only.
     """
     predicted = analysis.predicted
     n, by_radius = predicted.n_bodies, radius_rows(predicted)
     shape = by_radius.shape[:2]
-    own: tuple[Variables, IntArray, Array]
+    radii: tuple[Variables, IntArray, Array]
     if common is not None:
-        known = GaussianPrior(np.zeros(1, dtype=np.intp), np.zeros(1), np.array([common]))
+        prior_of_common = GaussianPrior(np.zeros(1, dtype=np.intp), np.zeros(1), np.array([common]))
         relative = by_radius * predicted.body_radius[:, None, None]
-        own = (
-            Variables("radius", all_free(1, 1), prior=known),
+        radii = (
+            Variables("radius", all_free(1, 1), prior=prior_of_common),
             np.zeros(shape, dtype=np.intp),
             relative,
         )
@@ -134,13 +134,13 @@ def _information(
         which = np.flatnonzero(np.isfinite(sigma))
         prior = GaussianPrior(which, np.zeros(len(which)), sigma[which])
         body = np.broadcast_to(np.arange(n), shape)
-        own = (Variables("radius", all_free(n, 1), prior=prior), body, by_radius)
-    problem, state = problem_of(
+        radii = (Variables("radius", all_free(n, 1), prior=prior), body, by_radius)
+    problem, state = session_problem(
         predicted,
         analysis.images,
         analysis.equations,
         analysis.prior,
-        (own,),
+        (radii,),
         length_rows(predicted, analysis.choices),
         prior_of_arms(predicted, analysis.choices, stated=True),
     )
@@ -148,7 +148,7 @@ def _information(
 
 
 def _stated_radii(analysis: Analysis) -> Array:
-    """Return the standard deviations of radii that were stated, infinite for the others [m]."""
+    """Stated standard deviations of radii, infinite for the others [m]."""
     choices, predicted = analysis.choices, analysis.predicted
 
     def sigma(j: int, arm: str) -> float:
@@ -164,25 +164,27 @@ def _stated_radii(analysis: Analysis) -> Array:
 
 
 def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
-    """Return why the scale of a session is open and what to do, as a refusal."""
+    """Describe why the scale of a session is open, and the remedies."""
     machine = dataset.machine
     sources = scale_sources(analysis)
     if dataset.axes is not None:  # radii and boards are of images
         sources = tuple(source for source in sources if source.source == "length")
-    known = [source.assumed for source in sources if source.sigma is not None]
-    ways = ", or ".join(known or [source.assumed for source in sources])
-    why, fixed = "readings of arms carry no length", ""
+    fixing = [source.assumed for source in sources if source.sigma is not None]
+    options = ", or ".join(fixing or [source.assumed for source in sources])
+    reason, fix_gain = "readings of arms carry no length", ""
     if machine.readings_carry_length:  # but for gains
-        why, fixed = "the gains of all motors that slide are free", "fix one of these gains, or "
+        reason, fix_gain = (
+            "the gains of all motors that slide are free",
+            "fix one of these gains, or ",
+        )
     if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
-        why += f", that what is stated tells the scale to no better than {100 * _VAGUE:g} %"
+        reason += f", and the stated values fix the scale no better than {100 * _VAGUE:g} %"
     stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:
         stated += (
             ", or radii that you know better than the model (--set '*.radius.*=VALUE±SIGMAmm')"
         )
     return (
-        f"{dataset.folder}: the parameters cannot be identified: found that {why}, so that "
-        "machine, rods and cameras could all be larger alike, needed something that fixes the "
-        f"scale: {ways}; {fixed}{stated}."
+        f"{dataset.folder}: the parameters cannot be identified: {reason}, so that the scale of "
+        f"machine, rods and cameras is open; these would fix it: {options}; {fix_gain}{stated}."
     )

@@ -1,4 +1,4 @@
-"""Information of each of the four steps on what it identifies, given the steps before.
+"""Information of each of the four steps on its parameters, given the steps before.
 
 Step 1 locates joints in each camera (6), (7); step 2 the base (9), step 3 the offsets (14), step 4
 the platform (16) to (19): by the default criteria, and as printed.
@@ -25,8 +25,8 @@ from legcal.machine.actuator import Actuator, ActuatorColumns, ActuatorKind
 from legcal.machine.leg import EquationKind, JointType, LegColumns
 from legcal.paper.carriers import Carrier, CarrierColumns
 
-MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
-_MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints count as one
+MAX_SIGMA = 1.0  # mean leg lengths: above, a direction is not determined
+_MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints are one joint
 _MIN_VARIANCE = 1e-12  # of a variance [m^2]
 
 
@@ -49,13 +49,13 @@ class Located:
 class StepInformation:
     """One step's information on the parameters that it identifies."""
 
-    name: str  # what it identifies
+    name: str
     columns: IntArray  # (c,): the parameters
     information: Array  # (m, c): whitened rows by these parameters in metres
 
 
 def locate_joints(predicted: PredictedObservations) -> Located:
-    """Return what step 1 says: all axes of a leg in a frame meet in A (6), and v . u = 0 (7)."""
+    """Information of step 1: the axes of a leg in a frame meet in A (6), and v . u = 0 (7)."""
     A, B = at_base_joints(predicted), at_platform_joints(predicted)
     revolute = revolute_axes(predicted)
     shape = predicted.n_frames, predicted.n_legs
@@ -86,7 +86,7 @@ def locate_joints(predicted: PredictedObservations) -> Located:
 
 
 def carrier_of(predicted: PredictedObservations, j: int) -> Carrier:
-    """Return the joint at A of a leg with what moves it, as step 1 looks for it."""
+    """Return the joint at A of a leg with its actuator, as estimated in step 1."""
     leg = predicted.legs[j]
     v = leg.base_axis if revolute_axes(predicted)[j] else None
     actuator = leg.actuator
@@ -100,7 +100,7 @@ def carrier_of(predicted: PredictedObservations, j: int) -> Carrier:
 
 
 def columns_of_joint(predicted: PredictedObservations, j: int) -> IntArray:
-    """Return which of the unknowns (CarrierColumns) the joint at A of a leg has."""
+    """Return the unknowns (CarrierColumns) of the joint at A of a leg."""
     own = carrier_of(predicted, j).columns
     return own if predicted.carried_by[j] >= 0 else own[own < CarrierColumns.AXIS.start]
 
@@ -117,7 +117,7 @@ def _by_unknowns(
 
 
 def identify_base(predicted: PredictedObservations, located: Located) -> StepInformation:
-    """Return what step 2 says of base joints and revolute axes, the frames being free."""
+    """Information of step 2 on base joints and revolute axes, frames marginalised out."""
     columns, by_frame = base_by_frames(predicted, located)
     return StepInformation("base_joints", columns, eliminate(by_frame, 6)[:, columns])
 
@@ -133,7 +133,7 @@ def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[
     rows = np.zeros((len(pairs), n, 6 + len(predicted.unit)))
     for row, (f, j) in zip(rows, pairs, strict=True):
         F = located.information[f, j]
-        if not located.axis[f, j]:  # what is known of A alone
+        if not located.axis[f, j]:  # the information on A alone
             rest = np.setdiff1d(np.arange(n), np.r_[CarrierColumns.V])
             F = np.zeros_like(F)
             F[: len(rest), rest] = compress(
@@ -147,8 +147,8 @@ def base_by_frames(predicted: PredictedObservations, located: Located) -> tuple[
 def _unknowns_by_parameters(predicted: PredictedObservations, j: int) -> Array:
     """Return the derivative (9, p) of the unknowns of a joint (CarrierColumns) by the parameters.
 
-    The point of an axis beside A stands where the numbers of the actuator have it moved along its
-    axis, which matters with turns of the axis.
+    The point of an axis beside A is the actuator's point shifted along the axis, so that it moves
+    with rotations of the axis.
     """
     scatter, length = predicted.local_to_parameters[j], predicted.mean_length
     found = np.zeros((CarrierColumns.COUNT, scatter.shape[1]))
@@ -169,10 +169,9 @@ def _unknowns_by_parameters(predicted: PredictedObservations, j: int) -> Array:
 def distance_rows(
     predicted: PredictedObservations, located: Located
 ) -> tuple[Array, Array, IntArray]:
-    """Return what distances between leg ends say of the offsets.
+    """Return the derivatives of distances between leg ends by the offsets.
 
-    Two legs on one platform joint have none: their distance is zero whatever the offsets are. Two
-    on different bodies of the platform have none that is constant.
+    Legs on a common platform joint are left out: their distance is always zero.
 
     Returns (m, n_lengths): Derivative of each distance by the offsets and lengths, whitened; (m, ):
     One over the standard deviation of each distance [1/m]; (m, 4): Frame, pose, and both legs of
@@ -212,7 +211,7 @@ def distance_rows(
 def offsets_from_distances(
     predicted: PredictedObservations, rows: Array, weight: Array, key: IntArray
 ) -> StepInformation:
-    """Return what step 3 says: the distance of each pair is constant and free, (14)."""
+    """Information of step 3: the distance of each pair is constant and unknown (14)."""
     columns = predicted.columns(LegColumns.LENGTH)
     _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
     pair = pair.ravel()
@@ -224,9 +223,9 @@ def offsets_from_distances(
 def identify_platform(
     predicted: PredictedObservations, located: Located, images: Array, equations: WhitenedEquations
 ) -> StepInformation:
-    """Return what step 4 says of platform joints and axes, and of universal axes at the base.
+    """Information of step 4 on platform joints and axes, and on universal axes at the base.
 
-    *images* and *equations* are those of the joint fit.
+    *images* and *equations* are from the joint fit.
     """
     universal = np.array(
         [leg.base_joint is JointType.UNIVERSAL for leg in predicted.legs], dtype=np.bool_
@@ -257,7 +256,7 @@ def identify_platform(
 
 
 def scalar_products(predicted: PredictedObservations, located: Located) -> StepInformation:
-    """Return what (9) says: all products of vectors A_j A_g and revolute axes of each frame."""
+    """Information of (9): all products of vectors A_j A_g and revolute axes of each frame."""
     columns = identify_base(predicted, located).columns
     by_unknowns = np.concatenate(
         [_unknowns_by_parameters(predicted, j) for j in range(predicted.n_legs)]
@@ -268,7 +267,7 @@ def scalar_products(predicted: PredictedObservations, located: Located) -> StepI
         pairs = [
             (p, q)
             for p, q in combinations_with_replacement(range(len(vectors)), 2)
-            if p != q or not is_unit[p]  # v . v = 1 says nothing
+            if p != q or not is_unit[p]  # v . v = 1 is trivial
         ]
         if not pairs:
             continue
@@ -281,7 +280,7 @@ def scalar_products(predicted: PredictedObservations, located: Located) -> StepI
 def consecutive_distances(
     rows: Array, weight: Array, key: IntArray, columns: IntArray
 ) -> StepInformation:
-    """Return what (14) says: distances equal those of the next position of the frame.
+    """Information of (14): equal distances at consecutive poses of a frame.
 
     The rows, weights and keys are those of :func:`distance_rows`.
     """
@@ -299,7 +298,7 @@ def consecutive_distances(
 def mean_distances(
     predicted: PredictedObservations, weight: Array, key: IntArray
 ) -> StepInformation:
-    """Return what (16) says: mean distances of leg ends in each frame are those of the joints."""
+    """Information of (16): mean distances of leg ends in each frame equal joint distances."""
     columns = predicted.columns(LegColumns.B)
     B = np.array([leg.B for leg in predicted.legs])
     distinct, which = np.unique(key[:, [0, 2, 3]], axis=0, return_inverse=True)
@@ -313,7 +312,7 @@ def mean_distances(
 
 
 def by_all_parameters(step: StepInformation, n_parameters: int) -> Array:
-    """Return a step's rows by all parameters; the others count as known."""
+    """Expand a step's rows to all parameters; those outside the step are known."""
     rows = np.zeros((len(step.information) + n_parameters, n_parameters))
     rows[: len(step.information), step.columns] = step.information
     known = np.setdiff1d(np.arange(n_parameters), step.columns)
@@ -322,7 +321,7 @@ def by_all_parameters(step: StepInformation, n_parameters: int) -> Array:
 
 
 def revolute_axes(predicted: PredictedObservations) -> BoolArray:
-    """Return which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
+    """Return a mask of legs with a revolute base axis among the parameters, (n_legs,)."""
     return np.array(
         [EquationKind.BASE_AXIS in leg.equations for leg in predicted.legs],
         dtype=np.bool_,
@@ -332,7 +331,7 @@ def revolute_axes(predicted: PredictedObservations) -> BoolArray:
 def _joint_and_axis(
     predicted: PredictedObservations, A: Across, B: Across, here: IntArray, j: int
 ) -> Array:
-    """Return rows by the unknowns of a joint with an axis, the leg's direction being free."""
+    """Rows by the unknowns of a joint with an axis, leg directions marginalised out."""
     carrier, pose = carrier_of(predicted, j), predicted.pose[here]
     a = int(predicted.carried_by[j])
     axis = carrier.axis_at(predicted.q[pose, a] if a >= 0 else np.zeros(len(pose)))[0]
@@ -351,7 +350,7 @@ def _joint_and_axis(
 
 
 def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
-    """Return rows F by A and axis of a leg as rows by the turn and displacement of the camera."""
+    """Transform rows F by a joint to rows by rotation and displacement of the camera."""
     columns, rows = CarrierColumns, np.zeros((len(F), 6))
     rows[:, :3] = -cross(predicted.A[j], F[:, columns.A])
     rows[:, 3:] = -F[:, columns.A]
@@ -369,7 +368,7 @@ def _by_camera(predicted: PredictedObservations, j: int, F: Array) -> Array:
 def _end_variance(
     predicted: PredictedObservations, B: Across, image: IntArray, leg: IntArray, n: Array
 ) -> Array:
-    """Return the variance of leg ends along directions n, (k,) [m^2], base joints being known."""
+    """Variance of leg ends along directions n, (k,) [m^2], for known base joints."""
     gradient = B.gradient[image, leg]
     size = np.maximum(np.sum(gradient**2, axis=2), 1e-30)
     across = np.sum((np.einsum("ki,kri->kr", n, gradient) / size) ** 2, axis=1)
@@ -407,7 +406,7 @@ def _groups(predicted: PredictedObservations, located: Located) -> _Groups:
 
 
 def _step_4_equations(equations: WhitenedEquations, groups: _Groups) -> BoolArray:
-    """Return which equations of the legs step 4 uses in each group, (n_groups, m)."""
+    """Mask of the leg equations used in step 4 by group, (n_groups, m)."""
     kinds = np.array([d.name for d in equations.demand])
     length, base_axis, twist = (kinds == d for d in ("LENGTH", "BASE_AXIS", "TWIST"))
     others = ~length & ~base_axis & (~twist | groups.in_base[:, None])
@@ -418,10 +417,7 @@ def _step_4_equations(equations: WhitenedEquations, groups: _Groups) -> BoolArra
 def _vectors_of(
     predicted: PredictedObservations, located: Located, f: int
 ) -> tuple[list[Array], list[Array], list[bool]]:
-    """Return the set V of (8), the derivative of each by the unknowns of all legs, (3, 9 n).
-
-    And which are unit vectors.
-    """
+    """Set V of (8), derivatives (3, 9 n) of each by the unknowns of all legs, and unit flags."""
     vectors, slopes, is_unit = list[Array](), list[Array](), list[bool]()
     columns, n = CarrierColumns, predicted.n_legs
 
@@ -454,7 +450,7 @@ def _vectors_of(
 
 
 def _covariance(predicted: PredictedObservations, located: Located, f: int) -> Array:
-    """Return the covariance of joints and axes of a frame after step 1, (9 n, 9 n) [m^2]."""
+    """Covariance of joints and axes of a frame after step 1, (9 n, 9 n) [m^2]."""
     n = CarrierColumns.COUNT
     covariance = np.zeros((n * predicted.n_legs,) * 2)
     for j in np.flatnonzero(located.joint[f]).tolist():
