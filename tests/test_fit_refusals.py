@@ -189,12 +189,12 @@ def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
 ) -> None:
     starts = [replace(at_truth(session), label=label) for label in ("second", "first", "third")]
     costs = {"first": 1.0, "second": 2.0, "third": 3.0}
-    unwatched = fit._first
+    unwatched = fit._first_minimum
 
     def with_cost(problem: FitProblem, start: Start) -> object:
         return replace(unwatched(problem, start), cost=costs[start.label])
 
-    monkeypatch.setattr(fit, "_first", with_cost)
+    monkeypatch.setattr(fit, "_first_minimum", with_cost)
     found = refine(session.legs, session.measurements, session.outlines, starts)
     assert found.start == "first"
 

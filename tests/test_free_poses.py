@@ -304,7 +304,7 @@ def five_carriages(folder: Path) -> Machine:
 def test_poses_that_carriages_leave_open_are_looked_for_with_their_readings(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(free_poses, "_DRAWN", 1)
+    monkeypatch.setattr(free_poses, "_N_DRAWS", 1)
     path = five_carriages(tmp_path).yaml_path
     session = machine_session(path, length=0.0, angle=0.0, n_views=1, n_poses=3)
     problem = build_fit(session.legs, session.measurements, session.outlines)

@@ -74,7 +74,7 @@ def small_search() -> Iterator[None]:
         patch.setattr(planner, "MIN_POSES", 8)
         patch.setattr(planner, "POSES_EACH", 2)
         patch.setattr(planner, "ROUNDS", 1)
-        patch.setattr(camera_places, "_TURNS", 6)
+        patch.setattr(camera_places, "_N_AZIMUTHS", 6)
         yield
 
 
@@ -613,7 +613,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path, tmp_path:
         (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": place}}))
         refused(NotVisible, remedy, places=tmp_path / "away.yaml")
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
-    refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
+    refused(NotVisible, "wider view, correct the focal length", camera=telephoto)
     refused(UsageError, "found 1 place for 2", places=tmp_path / "away.yaml", cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=places(tmp_path))  # fmt: skip

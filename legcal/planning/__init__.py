@@ -1,22 +1,22 @@
-"""Plan a session before it is shot: poses and camera places that determine the machine best.
+"""Plan a session: poses and camera places that determine the machine best (optimal design).
 
-In: a mechanism, a camera, what is known of the errors of outlines; out: a :class:`Plan`, and the
-folder of a session. :func:`plan` reads what is asked, ``planner`` is the method in order. The paper
-ends on it: "a better selection of the end-effector poses".
+In: a mechanism, a camera, and the noise of outlines; out: a :class:`Plan`, and the folder of a
+session. :func:`plan` checks the request, ``planner`` is the method from top to bottom. The paper
+names it as future work: "a better selection of the end-effector poses".
 
 ==================== ===================================================================
-``request``          what is asked, checked; the fewest images that reach a target
-``planner``          poses, places, images chosen, exchanged, polished, judged
-``poses``            poses that the machine takes, however far it is off
-``places``           where cameras may stand, and how well they are set
-``sight``            what a camera sees of legs: rays past other legs and plates
-``information``      rows that images add to the information of the joint fit
-``exchange``         greedy choice and exchanges by low-rank updates of the covariance
-``goals``            what is made small
-``order``            the order of poses and the ways between them
-``laid_board``       where a board lies, and which images show it
-``noise``            errors of outlines from earlier results
+``request``          options and their checks; the fewest images for a target error
+``planner``          poses, places and images: selection, exchange, local search, evaluation
+``poses``            poses within reach for all machines within tolerance
+``places``           camera places, and tolerances of tripods
+``sight``            visible parts of legs: rays past other legs and plates
+``information``      information of images in the joint fit
+``exchange``         greedy selection and exchanges by low-rank updates of the covariance
+``goals``            criteria to minimise
+``order``            order of poses and paths between them
+``laid_board``       place of a board, and images that show it
+``noise``            noise of outlines from earlier results
 ``planned_session``  the plan and its document
-``session``          its folder
+``session``          the folder of a planned session
 ==================== ===================================================================
 """

@@ -1,9 +1,9 @@
-"""Choose images: greedily, then by exchanges, with low-rank updates of the covariance.
+"""Select images: greedily, then by exchanges, with low-rank updates of the covariance.
 
-A session has slots for views. Candidates of a slot are rows U of images (:class:`Contributions`),
-all on the same unknowns. With the covariance S of all unknowns, an image more leaves
-S - S U^T (1 + U S U^T)^-1 U S, and an image less the same with other signs; the criterion is a
-function of the block of the machine, so that only that block is computed for a candidate.
+A session has a slot for each view. The candidates of a slot are information rows U of images
+(:class:`Contributions`) over the same unknowns. Adding an image updates the covariance S of all
+unknowns to S - S U^T (1 + U S U^T)^-1 U S, and removing one changes the signs. The criterion
+depends on the machine's block, so that only this block is computed for a candidate.
 """
 
 from __future__ import annotations
@@ -21,31 +21,33 @@ Criterion = Callable[
     [Array], Array
 ]  # covariances (n, p, p) of the machine -> (n,), smaller: better
 
-_BATCH = 64  # candidates that are judged at once
-_TRIED = 90  # of all candidates, for each image that is chosen
-_MIN_GAIN = 1e-4  # of the criterion, for which images are exchanged
+_BATCH = 64  # candidates evaluated at once
+_N_DRAWN = 90  # random candidates for each selected image
+_MIN_GAIN = 1e-4  # relative gain of the criterion for an exchange
 _MAX_PASSES = 8
-_LEAST_LEFT = 1e-9  # share of a variance, of which updates would be rounding
+_MIN_EIGENVALUE = 1e-9  # of an update, below which the covariance is inverted anew
 
 
 class Session:
-    """The covariance of all unknowns with the images that are chosen."""
+    """The information and covariance of all unknowns for the selected images."""
 
     def __init__(self, slots: Sequence[Contributions], given: Sequence[Contributions] = ()) -> None:
         names: dict[str, int] = {}
-        self.places: list[IntArray] = []
+        self.columns: list[IntArray] = []
         for s, slot in enumerate((*slots, *given)):
-            own = [f"{s}/{name}" if ": " in name else name for name in slot.names]
-            self.places.append(np.array([names.setdefault(name, len(names)) for name in own]))
+            local_names = [f"{s}/{name}" if ": " in name else name for name in slot.names]
+            self.columns.append(
+                np.array([names.setdefault(name, len(names)) for name in local_names])
+            )
         self.information = np.zeros((len(names), len(names)))
-        for place, slot in zip(self.places, (*slots, *given), strict=True):
-            self.information[np.ix_(place, place)] = slot.prior
-        for place, slot in zip(self.places[len(slots) :], given, strict=True):
+        for columns, slot in zip(self.columns, (*slots, *given), strict=True):
+            self.information[np.ix_(columns, columns)] = slot.prior
+        for columns, slot in zip(self.columns[len(slots) :], given, strict=True):
             stacked = slot.all_gains()
-            self.information[np.ix_(place, place)] += stacked.T @ stacked
+            self.information[np.ix_(columns, columns)] += stacked.T @ stacked
         self.names = names
         self.slots, self.given = list(slots), list(given)
-        self._at: dict[tuple[int, int], list[int]] = {}  # the images that are chosen of each site
+        self._chosen_at: dict[tuple[int, int], list[int]] = {}  # selected images of each site
         self.p = sum(name.startswith(KINEMATIC) for name in names)
         self.covariance = np.linalg.inv(self.information)
 
@@ -55,73 +57,72 @@ class Session:
         return np.asarray(self.covariance[: self.p, : self.p], dtype=np.float64)
 
     def changed(self, slot: int, image: int, sign: float) -> None:
-        """Add (+1) an image to a slot, or take it away (-1)."""
-        at = self._at.setdefault((slot, int(self.slots[slot].site[image])), [])
+        """Add (+1) an image to a slot, or remove it (-1)."""
+        chosen_at_site = self._chosen_at.setdefault((slot, int(self.slots[slot].site[image])), [])
         if sign > 0.0:
-            at.append(image)
-            self._update(slot, image, len(at), 1.0)
+            chosen_at_site.append(image)
+            self._update(slot, image, len(chosen_at_site), 1.0)
             return
-        place = at.index(image)
-        for k in range(place, len(at)):
-            self._update(slot, at[k], k + 1, -1.0)
-        at.remove(image)
-        for k in range(place, len(at)):
-            self._update(slot, at[k], k + 1, 1.0)
+        position = chosen_at_site.index(image)
+        for k in range(position, len(chosen_at_site)):
+            self._update(slot, chosen_at_site[k], k + 1, -1.0)
+        chosen_at_site.remove(image)
+        for k in range(position, len(chosen_at_site)):
+            self._update(slot, chosen_at_site[k], k + 1, 1.0)
 
     def _update(self, slot: int, image: int, number: int, sign: float) -> None:
-        """Add (+1) what an image adds as that many-th of its site, or take it away (-1)."""
+        """Add (+1) or remove (-1) the rows of an image that is the *number*-th of its site."""
         U = self.slots[slot].gains(np.array([image]), np.array([number]))[0]
-        place = self.places[slot]
-        self.information[np.ix_(place, place)] += sign * (U.T @ U)
-        K = U @ self.covariance[place]
-        S = np.eye(len(U)) + sign * (K[:, place] @ U.T)
-        variances, turn = np.linalg.eigh(S)
-        if variances[0] < _LEAST_LEFT:  # hardly anything is known without these rows
+        columns = self.columns[slot]
+        self.information[np.ix_(columns, columns)] += sign * (U.T @ U)
+        K = U @ self.covariance[columns]
+        S = np.eye(len(U)) + sign * (K[:, columns] @ U.T)
+        variances, eigenvectors = np.linalg.eigh(S)
+        if variances[0] < _MIN_EIGENVALUE:  # hardly anything is known without these rows
             self.renewed()
             return
-        half = (turn / np.sqrt(variances)).T @ K
+        half = (eigenvectors / np.sqrt(variances)).T @ K
         self.covariance -= sign * (half.T @ half)
 
     def renewed(self) -> None:
-        """Invert the information, without what updates have rounded."""
+        """Invert the information anew, against the rounding of updates."""
         self.covariance = np.linalg.inv(self.information)
 
     def with_one_more(self, slot: int, images: IntArray) -> Array:
-        """Return the covariances (n, p, p) of the machine with one of some images more."""
-        place = self.places[slot]
-        block, p = self.covariance[np.ix_(place, place)], self.p
-        own = self._next(slot, images)
-        with_own = own @ block
-        S = np.eye(own.shape[1]) + with_own @ np.swapaxes(own, 1, 2)
-        half = with_own[..., :p]
+        """Return the covariances (n, p, p) of the machine with each of *images* added."""
+        columns = self.columns[slot]
+        block, p = self.covariance[np.ix_(columns, columns)], self.p
+        rows = self._next_rows(slot, images)
+        rows_covariance = rows @ block
+        S = np.eye(rows.shape[1]) + rows_covariance @ np.swapaxes(rows, 1, 2)
+        half = rows_covariance[..., :p]
         return np.asarray(self.machine - np.swapaxes(half, 1, 2) @ np.linalg.solve(S, half))
 
-    def _next(self, slot: int, images: IntArray) -> Array:
-        """Return the rows (n, r, m) that images add to those chosen of their sites."""
-        own = self.slots[slot]
-        count = [len(self._at.get((slot, site), ())) for site in own.site[images].tolist()]
-        return own.gains(images, 1 + np.array(count))
+    def _next_rows(self, slot: int, images: IntArray) -> Array:
+        """Rows (n, r, m) of images, given the selected images of their sites."""
+        candidates = self.slots[slot]
+        count = [
+            len(self._chosen_at.get((slot, site), ())) for site in candidates.site[images].tolist()
+        ]
+        return candidates.gains(images, 1 + np.array(count))
 
     def fitted(self) -> Array:
-        """Return the covariance (p, p) of the machine by a fit of the given images alone.
-
-        Errors at places move it.
-        """
-        found = self.machine
-        for place, slot in zip(self.places[len(self.slots) :], self.given, strict=True):
-            moved = np.einsum("krm,krc->mc", slot.rows, slot.shifts)
-            moved = self.covariance[: self.p, place] @ moved
-            found = found + moved @ moved.T
-        return np.asarray(found, dtype=np.float64)
+        """Return the covariance (p, p) of a fit to the given images, with errors at places."""
+        covariance = self.machine
+        for columns, slot in zip(self.columns[len(self.slots) :], self.given, strict=True):
+            shift = np.einsum("krm,krc->mc", slot.rows, slot.shifts)
+            shift = self.covariance[: self.p, columns] @ shift
+            covariance = covariance + shift @ shift.T
+        return np.asarray(covariance, dtype=np.float64)
 
 
 @dataclass
 class Chosen:
-    """The images of a session: slot and candidate of each."""
+    """The selected images: slot and candidate of each."""
 
     images: list[tuple[int, int]] = field(default_factory=list)
     value: float = np.inf  # of the criterion
-    history: list[float] = field(default_factory=list)  # the same with 1, 2, ... images
+    history: list[float] = field(default_factory=list)  # criterion with 1, 2, ... images
 
 
 def choose(
@@ -135,32 +136,34 @@ def choose(
     is_enough: Callable[[float], bool] = lambda _: False,
     progress: Report = no_progress,
 ) -> Chosen:
-    """Return the images that one after the other lower the criterion most."""
-    found = Chosen()
+    """Select images greedily: each lowers the criterion most."""
+    chosen = Chosen()
     n_slots = len(session.slots)
-    while len(found.images) < n_images:
-        count = [sum(s == slot for s, _ in found.images) for slot in range(n_slots)]
+    while len(chosen.images) < n_images:
+        count = [sum(s == slot for s, _ in chosen.images) for slot in range(n_slots)]
         missing = [max(least - c, 0) for c in count]
-        left = n_images - len(found.images)
+        remaining = n_images - len(chosen.images)
         open_slots = [
             s for s in range(n_slots)
-            if count[s] < most and (missing[s] > 0 or sum(missing) < left)
+            if count[s] < most and (missing[s] > 0 or sum(missing) < remaining)
         ]  # fmt: skip
-        slot, image, value = _best(session, open_slots, criterion, rng, set(found.images))
+        slot, image, value = _best_candidate(
+            session, open_slots, criterion, rng, set(chosen.images)
+        )
         session.changed(slot, image, 1.0)
-        found.images.append((slot, image))
-        found.value = value
-        found.history.append(value)
-        progress("Images", len(found.images), n_images)
+        chosen.images.append((slot, image))
+        chosen.value = value
+        chosen.history.append(value)
+        progress("Images", len(chosen.images), n_images)
         if is_enough(value) and min(count) >= least:
             break
     session.renewed()
-    return found
+    return chosen
 
 
 def exchange(
     session: Session,
-    found: Chosen,
+    chosen: Chosen,
     criterion: Criterion,
     rng: np.random.Generator,
     least: int,
@@ -169,51 +172,53 @@ def exchange(
     progress: Report = no_progress,
     stop: Callable[[], bool] = lambda: False,
 ) -> Chosen:
-    """Return the same number of images after exchanging single ones while that helps."""
-    found.value = float(criterion(session.machine[None])[0])
+    """Exchange single images while the criterion improves."""
+    chosen.value = float(criterion(session.machine[None])[0])
     for turn in range(_MAX_PASSES):
-        before = found.value
-        for i, (slot, image) in enumerate(list(found.images)):
+        before = chosen.value
+        for i, (slot, image) in enumerate(list(chosen.images)):
             if stop():
                 break
-            others = [pair for k, pair in enumerate(found.images) if k != i]
+            others = [pair for k, pair in enumerate(chosen.images) if k != i]
             count = [sum(s == other for s, _ in others) for other in range(len(session.slots))]
             open_slots = [s for s in range(len(count)) if count[s] < most]
             if count[slot] < least:
                 open_slots = [slot]
             session.changed(slot, image, -1.0)
-            new = _best(session, open_slots, criterion, rng, set(found.images))
-            if new[2] < found.value * (1.0 - _MIN_GAIN):
-                slot, image, found.value = new
-                found.images[i] = slot, image
+            replacement = _best_candidate(session, open_slots, criterion, rng, set(chosen.images))
+            if replacement[2] < chosen.value * (1.0 - _MIN_GAIN):
+                slot, image, chosen.value = replacement
+                chosen.images[i] = slot, image
             session.changed(slot, image, 1.0)
         session.renewed()
-        found.value = float(criterion(session.machine[None])[0])
+        chosen.value = float(criterion(session.machine[None])[0])
         progress("Exchanges", turn + 1, _MAX_PASSES)
-        if found.value > before * (1.0 - 10.0 * _MIN_GAIN):
+        if chosen.value > before * (1.0 - 10.0 * _MIN_GAIN):
             break
     progress("Exchanges", _MAX_PASSES, _MAX_PASSES)
-    return found
+    return chosen
 
 
-def _best(
+def _best_candidate(
     session: Session,
     slots: Sequence[int],
     criterion: Criterion,
     rng: np.random.Generator,
     taken: set[tuple[int, int]],
 ) -> tuple[int, int, float]:
-    """Return the best of some candidates that are drawn: slot, image, and the criterion with it."""
-    every = [
+    """Best of randomly drawn candidates: slot, image, and its criterion."""
+    candidates = [
         (s, k) for s in slots for k in range(len(session.slots[s].rows)) if (s, k) not in taken
     ]
-    drawn = rng.permutation(len(every))[:_TRIED].tolist()
+    drawn = rng.permutation(len(candidates))[:_N_DRAWN].tolist()
     best = (-1, -1, np.inf)
     for slot in slots:
-        own = np.array([every[i][1] for i in drawn if every[i][0] == slot], dtype=np.intp)
-        for part in np.split(own, range(_BATCH, len(own), _BATCH)) if len(own) else []:
-            values = criterion(session.with_one_more(slot, part))
+        images = np.array(
+            [candidates[i][1] for i in drawn if candidates[i][0] == slot], dtype=np.intp
+        )
+        for batch in np.split(images, range(_BATCH, len(images), _BATCH)) if len(images) else []:
+            values = criterion(session.with_one_more(slot, batch))
             k = int(np.argmin(values))
             if values[k] < best[2]:
-                best = slot, int(part[k]), float(values[k])
+                best = slot, int(batch[k]), float(values[k])
     return best

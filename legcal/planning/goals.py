@@ -1,7 +1,7 @@
-"""What a plan is to make small: errors of the platform over the workspace, or of parameters.
+"""Criteria of a plan: errors of the platform over the workspace, or of parameters.
 
-Errors of the platform are those of all its joints at the poses that stand for the workspace: the
-root mean square distance by which the covariance of the machine moves them.
+The error of the platform is the root mean square displacement of its joints at poses all over the
+workspace, for the covariance of the machine.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ class Goal(StrEnum):
     """The quantity that a plan minimises."""
 
     MEAN = "mean"  # error of the platform, mean over the workspace
-    WORST = "worst"  # the same where it is largest
+    WORST = "worst"  # error of the platform, maximum over the workspace
     D_OPTIMAL = "d"  # determinant of the covariance of all parameters
     PARAMETERS = "parameters"  # sigma of named parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """How parameters move the platform, all over the workspace."""
+    """Sensitivity of the platform to the parameters, over the workspace."""
 
     by_parameters: Array  # (w, 6, p): rotation vectors, displacements of the origin of R_e
     joints: Array  # (w, n_joints, 3, p): displacements of platform joints [m]
 
     def error(self, covariance: Array) -> PlatformError:
-        """Return what a covariance (p, p) of the kinematic parameters means there."""
+        """Return the error of the platform for a covariance (p, p) of the parameters."""
         return expected_error(self.by_parameters, covariance)
 
 
 def workspace_of(machine: Machine, legs: FittedLegs) -> Workspace | None:
-    """Return the workspace of a machine; None where readings do not give poses."""
+    """Return the workspace of a machine; None if readings do not determine its poses."""
     if not machine.is_determined:
         return None
     try:
@@ -71,9 +71,9 @@ def criterion_of(
     basis: Array,  # (n_parameters, p)
     named: Sequence[str] = (),
 ) -> Criterion:
-    """Return the criterion of a goal: of covariances (n, p, p), by their own unit.
+    """Return the criterion of a goal, a function of covariances (n, p, p).
 
-    Raises UsageError if the goal is not one of this machine.
+    Raises UsageError if the goal does not apply to the machine.
     """
     units, names = legs.parametrization.units, legs.parametrization.names
     length = float(np.mean([np.linalg.norm(leg.B) + leg.q0 for leg in legs.nominal]))
@@ -81,8 +81,8 @@ def criterion_of(
     if goal in (Goal.MEAN, Goal.WORST):
         if work is None:
             raise UsageError(
-                "The plan could not minimise the error of the platform: found a machine of which "
-                "readings do not give the pose, needed --criterion d or parameters; choose one."
+                "The plan could not minimise the error of the platform: the readings of this "
+                "machine do not determine its pose; choose --criterion d or parameters."
             )
         moves = np.concatenate(list(np.moveaxis(work.joints, 1, 0)), axis=1) @ basis
         weights = np.einsum("wri,wrj->wij", moves, moves) / work.joints.shape[1]

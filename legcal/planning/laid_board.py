@@ -1,9 +1,8 @@
-"""Where a calibration board lies on the base, and which images show it.
+"""Place of a calibration board on the base, and the images that show it.
 
-It lies flat at the level of the base joints, in their middle or beside them, its print to the
-platform: there most places see it. An image shows it if all of its corners are in the picture, seen
-from before it by enough and large enough to be read, and behind no leg, no arm and not the plate of
-the platform.
+The board lies flat at the level of the base joints, at their centre or beside them, facing the
+platform: there most camera places see it. An image shows it if all corners are in the picture, from
+a moderate angle, large enough to be detected, and not behind a leg, an arm or the platform plate.
 """
 
 from __future__ import annotations
@@ -22,23 +21,23 @@ from legcal.vision.camera import Camera
 from legcal.vision.visibility import in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine
-_DISTANCE = 1.05  # half diagonals of the board beyond the base joints
+_DISTANCE = 1.05  # of a board beside the base joints, in half diagonals
 _MIN_COSINE = 0.45  # between the normal of the print and the line of sight
-_MODULE_PX = 2.0  # of a module of a marker, across which it looks narrowest
-_MODULES = 6.0  # that a square without a marker counts as
+_MODULE_PX = 2.0  # least apparent width of a module of a marker
+_MODULES = 6.0  # modules equivalent to a square without a marker
 _FRAME = {"charuco": 2, "aprilgrid": 4}  # modules of the black frame of a marker, both sides
 
 
 @dataclass(frozen=True, eq=False)
 class LaidBoard:
-    """A board in its place."""
+    """A calibration board at its place on the base."""
 
     board: Board
     T_base_board: RigidTransform
 
     @property
     def normal(self) -> Array:
-        """Where the print looks in the base link, (3,)."""
+        """Normal of the print in the base link, (3,)."""
         z = self.T_base_board.rotation.as_matrix()[:, 2]
         return np.asarray(z * self.board.towards_viewer)
 
@@ -59,9 +58,9 @@ class LaidBoard:
         bodies: Bodies,
         margin_px: float = 0.0,
         *,
-        is_read: bool = True,  # whether it must look large enough
+        is_read: bool = True,  # require the size for detection
     ) -> BoolArray:
-        """Return which images of one camera show it, (n_images,)."""
+        """Return a mask of the images of one camera that show the board, (n_images,)."""
         n = len(bodies.B)
         outer, eye = self.corners, T_base_camera.translation
         P = T_base_camera.inv().apply(outer)
@@ -84,7 +83,7 @@ class LaidBoard:
         return ~np.asarray(hidden.any(axis=1))
 
     def _narrowest(self, px: Array) -> float:
-        """Return how wide a module looks where it is narrowest, from outer corners (4, 2) [px]."""
+        """Least apparent width of a module, from outer corners (4, 2) [px]."""
         board = self.board
         x, y = (px[1] - px[0]) / board.columns, (px[3] - px[0]) / board.rows  # of a tile
         tile = abs(x[0] * y[1] - x[1] * y[0]) / max(np.linalg.norm(x), np.linalg.norm(y))
@@ -96,9 +95,9 @@ class LaidBoard:
 
 
 def feet(board: Board, A: Array, up: Array) -> list[tuple[Array, Array]]:
-    """Return where a board may lie: from the middle of base joints (n, 3), and its side, (3,) each.
+    """Return candidate positions relative to the centre of base joints, and x axes, (3,) [m].
 
-    That is in their middle, and beyond all of them in a few directions across *up* [m].
+    At the centre, and beyond all joints in a few directions normal to *up*.
     """
     flat = A - A.mean(axis=0)
     flat = flat - (flat @ up)[:, None] * up
@@ -110,7 +109,7 @@ def feet(board: Board, A: Array, up: Array) -> list[tuple[Array, Array]]:
 
 
 def lying(board: Board, machine: Machine) -> list[LaidBoard]:
-    """Return the places of a board on the base."""
+    """Return the candidate places of a board on the base."""
     up, middle = machine.upward, machine.A_base.mean(axis=0)
     return [
         LaidBoard(board, facing_board(board, middle + foot, up, side))

@@ -1,4 +1,4 @@
-"""The errors of outlines that a plan counts on, from an earlier result."""
+"""Noise of outlines for a plan, from an earlier result."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from legcal.planning.information import DEFAULT_NOISE, PredictedNoise
 
 
 def read_noise(path: Path) -> PredictedNoise:
-    """Return the noise that an earlier result shows, by its folder or its ``result.json``."""
+    """Return the estimated noise of an earlier result, by its folder or ``result.json``."""
     file = path / "result.json" if path.is_dir() else path
     try:
-        found = read_json(file)
-        if "legcal_result" in found:
-            return _of_result(found, file)
+        document = read_json(file)
+        if "legcal_result" in document:
+            return _noise_of_result(document, file)
     except FileNotFoundError as error:
-        what = "no such file" if file == path else f"a folder without {file.name}"
-        raise _useless(path, what) from error
+        problem = "no such file" if file == path else f"a folder without {file.name}"
+        raise _unusable(path, problem) from error
     except OSError as error:
-        raise _useless(path, f"'{error.strerror or error}'") from error
+        raise _unusable(path, f"'{error.strerror or error}'") from error
     except KeyError as error:
-        raise _useless(path, f"a document without {error}") from error
+        raise _unusable(path, f"a document without {error}") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise _useless(path, "no JSON document") from error
+        raise _unusable(path, "no JSON document") from error
     except (ValueError, TypeError, AttributeError, DatasetError) as error:
-        raise _useless(path, f"'{error}'") from error
-    raise _useless(path, "another document")
+        raise _unusable(path, f"'{error}'") from error
+    raise _unusable(path, "another document")
 
 
-def _useless(path: Path, found: str) -> UsageError:
+def _unusable(path: Path, problem: str) -> UsageError:
     return UsageError(
-        f"{path}: the noise could not be used: found {found}, needed the folder of an earlier "
+        f"{path}: the noise could not be used: found {problem}, needed the folder of an earlier "
         "result or its result.json; correct --noise, or leave it out."
     )
 
 
-def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
-    """Return the noise of a result: what its outlines claim, times what its residuals show."""
-    noise, common = found["residuals"]["noise"], found["residuals"]["shared_px"]
+def _noise_of_result(document: dict[str, Any], file: Path) -> PredictedNoise:
+    """Noise of a result: claimed standard deviations times the estimated scale."""
+    noise, common = document["residuals"]["noise"], document["residuals"]["shared_px"]
     scale = float(noise["scale"])
     sigma, correlation = DEFAULT_NOISE.sigma_px, DEFAULT_NOISE.correlation
     table = file.parent / OBSERVATIONS_NAME
@@ -62,9 +62,9 @@ def _of_result(found: dict[str, Any], file: Path) -> PredictedNoise:
             sigma = scale * float(np.median(np.sqrt(variance * length / 4.0)))
             correlation = float(np.median(s01 / variance))
     shared = tuple(float(common.get(kind, 0.0)) for kind in KINDS)
-    # Errors at places are among those of single outlines, and few images show them as these alone.
-    of_edges = float(noise["bias_px"]), float(noise["tilt_px"])
+    # With few images, errors at places appear as bias and tilt of single outlines.
+    single_edges = float(noise["bias_px"]), float(noise["tilt_px"])
     at_places = (float(common.get(kind, 0.0)) for kind in PLACES)
-    places = tuple(max(both) for both in zip(of_edges, at_places, strict=True))
+    places = tuple(max(both) for both in zip(single_edges, at_places, strict=True))
     gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
     return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))

@@ -1,9 +1,9 @@
-"""Where cameras may stand: around the machine, at places of a list, within bounds.
+"""Camera places: around the machine, from a list, within bounds.
 
-A tripod is set to an eighth of a leg and 5 deg, so a place counts with a margin in the picture
-(:class:`Setting`): from where it stands the joints of all poses are in the picture even if it is
-set that much wrongly, or, nearer, most of them. Pictures are upright where z of the base link
-points up, also of machines that hang: a tripod stands on the ground.
+A tripod is placed to within an eighth of a leg and 5 deg, so that places are chosen with a margin
+in the picture (:class:`Setting`): the joints of all poses, or from nearer places most of them, are
+in the picture for every tripod within tolerance. Pictures are upright for z of the base link
+pointing up, also for hanging machines: a tripod stands on the ground.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import in_picture
 
-_TURNS = 16  # directions around the machine
-_LIFTS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
-_LIFTS_PLANAR = (0.65, 1.0, 1.35)  # above the plane of motion
+_N_AZIMUTHS = 16  # directions around the machine
+_ELEVATIONS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
+_ELEVATIONS_PLANAR = (0.65, 1.0, 1.35)  # above the plane of motion
 _NEARER = (1.0, 0.8, 0.65)  # of the distance from where all is in the picture
 _FARTHER = 2.0  # of it, at most, in a box
 _ACROSS = 5  # places along each side of a box
@@ -46,20 +46,20 @@ USUAL_SHIFT, USUAL_LENGTH, USUAL_DRAWS = 0.125, 0.005, 20  # mean leg lengths, d
 
 @dataclass(frozen=True)
 class Setting:
-    """How well a tripod is set, and what is known of the machine before.
+    """Tolerances of tripods and of the machine.
 
     Attributes
     ----------
     shift : float
-        How far a camera may stand from its place [m], at most.
+        Largest distance of a camera from its planned place [m].
     length : float
-        How far lengths and coordinates are from the model [m], at most.
+        Largest error of lengths and coordinates of the model [m].
     turn : float
-        How far a camera may look elsewhere [rad], at most.
+        Largest error of the orientation of a camera [rad].
     angle : float
-        How far axes are from the model [rad], at most.
+        Largest error of axes of the model [rad].
     draws : int
-        How many such sessions are drawn to judge a plan.
+        Random sessions within these tolerances, to evaluate a plan.
     """
 
     shift: float
@@ -69,12 +69,12 @@ class Setting:
     draws: int = 20
 
     def margin(self, camera: Camera, nearest: float) -> float:
-        """Return how far in the picture a point moves at most, at that distance [px]."""
+        """Return the largest image shift of a point at a distance *nearest* [px]."""
         focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
         return focal * float(np.tan(self.turn) + (self.shift + self.length) / nearest)
 
     def camera_elsewhere(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
-        """Return a camera pose as it may be set instead of another."""
+        """Draw a camera pose within tolerance."""
         shift, turn = rng.normal(size=(2, 3))
         shift *= self.shift * rng.random() / np.linalg.norm(shift)
         turn *= self.turn * rng.random() / np.linalg.norm(turn)
@@ -84,7 +84,7 @@ class Setting:
 
 
 def usual_setting(size: float) -> Setting:
-    """Return the setting of a machine of a mean leg length [m], where nobody says more."""
+    """Return the default tolerances for a mean leg length *size* [m]."""
     return Setting(USUAL_SHIFT * size, USUAL_LENGTH * size, draws=USUAL_DRAWS)
 
 
@@ -102,7 +102,7 @@ class PlacesEntry(FileSchema):
 
 
 class ViewEntry(FileSchema):
-    """Where a camera of another file stands; what else is said of it does not matter."""
+    """The camera pose of a view in another file; other entries are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -122,11 +122,11 @@ class Place:
     """A place of a camera."""
 
     T_base_camera: RigidTransform
-    name: str = ""  # that of a list
-    fixed: bool = False  # it is not moved any more
+    name: str = ""  # in the list of places
+    fixed: bool = False  # not optimised
 
     def is_inside(self, bounds: Array | None) -> bool:
-        """Say whether a camera stands within bounds (3, 2) [m]."""
+        """Whether the camera is within bounds (3, 2) [m]."""
         if bounds is None:
             return True
         x = self.T_base_camera.translation
@@ -143,25 +143,25 @@ def read_places(path: Path, machine: Machine) -> list[Place]:
         views = validate(ViewsEntry, document, path).views
         return [Place(v.T_base_camera.motion(), name, fixed=True) for name, v in views.items()]
     entry = validate(PlacesEntry, document, path)
-    points, found = all_points(machine, [machine.home]), []
+    points, places = all_points(machine, [machine.home]), []
     for name, place in entry.places.items():
         position = np.array(place.xyz)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         T = look_at(position, middle)
         if place.quat_xyzw is not None:
-            turned = Rotation.from_quat(place.quat_xyzw)
-            T = RigidTransform.from_components(position, turned)
-        found.append(Place(T, name, fixed=True))
-    return found
+            rotation = Rotation.from_quat(place.quat_xyzw)
+            T = RigidTransform.from_components(position, rotation)
+        places.append(Place(T, name, fixed=True))
+    return places
 
 
 def _document(path: Path) -> dict[str, Any]:
-    """Return what a YAML or JSON file holds."""
+    """Contents of a YAML or JSON file."""
     try:
-        found = read_json(path)  # a result is JSON, and long
+        document = read_json(path)  # a result is JSON, and long
     except (OSError, ValueError):
-        found = None
-    return found if isinstance(found, dict) else read_yaml(path, "places file")
+        document = None
+    return document if isinstance(document, dict) else read_yaml(path, "places file")
 
 
 def places_around(
@@ -172,48 +172,50 @@ def places_around(
     bounds: Array | None,  # (3, 2) lowest and highest coordinates in the base link [m]
 ) -> list[Place]:
     """Return places all around a machine. Raises NotVisible if there are none."""
-    up, found = machine.upward, []
-    for lift in _LIFTS if machine.spatial else _LIFTS_PLANAR:
-        for turn in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False):
-            found += places_along(direction_above(up, turn, lift), points, camera, setting)
-    start = f"{machine.yaml_path}: no camera could be placed: found"
-    if not found:
+    up, places = machine.upward, []
+    for lift in _ELEVATIONS if machine.spatial else _ELEVATIONS_PLANAR:
+        for turn in np.linspace(0.0, 2.0 * np.pi, _N_AZIMUTHS, endpoint=False):
+            places += places_along(direction_above(up, turn, lift), points, camera, setting)
+    start = f"{machine.yaml_path}: no camera could be placed:"
+    if not places:
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
         raise NotVisible(
-            f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
-            f"of it in the picture, tripods set to {1e2 * setting.shift:.2g} cm and "
-            f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
-            "correct the focal length in its file, or name --places."
+            f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine has all of "
+            f"it in the picture for tripods within {1e2 * setting.shift:.2g} cm and "
+            f"{np.degrees(setting.turn):g} deg; use a camera with a wider view, correct the focal "
+            "length in its file, or give --places."
         )
     if bounds is None:
-        return found
-    inside = [place for place in found if place.is_inside(bounds)]
-    if len(inside) < _TURNS:  # a box between those places
+        return places
+    inside = [place for place in places if place.is_inside(bounds)]
+    if len(inside) < _N_AZIMUTHS:  # a box between those places
         inside += _places_in(bounds, points, camera, setting)
     if not inside:
-        where = np.array([place.T_base_camera.translation for place in found])
+        positions = np.array([place.T_base_camera.translation for place in places])
         _, distance, least = _distances(bounds.mean(axis=1), points, camera, setting)
-        where_to = " that reach one"
+        direction = " that reach one"
         if distance > _FARTHER * least:
-            where_to = ", nearer to the machine"
+            direction = ", nearer to the machine"
         elif distance < min(_NEARER) * least:
-            where_to = ", farther from the machine"
+            direction = ", farther from the machine"
         spans = [
             f"{name} {low:.2f} to {high:.2f}"
-            for name, low, high in zip("xyz", where.min(axis=0), where.max(axis=0), strict=True)
+            for name, low, high in zip(
+                "xyz", positions.min(axis=0), positions.max(axis=0), strict=True
+            )
         ]
         raise NotVisible(
-            f"{start} no place inside --bounds that shows most of it, near enough, needed one; "
-            f"places around the machine have {', '.join(spans)} m: give wider bounds{where_to}, or "
-            "a camera with another view."
+            f"{start} no place inside --bounds shows most of the machine large enough; "
+            f"places around the machine have {', '.join(spans)} m: give wider bounds{direction}, "
+            "or a camera with another view."
         )
     return inside
 
 
 def places_along(toward: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
-    """Return the places in a direction from where all, or most, points are in the picture."""
+    """Return the places in a direction with all, or most, points in the picture."""
     target, size, reach = _extent(toward, points)
-    distance = _distance_of_all(toward, points, camera, setting)
+    distance = _distance_to_frame_all(toward, points, camera, setting)
     return [
         Place(look_at(target + d * toward, target))
         for d in distance * np.array(_NEARER)
@@ -222,38 +224,38 @@ def places_along(toward: Array, points: Array, camera: Camera, setting: Setting)
 
 
 def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
-    """Return places all over a box, from where all, or most, points are in the picture."""
+    """Places all over a box with all, or most, points in the picture."""
     grid = np.meshgrid(*(np.linspace(low, high, _ACROSS) for low, high in bounds))
-    found = []
+    places = []
     for position in np.stack(grid, axis=-1).reshape(-1, 3):
         toward, d, distance = _distances(position, points, camera, setting)
         target, size, reach = _extent(toward, points)
         if d - reach >= _CLEARANCE * size and min(_NEARER) <= d / distance <= _FARTHER:
-            found.append(Place(look_at(position, target)))
-    return found
+            places.append(Place(look_at(position, target)))
+    return places
 
 
 def _distances(
     position: Array, points: Array, camera: Camera, setting: Setting
 ) -> tuple[Array, float, float]:
-    """Return the direction of a position from points, how far it is, and from how far all show.
+    """Direction of a position from points, its distance, and the distance that frames all points.
 
-    Distances are those from the middle of the points [m].
+    Distances are from the centre of the points [m].
     """
-    away = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
-    d = max(float(np.linalg.norm(away)), _ROUNDING)
-    return away / d, d, _distance_of_all(away / d, points, camera, setting)
+    offset = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
+    d = max(float(np.linalg.norm(offset)), _ROUNDING)
+    return offset / d, d, _distance_to_frame_all(offset / d, points, camera, setting)
 
 
 def _extent(toward: Array, points: Array) -> tuple[Array, float, float]:
-    """Return the middle of points, their size, and how far they reach in a direction [m]."""
+    """Centre of points, their size, and their extent in a direction [m]."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     return target, size, float(((points - target) @ toward).max())
 
 
-def _distance_of_all(toward: Array, points: Array, camera: Camera, setting: Setting) -> float:
-    """Return from how far all points are in the picture [m], infinity if from nowhere."""
+def _distance_to_frame_all(toward: Array, points: Array, camera: Camera, setting: Setting) -> float:
+    """Distance from which all points are in the picture [m], infinite if there is none."""
     target, size, reach = _extent(toward, points)
     for distance in _DISTANCES * size:
         nearest = distance - reach
@@ -266,35 +268,35 @@ def _distance_of_all(toward: Array, points: Array, camera: Camera, setting: Sett
 
 
 def parse_bounds(text: str) -> Array:
-    """Return bounds (3, 2) [m] of a text ``-2:2,-2:2,0:1.5``."""
+    """Parse bounds (3, 2) [m] from a text ``-2:2,-2:2,0:1.5``."""
     parts = [part.split(":") for part in text.split(",")]
     if len(parts) != 3 or any(len(part) != 2 for part in parts):
         raise UsageError(
             f"--bounds could not be used: found '{text}', needed lowest and highest x, y and z of "
             "the camera in the base link; write them like -2m:2m,-2m:2m,0m:1.5m."
         )
-    found = np.array([[_coordinate(x.strip()) for x in part] for part in parts])
-    if np.any(found[:, 0] >= found[:, 1]):
+    bounds = np.array([[_coordinate(x.strip()) for x in part] for part in parts])
+    if np.any(bounds[:, 0] >= bounds[:, 1]):
         raise UsageError(
             f"--bounds could not be used: found '{text}', needed the lower number first in each "
             "pair; exchange them."
         )
-    return found
+    return bounds
 
 
 def _coordinate(text: str) -> float:
-    """Return a coordinate [m], which may be negative."""
+    """Parse a coordinate [m], which may be negative."""
     size = parse_quantity(text.removeprefix("-"), LENGTH, "--bounds")
     return -size if text.startswith("-") else size
 
 
 def near(place: Place, target: Array, step: float, rng: np.random.Generator) -> Place:
-    """Return a place that stands a little elsewhere and looks at the machine."""
+    """Draw a place nearby that looks at the machine; a fixed one stays."""
     if place.fixed:
         return place
     position = place.T_base_camera.translation
-    away = np.linalg.norm(position - target)
-    return Place(look_at(position + step * away * rng.normal(size=3), target))
+    distance = np.linalg.norm(position - target)
+    return Place(look_at(position + step * distance * rng.normal(size=3), target))
 
 
 def all_points(machine: Machine, poses: Sequence[RigidTransform]) -> Array:

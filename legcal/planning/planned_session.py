@@ -1,4 +1,4 @@
-"""A planned session: what is to be shot, and what to expect of it."""
+"""A planned session: camera places, poses, and expected errors."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from legcal.vision.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class PlannedView:
-    """A camera place and the images that are to be taken from it."""
+    """A camera place and the images to take from it."""
 
     name: str
     T_base_camera: RigidTransform
-    poses: Configurations  # in the order in which they are to be taken
-    via: tuple[str, ...]  # where to go before each pose: "" straight there, home, or the number
-    # of an earlier pose of the session, from 1
-    seen: Seen  # of the nominal machine, from the very place
+    poses: Configurations  # in the order to take them
+    via: tuple[str, ...]  # intermediate pose before each: "" for none, home, or the 1-based number
+    # of an earlier pose of the session
+    seen: Seen  # of the nominal machine, from the nominal place
 
     @property
     def shows(self) -> BoolArray:
@@ -45,9 +45,9 @@ class PlannedView:
 
 
 def pose_labels(n_images: int, n_given: int = 0) -> list[str]:
-    """Return the labels of the poses of a session, in the order in which they are taken.
+    """Return labels of the poses of a session, in the order to take them.
 
-    Those that it adds to come before: the same label would mean the same pose.
+    Numbers continue those of the given session, since the same label means the same pose.
     """
     width = max(2, len(str(n_given + n_images)))
     return [f"p{k + 1:0{width}d}" for k in range(n_given, n_given + n_images)]
@@ -63,23 +63,23 @@ class Plan:
     machine : Machine
         The nominal model.
     camera : Camera
-        The camera that was planned with.
+        The camera.
     views : tuple of PlannedView
-        Camera places, each with its poses. Of a camera in the hand every image is a view.
+        Camera places, each with its poses. Of a hand-held camera every image is a view.
     goal : Goal
-        What was made small.
+        The minimised quantity.
     value : float
         The criterion of the session as planned [m; the determinant's root without a unit].
     error : PlatformError or None
         Expected error of the platform over the workspace, one standard deviation: the root mean
-        square over the draws; None where readings do not give its pose.
+        square over the draws; None if readings do not determine its pose.
     sigma : (p,) array
         Expected standard deviation of each kinematic parameter [m, rad].
     growth : (n, 2) array
-        Numbers of images, and the criterion with so many, in the order in which they help most;
-        beyond those planned as it goes on if more of their kind are taken.
+        Numbers of images, and the criterion with that many, most useful images first; beyond the
+        planned number, with copies of the planned images.
     limits : dict
-        By what errors a plan of any size is limited: the criterion [m] if each were not there.
+        Sources of error that limit a plan: the criterion [m] without each of them.
     """
 
     machine: Machine
@@ -99,8 +99,8 @@ class Plan:
     seed: int = 0
     board: LaidBoard | None = None  # on the base, in every image
     hand_held: bool = False
-    given: str = ""  # the dataset that it adds to
-    n_given: int = 0  # its photographs
+    given: str = ""  # the dataset that the plan extends
+    n_given: int = 0  # number of its photographs
     notes: tuple[str, ...] = ()
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
@@ -111,14 +111,14 @@ class Plan:
 
     @property
     def labels(self) -> list[str]:
-        """Labels of the poses, in the order in which they are taken."""
+        """Labels of the poses, in the order to take them."""
         return pose_labels(self.n_images, self.n_given)
 
     @property
     def sentence(self) -> str:
-        """What is expected, in words."""
+        """The expected error, in words."""
         if self.error is None:
-            return "The error of the platform is not predicted: readings do not give its pose."
+            return "The error of the platform is not predicted: readings do not determine its pose."
         beside = f" beside those of {self.given}" if self.given else ""
         most = f", at most {1e3 * self.error.max_displacement:.3f} mm" * (self.goal is Goal.WORST)
         return (
@@ -195,7 +195,7 @@ class ExpectedError(Document):
 
 
 class Tolerance(Document):
-    """How far a session may be from its plan, and the machine from its model, at most."""
+    """Tolerances of the session and of the machine."""
 
     camera_m: Annotated[Number, Field(ge=0.0)]
     camera_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
@@ -265,6 +265,6 @@ class PlanDocument(Document):
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:
-    """Return how many images from how many places, in words."""
+    """Describe the numbers of images and places."""
     n = sum(len(view.poses.poses) for view in views)
     return f"{n} photographs from {len(views)} place{'s' * (len(views) != 1)}"

@@ -1,9 +1,9 @@
-"""The method: poses, camera places, images chosen and exchanged, polished, judged.
+"""The method: candidate poses and places, selection of images, local search, evaluation.
 
-:func:`plan_session` reads from the top. Poses that the machine can take and places of cameras are
-drawn, places chosen by what they show on average, images chosen greedily and exchanged,
-then places and poses polished by exchanges with others nearby. What is expected is judged by
-sessions as they will be, with tripods and machine a little elsewhere.
+:func:`plan_session` is the method from top to bottom. Feasible poses and camera places are drawn,
+places selected by their mean information, images selected greedily and exchanged, then places and
+poses refined by local search. The expected errors are the mean over random sessions, with tripods
+and machine within their tolerances.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ from legcal.workers import Run, in_turn
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
 N_PROBES = 12  # poses by which places are compared
 N_BOARD_PROBES = 4  # poses by which places of a board are compared
-FAR = 3.0  # sizes of the machine, from where that is looked at
-N_HANDS = 10  # places that a camera in the hand chooses from
-MIN_SHARE = 0.5  # of its equal share that each view has of the images, at least
-ROUNDS = 3  # of polishing, each with half the steps of the one before
+FAR = 3.0  # distance for this comparison, in sizes of the machine
+N_HANDS = 10  # candidate places of a hand-held camera
+MIN_SHARE = 0.5  # least number of images of a view, over an equal share
+ROUNDS = 3  # of local search, each with half the step of the one before
 POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
-# Mean leg lengths: a session that leaves more, and more than the model, is refused
+# Mean leg lengths: a session with a larger error, also above the model's, is refused
 _LEAST_ERROR = 0.0025
-_CONTINUED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # times the planned images
-_MOST_NEEDED = 100  # images that are looked at to say how many would do
+_EXTRAPOLATED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # multiples of the planned images
+_MOST_NEEDED = 100  # images, in the search for a sufficient number
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +81,12 @@ class Task:
     named: tuple[str, ...] = ()  # parameters
     bounds: Array | None = None  # (3, 2) of cameras in the base link [m]
     places: tuple[Place, ...] = ()  # in place of those around the machine
-    given: tuple[Candidates, ...] = ()  # what was shot already
+    given: tuple[Candidates, ...] = ()  # existing images
     given_name: str = ""
     board: Board | None = None
     hand_held: bool = False
     seed: int = 0
-    laid: LaidBoard | None = None  # the board in its place, once that is chosen
+    laid: LaidBoard | None = None  # the board at its selected place
 
     @property
     def machine(self) -> Machine:
@@ -95,13 +95,13 @@ class Task:
 
     @property
     def n_given(self) -> int:
-        """Number of images that were shot already."""
-        return sum(len(one.poses.poses) for one in self.given)
+        """Number of existing images."""
+        return sum(len(view.poses.poses) for view in self.given)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The nominal machine, or one that is drawn, before cameras."""
+    """A machine, nominal or within tolerance, in front of cameras."""
 
     task: Task
     legs: tuple[Leg, ...]  # in R_b and R_e
@@ -113,11 +113,11 @@ class Scene:
 
     @classmethod
     def drawn(cls, task: Task, rng: np.random.Generator) -> Scene:
-        """Return a machine as it may be."""
+        """Draw a machine within tolerance."""
         return cls(task, drawn_legs(task.predictor.legs, task.setting, rng))
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
-        """Return what a camera sees at poses T_Rb_Re; *surely*: wherever the tripod is set."""
+        """Return the parts visible at poses T_Rb_Re; *surely*: for all tripods in tolerance."""
         bodies = Bodies.at(self.task.machine, self.legs, poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
@@ -131,7 +131,7 @@ class Scene:
         surely: bool,
         is_read: bool = True,
     ) -> BoolArray:
-        """Return which images show the board, (n_images,); all of them where there is none."""
+        """Return a mask of images that show the board, (n_images,); all without a board."""
         laid, camera = self.task.laid, self.task.predictor.camera
         if laid is None:
             return np.ones(len(poses), dtype=np.bool_)
@@ -139,16 +139,16 @@ class Scene:
         margin = self._margin(T, laid.corners) if surely else 0.0
         return laid.is_shown(camera, T, bodies, margin, is_read=is_read)
 
-    def showing(self, own: Candidates) -> Candidates:
-        """Return the candidates whose images show the board, the same if all do."""
-        poses = platforms_in_base(self.task.machine, own.poses.poses)
-        shown = self.board_is_shown(own.place.T_base_camera, poses, surely=True)
+    def showing(self, candidates: Candidates) -> Candidates:
+        """Select the candidates that show the board; the same object if all do."""
+        poses = platforms_in_base(self.task.machine, candidates.poses.poses)
+        shown = self.board_is_shown(candidates.place.T_base_camera, poses, surely=True)
         if shown.all():
-            return own
-        return replace(own, poses=some_of(own.poses, np.flatnonzero(shown).tolist()))
+            return candidates
+        return replace(candidates, poses=some_of(candidates.poses, np.flatnonzero(shown).tolist()))
 
     def _margin(self, T: RigidTransform, points: Array) -> float:
-        """Return how far in the picture points (n, 3) in the base link move at most [px]."""
+        """Largest image shift of points (n, 3) in the base link within tolerance [px]."""
         nearest = float(T.inv().apply(points)[:, 2].min())
         return self.task.setting.margin(self.task.predictor.camera, max(nearest, 0.1))
 
@@ -161,9 +161,9 @@ class Scene:
         is_shot: bool = False,
         is_fit: bool = False,
     ) -> Contributions | None:
-        """Return what images of poses T_Rb_Re add; None if they show nothing.
+        """Return the information of images at poses T_Rb_Re; None if they show nothing.
 
-        An image without the board adds nothing, unless it was shot already.
+        An image without the board has no information, unless it exists already.
         """
         seen, n = self.seen(T, poses, surely=surely), len(poses)
         with_board = is_shot or self.board_is_shown(T, poses, surely=surely)
@@ -171,37 +171,43 @@ class Scene:
             return None
         outlines = seen.outlines(1.0, np.arange(n, dtype=np.intp))
         view = np.zeros(n, dtype=np.intp)
-        found = self.task.predictor.contributions(
+        added = self.task.predictor.contributions(
             {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit
         )
         if self.task.board is not None:
-            found = _tied_by_board(found, T)
-            found = replace(found, rows=found.rows * np.reshape(with_board, (-1, 1, 1)))
+            added = _tied_by_board(added, T)
+            added = replace(added, rows=added.rows * np.reshape(with_board, (-1, 1, 1)))
         if self.task.hand_held:  # one series of images of one camera
-            found = replace(found, names=tuple(n.replace("here: ", "hand ") for n in found.names))
-        return found
+            added = replace(added, names=tuple(n.replace("here: ", "hand ") for n in added.names))
+        return added
 
     def of(self, candidates: Candidates, *, is_shot: bool = False) -> Contributions | None:
-        """Return what images of candidates add."""
+        """Return the information of the images of candidates."""
         poses = platforms_in_base(self.task.machine, candidates.poses.poses)
         return self.contributions(candidates.place.T_base_camera, poses, is_shot=is_shot)
 
 
-def _tied_by_board(found: Contributions, T_base_camera: RigidTransform) -> Contributions:
-    """Return contributions of a view whose camera a board on the base places.
+def _tied_by_board(contributions: Contributions, T_base_camera: RigidTransform) -> Contributions:
+    """Replace the camera pose of a view by the pose of a board on the base.
 
-    What the board shows of where cameras stand to it counts as exact: cameras move with it alone,
-    each turned and displaced as its own frame sees that.
+    Camera poses relative to the board count as exact, so that all cameras share the six unknowns
+    of the board.
     """
     R = T_base_camera.rotation.as_matrix().T
-    at = [found.names.index(f"here: pose {k}") for k in range(6)]
-    turned = block_diag(R, R)
-    rows, prior, names = found.rows.copy(), found.prior.copy(), list(found.names)
-    rows[..., at] = rows[..., at] @ turned
-    prior[np.ix_(at, at)] = turned.T @ prior[np.ix_(at, at)] @ turned
-    for k, i in enumerate(at):
+    camera_columns = [contributions.names.index(f"here: pose {k}") for k in range(6)]
+    rotation = block_diag(R, R)
+    rows, prior, names = (
+        contributions.rows.copy(),
+        contributions.prior.copy(),
+        list(contributions.names),
+    )
+    rows[..., camera_columns] = rows[..., camera_columns] @ rotation
+    prior[np.ix_(camera_columns, camera_columns)] = (
+        rotation.T @ prior[np.ix_(camera_columns, camera_columns)] @ rotation
+    )
+    for k, i in enumerate(camera_columns):
         names[i] = f"board {k}"
-    return replace(found, rows=rows, prior=prior, names=tuple(names))
+    return replace(contributions, rows=rows, prior=prior, names=tuple(names))
 
 
 def plan_session(
@@ -210,11 +216,11 @@ def plan_session(
     stop: Callable[[], bool] = lambda: False,
     run: Run = in_turn,
 ) -> Plan:
-    """Return the plan of a session.
+    """Plan a session.
 
-    Its steps look at the nominal machine before cameras where they are planned. A round of steps
-    is kept where the mean over machines and tripods as they may be is better. What places show, and
-    these draws, are worked out by *run*; plans do not depend on it.
+    The search uses the nominal machine and nominal camera places. A round of local search is kept
+    if the mean over random machines and tripods within tolerance improves. Information of places
+    and these draws are computed by *run*; the plan does not depend on it.
 
     Raises DidNotConverge, NotVisible or NotIdentifiable if there are no poses, no places, or too
     few images.
@@ -224,12 +230,12 @@ def plan_session(
     poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
     task = _with_laid_board(task, poses)
     scene = Scene.nominal(task)
-    shown = _probed(scene, _places(task, poses), poses, rng, progress, run)
-    before = [scene.of(one, is_shot=True) for one in task.given]
+    shown = _visible_places(scene, _places(task, poses), poses, rng, progress, run)
+    before = [scene.of(candidates, is_shot=True) for candidates in task.given]
     work, basis = workspace_of(machine, legs), shown[0][1].basis
     search = _Search(
         scene,
-        [found for found in before if found is not None],
+        [contributions for contributions in before if contributions is not None],
         work,
         basis,
         criterion_of(task.goal, work, legs, basis, task.named),
@@ -248,20 +254,20 @@ def plan_session(
         step = 0.5**turn
         placed = search.better_places(current, step, middle)
         polished, reached = search.better_poses(placed, step, least)
-        there = search.expected_covariance(polished)
-        if search.value_of(there) < search.value_of(expected):
-            current, value, expected = polished, reached, there
+        polished_covariance = search.expected_covariance(polished)
+        if search.value_of(polished_covariance) < search.value_of(expected):
+            current, value, expected = polished, reached, polished_covariance
         progress("Polishing", turn + 1, ROUNDS)
     was_stopped = stop()
     plan = search.judged(current, value, expected)
     if was_stopped:
-        note = "The search was stopped: this is the best plan that it had found."
+        note = "The search was stopped early: this is the best plan so far."
         plan = replace(plan, notes=(note, *plan.notes))
     return plan
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
-    """Return the places that cameras may take."""
+    """Candidate camera places."""
     if task.places:
         return list(task.places)
     points = _framed(task, poses)
@@ -269,48 +275,50 @@ def _places(task: Task, poses: Configurations) -> list[Place]:
 
 
 def _framed(task: Task, poses: Configurations) -> Array:
-    """Return what pictures are to show, (n, 3) in the base link [m]: joints, and the board."""
+    """Points to frame in pictures, (n, 3) in the base link [m]: joints, and the board."""
     points = all_points(task.machine, poses.poses)
     return points if task.laid is None else np.concatenate([points, task.laid.corners])
 
 
 def _with_laid_board(task: Task, poses: Configurations) -> Task:
-    """Return the task with its board where most places around the machine see it.
+    """Place the board where most camera places see it.
 
     Raises NotVisible if none does.
     """
     if task.board is None:
         return task
-    some = np.linspace(0, len(poses.poses) - 1, min(N_BOARD_PROBES, len(poses.poses))).astype(int)
-    in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in some])
+    probes = np.linspace(0, len(poses.poses) - 1, min(N_BOARD_PROBES, len(poses.poses))).astype(int)
+    in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in probes])
     places = [place.T_base_camera for place in _places(task, poses)]
-    if not task.places:  # wherever the board is, they can go back until it is in the picture
+    if not task.places:  # cameras can move back until the board is in the picture
         points = all_points(task.machine, poses.poses)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        away = np.array([T.translation - middle for T in places])
-        away = np.unique((away / np.linalg.norm(away, axis=1)[:, None]).round(6), axis=0)
-        away *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
-        places = [look_at(middle + step, middle) for step in away]
+        directions = np.array([T.translation - middle for T in places])
+        directions = np.unique(
+            (directions / np.linalg.norm(directions, axis=1)[:, None]).round(6), axis=0
+        )
+        directions *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
+        places = [look_at(middle + step, middle) for step in directions]
     best, most = task, 0.0
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
         scene = Scene.nominal(trial)
-        of_all = [
+        is_shown = [
             scene.board_is_shown(T, in_Rb, surely=False, is_read=bool(task.places)) for T in places
         ]
-        share = np.mean(of_all)
+        share = np.mean(is_shown)
         if share > most:
             best, most = trial, float(share)
     if not most:
         raise NotVisible(
-            f"{task.machine.yaml_path}: no session could be planned: found no place of the board "
-            "flat on the base that a camera sees beside the legs wherever it is set, needed one; "
+            f"{task.machine.yaml_path}: no session could be planned: no camera sees the board flat "
+            "on the base, at any place beside or between the legs; "
             "use another board, higher --places, wider --bounds, or a camera with a wider view."
         )
     return best
 
 
-def _probed(
+def _visible_places(
     scene: Scene,
     places: Sequence[Place],
     poses: Configurations,
@@ -318,23 +326,23 @@ def _probed(
     progress: Report,
     run: Run,
 ) -> list[tuple[Place, Contributions]]:
-    """Return the places that see legs, with what they show of some poses."""
-    machine, found = scene.task.machine, []
+    """Return the camera places that see legs, with the information of a few poses."""
+    machine, visible = scene.task.machine, []
     probes = np.sort(rng.permutation(len(poses.poses))[:N_PROBES]).tolist()
     in_Rb = platforms_in_base(machine, [poses.poses[i] for i in probes])
-    of_places = run(
+    contributions_of_places = run(
         partial(scene.contributions, poses=in_Rb), [place.T_base_camera for place in places]
     )
-    for k, (place, contributions) in enumerate(zip(places, of_places, strict=True)):
+    for k, (place, contributions) in enumerate(zip(places, contributions_of_places, strict=True)):
         if contributions is not None:
-            found.append((place, contributions))
+            visible.append((place, contributions))
         progress("Camera places", k + 1, len(places))
-    needed = 1 if scene.task.hand_held else scene.task.n_views
-    if not found or (scene.task.places and len(found) < needed):
-        used = {id(place) for place, _ in found}
+    n_needed = 1 if scene.task.hand_held else scene.task.n_views
+    if not visible or (scene.task.places and len(visible) < n_needed):
+        used = {id(place) for place, _ in visible}
         blind = [place for place in places if id(place) not in used]
-        raise NotVisible(_unseen(scene, blind, len(places), needed, in_Rb))
-    return found
+        raise NotVisible(_no_visible_places(scene, blind, len(places), n_needed, in_Rb))
+    return visible
 
 
 _REMEDIES = {
@@ -347,29 +355,29 @@ _REMEDIES = {
 }
 
 
-def _unseen(
+def _no_visible_places(
     scene: Scene,
     blind: Sequence[Place],
     n_places: int,
     needed: int,
     poses: Sequence[RigidTransform],
 ) -> str:
-    """Return that too few places see legs, and the remedy for what most of the others lack."""
+    """Describe that too few places see legs, with the remedy for the most frequent cause."""
     setting = scene.task.setting
     board = "" if scene.task.board is None else " and the board"
-    causes = [_why_unseen(scene, place.T_base_camera, poses) for place in blind]
+    causes = [_cause_of_invisibility(scene, place.T_base_camera, poses) for place in blind]
     remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
     names = ", ".join(place.name for place in blind if place.name)
     return (
-        f"{scene.task.machine.yaml_path}: no session could be planned: found "
-        f"{n_places - len(blind)} of {n_places} camera places that see legs{board} wherever the "
-        f"tripod is set within {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg, "
-        f"needed {needed}; {remedy.format(names or 'the places')}."
+        f"{scene.task.machine.yaml_path}: no session could be planned: {n_places - len(blind)} of "
+        f"{n_places} camera places see legs{board} for every tripod within "
+        f"{1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg, needed {needed}; "
+        f"{remedy.format(names or 'the places')}."
     )
 
 
-def _why_unseen(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
-    """Return why a camera sees no legs, or no board, at poses T_Rb_Re, a key of the remedies."""
+def _cause_of_invisibility(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
+    """Cause why a camera sees no legs, or no board, at poses T_Rb_Re: a key of the remedies."""
     camera = scene.task.predictor.camera
     if len(scene.seen(T, poses, surely=True).leg):  # the board alone is missing
         is_in_view = scene.board_is_shown(T, poses, surely=True, is_read=False).any()
@@ -394,34 +402,36 @@ def choose_places(
     criterion: Criterion,
     given: Sequence[Contributions] = (),
 ) -> list[int]:
-    """Return the places whose images, on average, determine the machine best together."""
+    """Select the places whose images, on average, determine the machine best jointly."""
     names: dict[str, int] = {}
-    for found in (*shown, *given):
-        for name in found.names:
+    for contributions in (*shown, *given):
+        for name in contributions.names:
             if ": " not in name:
                 names.setdefault(name, len(names))
     shared = np.zeros((len(shown) + len(given), len(names), len(names)))
     prior = np.zeros((len(names), len(names)))
-    for k, found in enumerate((*shown, *given)):
-        is_own = np.array([": " in name for name in found.names])
-        at = np.array([names[name] for name in found.names if ": " not in name])
-        stacked = found.all_gains().reshape(-1, len(found.names))
-        share = n_images / n_views / len(found.rows) if k < len(shown) else 1.0
+    for k, contributions in enumerate((*shown, *given)):
+        is_of_view = np.array([": " in name for name in contributions.names])
+        columns = np.array([names[name] for name in contributions.names if ": " not in name])
+        stacked = contributions.all_gains().reshape(-1, len(contributions.names))
+        share = n_images / n_views / len(contributions.rows) if k < len(shown) else 1.0
         G = stacked.T @ stacked * share
-        own = G[np.ix_(is_own, is_own)] + found.prior[np.ix_(is_own, is_own)]
-        mixed = G[np.ix_(is_own, ~is_own)]
-        G = G[np.ix_(~is_own, ~is_own)] - mixed.T @ np.linalg.solve(own, mixed)
-        shared[k][np.ix_(at, at)] = G
-        prior[np.ix_(at, at)] = found.prior[np.ix_(~is_own, ~is_own)]
-    p, free = shown[0].basis.shape[1], shared[: len(shown)]
+        own_information = (
+            G[np.ix_(is_of_view, is_of_view)] + contributions.prior[np.ix_(is_of_view, is_of_view)]
+        )
+        mixed = G[np.ix_(is_of_view, ~is_of_view)]
+        G = G[np.ix_(~is_of_view, ~is_of_view)] - mixed.T @ np.linalg.solve(own_information, mixed)
+        shared[k][np.ix_(columns, columns)] = G
+        prior[np.ix_(columns, columns)] = contributions.prior[np.ix_(~is_of_view, ~is_of_view)]
+    p, free_places = shown[0].basis.shape[1], shared[: len(shown)]
     base = prior + shared[len(shown) :].sum(axis=0)
 
     def values(others: Sequence[int]) -> Array:
-        inverse = np.linalg.inv(base + free[list(others)].sum(axis=0) + free)
-        of_each = criterion(np.asarray(inverse[:, :p, :p], dtype=np.float64))
-        if n_views <= len(free):
-            of_each[list(others)] = np.inf
-        return of_each
+        inverse = np.linalg.inv(base + free_places[list(others)].sum(axis=0) + free_places)
+        criteria = criterion(np.asarray(inverse[:, :p, :p], dtype=np.float64))
+        if n_views <= len(free_places):
+            criteria[list(others)] = np.inf
+        return criteria
 
     chosen: list[int] = []
     while len(chosen) < n_views:
@@ -430,30 +440,30 @@ def choose_places(
         before = list(chosen)
         for i in range(n_views):
             others = chosen[:i] + chosen[i + 1 :]
-            of_each = values(others)
-            if of_each.min() < of_each[chosen[i]]:
-                chosen[i] = int(np.argmin(of_each))
+            criteria = values(others)
+            if criteria.min() < criteria[chosen[i]]:
+                chosen[i] = int(np.argmin(criteria))
         if chosen == before:
             return chosen
 
 
-def _of_images(current: Sequence[Candidates], images: Chosen) -> list[Candidates]:
-    """Return the places with the poses that were chosen, places without any left out."""
-    of_slot = [[k for s, k in images.images if s == v] for v in range(len(current))]
+def _selected_candidates(current: Sequence[Candidates], images: Chosen) -> list[Candidates]:
+    """Return the selected poses by place; places without any are dropped."""
+    images_of_slot = [[k for s, k in images.images if s == v] for v in range(len(current))]
     return [
-        replace(own, poses=some_of(own.poses, which))
-        for own, which in zip(current, of_slot, strict=True)
+        replace(candidates, poses=some_of(candidates.poses, which))
+        for candidates, which in zip(current, images_of_slot, strict=True)
         if which
     ]
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search for a session, and what each of its steps needs."""
+    """The search for a session."""
 
     scene: Scene  # the nominal machine
-    given: Sequence[Contributions]  # of images that were shot already
-    work: Workspace | None  # None where readings give no pose
+    given: Sequence[Contributions]  # of existing images
+    work: Workspace | None  # None if readings do not determine the pose
     basis: Array  # of the coordinates of the machine
     criterion: Criterion
     rng: np.random.Generator
@@ -463,11 +473,11 @@ class _Search:
 
     @property
     def task(self) -> Task:
-        """What is asked."""
+        """The planning task."""
         return self.scene.task
 
     def added(self, candidates: Sequence[Candidates]) -> list[Contributions]:
-        """Return what images of candidates add, all of which see legs."""
+        """Return the information of candidates, all of which see legs."""
         return [one for one in self.run(self.scene.of, candidates) if one is not None]
 
     def with_all(self, slots: Sequence[Contributions]) -> Session:
@@ -481,20 +491,20 @@ class _Search:
     def chosen(
         self, shown: Sequence[tuple[Place, Contributions]], poses: Configurations
     ) -> tuple[list[Candidates], int, float]:
-        """Return places and poses to begin with, the least images of each, and the criterion.
+        """Select the first places and poses; return the least images of each, and the criterion.
 
         Raises NotVisible or NotIdentifiable if the images are too few.
         """
         task, machine = self.task, self.task.machine
         n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
-        of_places = [contributions for _, contributions in shown]
-        chosen = choose_places(of_places, n_places, task.n_images, self.criterion, self.given)
+        contributions = [contributions for _, contributions in shown]
+        chosen = choose_places(contributions, n_places, task.n_images, self.criterion, self.given)
         current = [self.scene.showing(Candidates(shown[i][0], poses)) for i in chosen]
-        count = [len(own.poses.poses) for own in current]
+        count = [len(candidates.poses.poses) for candidates in current]
         if sum(count) < task.n_images:
             raise NotVisible(
-                f"{machine.yaml_path}: no session could be planned: found {sum(count)} images from "
-                f"{len(current)} places that show legs and the board, needed {task.n_images}; plan "
+                f"{machine.yaml_path}: no session could be planned: only {sum(count)} images from "
+                f"{len(current)} places show legs and the board, needed {task.n_images}; plan "
                 "fewer --images, more --cameras, or a board of another size."
             )
         least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
@@ -509,84 +519,92 @@ class _Search:
             progress=self.progress, stop=self.stop,
         )  # fmt: skip
         self._refuse_undetermined(session)
-        return _of_images(current, images), least, images.value
+        return _selected_candidates(current, images), least, images.value
 
     def _refuse_undetermined(self, session: Session) -> None:
-        """Refuse a session that leaves a direction open that matters; say how many images do."""
+        """Refuse a session that does not improve the model; state a sufficient number of images."""
         task, work, basis = self.task, self.work, self.basis
-        most = max(task.setting.length, _LEAST_ERROR * task.machine.size)
+        limit = max(task.setting.length, _LEAST_ERROR * task.machine.size)
 
-        def off(S: Array) -> Array:
-            """Return the error of the platform, or the criterion where readings give no pose."""
+        def error_of(S: Array) -> Array:
+            """Error of the platform, or the criterion if readings do not determine its pose."""
             if work is None:
                 return self.criterion(S)
-            errors = [work.error(basis @ one @ basis.T).mean_displacement for one in S]
+            errors = [
+                work.error(basis @ covariance @ basis.T).mean_displacement for covariance in S
+            ]
             return np.array(errors)
 
-        if float(off(session.machine[None])[0]) < most:
+        if float(error_of(session.machine[None])[0]) < limit:
             return
         more = choose(
             Session(session.slots, self.given),
             _MOST_NEEDED,
-            off,
+            error_of,
             np.random.default_rng(task.seed),
             0,
             _MOST_NEEDED,
-            is_enough=lambda error: error < most,
+            is_enough=lambda error: error < limit,
         )
         n = max(len(more.images), task.n_images + 1)
         places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
         remedy = (
-            f"plan {n} --images or more" if more.value < most else "plan more --cameras, or --board"
+            f"plan {n} --images or more"
+            if more.value < limit
+            else "plan more --cameras, or --board"
         )
-        needed = f"at least {n}" if more.value < most else "more places"
+        needed = f"at least {n}" if more.value < limit else "more places"
         raise NotIdentifiable(
-            f"{task.machine.yaml_path}: no session could be planned: found {task.n_images} "
-            f"image{'s' * (task.n_images != 1)} from {places}, not enough to know the machine "
-            f"better than its model does, needed {needed}; {remedy}."
+            f"{task.machine.yaml_path}: no session could be planned: {task.n_images} "
+            f"image{'s' * (task.n_images != 1)} from {places} would not improve on the accuracy of "
+            f"the model, needed {needed}; {remedy}."
         )
 
     def better_places(
         self, current: Sequence[Candidates], step: float, target: Array
     ) -> list[Candidates]:
-        """Return the same poses seen from places nearby, where that is better."""
-        current, known = list(current), self.added(current)
-        value = self.value(known)
-        for v, own in enumerate(current):
-            for _ in range(0 if own.place.fixed else N_NEAR_PLACES):
+        """Local search over camera places, poses unchanged."""
+        current, contributions = list(current), self.added(current)
+        value = self.value(contributions)
+        for v, candidates in enumerate(current):
+            for _ in range(0 if candidates.place.fixed else N_NEAR_PLACES):
                 if self.stop():
                     break
                 place = near(current[v].place, target, PLACE_STEP * step, self.rng)
-                trial = replace(own, place=place)
-                found = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
-                if found is None or self.scene.showing(trial) is not trial:
+                trial = replace(candidates, place=place)
+                added = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
+                if added is None or self.scene.showing(trial) is not trial:
                     continue
-                there = self.value([*known[:v], found, *known[v + 1 :]])
-                if there < value:
-                    current[v], known[v], value = trial, found, there
+                trial_value = self.value([*contributions[:v], added, *contributions[v + 1 :]])
+                if trial_value < value:
+                    current[v], contributions[v], value = trial, added, trial_value
         return current
 
     def better_poses(
         self, current: Sequence[Candidates], step: float, least: int
     ) -> tuple[list[Candidates], float]:
-        """Return places and poses after exchanges with poses nearby, and the criterion."""
-        task, far = self.task, POSE_STEP * step
+        """Exchange poses with poses nearby; also return the criterion."""
+        task, spread = self.task, POSE_STEP * step
         widened = []
-        for own in current:
-            poses = own.poses
+        for candidates in current:
+            poses = candidates.poses
             if not self.stop():
                 legs = task.predictor.legs
-                poses = poses_near(task.machine, legs, task.setting, poses, far, self.rng)
-            widened.append(self.scene.showing(replace(own, poses=poses)))
+                poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
+            widened.append(self.scene.showing(replace(candidates, poses=poses)))
         session = Session(self.added(widened), self.given)
-        images = [(v, k) for v, own in enumerate(current) for k in range(len(own.poses.poses))]
+        images = [
+            (v, k)
+            for v, candidates in enumerate(current)
+            for k in range(len(candidates.poses.poses))
+        ]
         for slot, image in images:
             session.changed(slot, image, 1.0)
         session.renewed()
-        better = exchange(
+        exchanged = exchange(
             session, Chosen(images), self.criterion, self.rng, least, len(images), stop=self.stop
         )
-        return _of_images(widened, better), better.value
+        return _selected_candidates(widened, exchanged), exchanged.value
 
     def value_of(self, covariance: Array) -> float:
         """Return the criterion of a covariance (p, p) of the parameters."""
@@ -594,7 +612,7 @@ class _Search:
         return float(self.criterion((inverse @ covariance @ inverse.T)[None])[0])
 
     def expected_covariance(self, current: Sequence[Candidates]) -> Array:
-        """Return the mean covariance (p, p) of the parameters in sessions as they may be."""
+        """Return the mean covariance (p, p) of the parameters over random sessions."""
         n, covariances = self.task.setting.draws, []
         rngs = np.random.default_rng(self.task.seed + 1).spawn(n)
         for drawn in self.run(partial(drawn_covariance, self.task, current), rngs):
@@ -603,29 +621,31 @@ class _Search:
         return np.asarray(np.mean(covariances, axis=0))
 
     def judged(self, current: Sequence[Candidates], value: float, covariance: Array) -> Plan:
-        """Return the plan with what sessions as they may be are expected to give, (p, p)."""
+        """Assemble the plan with the expected *covariance* (p, p) of the parameters."""
         task, predictor, machine = self.task, self.task.predictor, self.task.machine
-        found = self.added(current)
+        contributions = self.added(current)
         ordered, begin = list[Configurations](), machine.home_configuration
-        for own in current:
-            ordered.append(some_of(own.poses, in_short_order(machine, own.poses, begin)))
+        for candidates in current:
+            ordered.append(
+                some_of(candidates.poses, in_short_order(machine, candidates.poses, begin))
+            )
             begin = ordered[-1].configurations[-1]
         via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
-        views, done = [], 0
-        for own, poses in zip(current, ordered, strict=True):
-            of_view = via[done : done + len(poses.poses)]
-            done += len(poses.poses)
-            T, in_Rb = own.place.T_base_camera, platforms_in_base(machine, poses.poses)
+        views, n_done = [], 0
+        for candidates, poses in zip(current, ordered, strict=True):
+            via_of_view = via[n_done : n_done + len(poses.poses)]
+            n_done += len(poses.poses)
+            T, in_Rb = candidates.place.T_base_camera, platforms_in_base(machine, poses.poses)
             seen = self.scene.seen(T, in_Rb, surely=False)
-            views.append(PlannedView(own.place.name, T, poses, of_view, seen))
+            views.append(PlannedView(candidates.place.name, T, poses, via_of_view, seen))
         notes = []
         if blocked:
             notes.append(
-                f"No free way was found to {blocked} of the poses, not even by home: lead the "
-                "machine there by hand, away from singularities and collisions."
+                f"No free path was found to {blocked} of the poses, not even through home: move "
+                "the machine there manually, away from singularities and collisions."
             )
         if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
-            notes.append(f"Readings do not give the pose: {machine.undetermined}.")
+            notes.append(f"Readings do not determine the pose: {machine.undetermined}.")
         parametrization = predictor.legs.parametrization
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         for name in task.named:
@@ -646,8 +666,8 @@ class _Search:
             sigma=sigma,
             names=parametrization.names,
             units=parametrization.units,
-            growth=self._growth(found),
-            limits=_limits(self.with_all(found), self.criterion),
+            growth=self._growth(contributions),
+            limits=_limits(self.with_all(contributions), self.criterion),
             seed=task.seed,
             board=task.laid,
             hand_held=task.hand_held,
@@ -657,19 +677,19 @@ class _Search:
         )
 
     def _growth(self, found: Sequence[Contributions]) -> Array:
-        """Return numbers of images and the criterion with so many, (n, 2), beyond those planned."""
+        """Numbers of images and their criterion, (n, 2), extrapolated beyond the plan."""
         n = sum(len(part.rows) for part in found)
         session = Session(found, self.given)
         order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
         rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
-        for times in _CONTINUED:
+        for times in _EXTRAPOLATED:
             more = [part.repeated(times) for part in found]
             rows.append((round(times * n), self.value(more)))
         return np.array(rows)
 
 
 def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
-    """Return views with the names of their places, or new ones in turn; hand-held ones by pose."""
+    """Name views after their places or by number; hand-held images after their pose."""
     if task.hand_held:
         views = [
             replace(
@@ -686,18 +706,18 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
 
 
 def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:
-    """Return the covariance (p, p) of the parameters in a session as it may be."""
-    there, machine, parts = Scene.drawn(task, rng), task.machine, []
-    for own, is_set in (*((c, False) for c in current), *((c, True) for c in task.given)):
-        nearby = platforms_in_base(machine, own.poses.poses)
+    """Return the covariance (p, p) of the parameters in a random session within tolerance."""
+    scene, machine, parts = Scene.drawn(task, rng), task.machine, []
+    for candidates, is_set in (*((c, False) for c in current), *((c, True) for c in task.given)):
+        nearby = platforms_in_base(machine, candidates.poses.poses)
         poses: Sequence[RigidTransform] = nearby
         if machine.is_determined:
-            poses = poses_at_readings(machine, there.legs, own.poses.readings, nearby)
-        T = own.place.T_base_camera
+            poses = poses_at_readings(machine, scene.legs, candidates.poses.readings, nearby)
+        T = candidates.place.T_base_camera
         T = T if is_set else task.setting.camera_elsewhere(T, rng)
-        found = there.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
-        if found is not None:
-            parts.append(found)
+        added = scene.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
+        if added is not None:
+            parts.append(added)
     session = Session([], parts)
     basis = parts[0].basis
     return np.asarray(basis @ session.fitted() @ basis.T)
@@ -712,17 +732,17 @@ _LIMITS = {
 
 
 def _limits(session: Session, criterion: Criterion) -> dict[str, float]:
-    """Return the criterion if errors of a kind were not there, or images were without end."""
-    found = {}
-    for what, words in _LIMITS.items():
-        known = [
+    """Criterion without each source of error."""
+    criteria = {}
+    for source, words in _LIMITS.items():
+        removed = [
             i for name, i in session.names.items()
             if any(word in name for word in words)
-            and not (what.startswith("intrinsics") and "gamma" in name)
+            and not (source.startswith("intrinsics") and "gamma" in name)
         ]  # fmt: skip
-        if known:
-            left = np.setdiff1d(np.arange(len(session.names)), known)
-            inverse = np.linalg.inv(session.information[np.ix_(left, left)])
+        if removed:
+            remaining = np.setdiff1d(np.arange(len(session.names)), removed)
+            inverse = np.linalg.inv(session.information[np.ix_(remaining, remaining)])
             S = np.asarray(inverse[: session.p, : session.p], dtype=np.float64)
-            found[what] = float(criterion(S[None])[0])
-    return found
+            criteria[source] = float(criterion(S[None])[0])
+    return criteria

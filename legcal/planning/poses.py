@@ -1,4 +1,4 @@
-"""Poses that a session may use: the machine can take them, however far it is off its model."""
+"""Candidate poses of a session: feasible for every machine within tolerance."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from legcal.machine.parameters import is_held_by_default, moved_legs
 from legcal.planning.places import USUAL_LENGTH, Setting
 from legcal.progress import Report, no_progress
 
-N_REACHING = 10  # machines that must reach a pose,
-_WIDER = 1.5  # times as far off as machines may be
-N_NEAR = 3  # poses that are tried near each
-_MIN_SHARE = 0.2  # of the poses that are drawn, to be of use
-_MOST_MOVED = 0.1  # of the length of a leg, by which errors of the machine move a pose
-_CLOSED = 2.5e-7  # mean leg lengths
-_HALF_WAY = 0.5  # least step to a pose nearby
+N_REACHING = 10  # random machines that must reach a pose
+_WIDER = 1.5  # their tolerance, over the stated one
+N_NEAR = 3  # candidates near each pose
+_MIN_SHARE = 0.2  # of the drawn poses, that must be usable
+_MOST_MOVED = 0.1  # leg lengths: largest motion of a pose by errors of the machine
+_CLOSED = 2.5e-7  # mean leg lengths: residual of a reached pose
+_HALF_WAY = 0.5  # least step towards a pose nearby
 
 
 def candidate_poses(
@@ -39,37 +39,37 @@ def candidate_poses(
     rng: np.random.Generator,
     progress: Report = no_progress,
 ) -> Configurations:
-    """Return poses that the machine can take, half of them extreme.
+    """Draw feasible poses, half of them extreme.
 
     Raises DidNotConverge if there are too few.
     """
-    found: list[Array] = []
+    configurations: list[Array] = []
     for extreme in (True, False):
         drawn = feasible_poses(machine, n // 2, rng, extreme=extreme, progress=progress)
         kept = surely_reached(machine, legs, setting, drawn)
-        found += [drawn.configurations[k] for k in np.flatnonzero(kept)]
-    if len(found) < max(_MIN_SHARE * n, 1):
+        configurations += [drawn.configurations[k] for k in np.flatnonzero(kept)]
+    if len(configurations) < max(_MIN_SHARE * n, 1):
         remedies = [
             "check legcal.home and the limits of the joints",
-            "say with --model-error that it is known better",
+            "state a smaller --model-error",
         ]
         if setting.length > USUAL_LENGTH * machine.size:
             remedies.reverse()
         raise DidNotConverge(
-            f"{machine.yaml_path}: no session could be planned: found {len(found)} of {n} poses "
-            "that the machine still reaches at the same readings if its joints are "
+            f"{machine.yaml_path}: no session could be planned: the machine reaches only "
+            f"{len(configurations)} of {n} poses at the same readings if its joints are "
             f"{1e3 * setting.length:.2g} mm off, needed {_MIN_SHARE * n:.0f}; "
             f"{', or '.join(remedies)}."
         )
-    return poses_at(machine, found)
+    return poses_at(machine, configurations)
 
 
 def surely_reached(
     machine: Machine, legs: FittedLegs, setting: Setting, poses: Configurations
 ) -> BoolArray:
-    """Return which poses machines reach, at the same readings, that are as far off as they may be.
+    """Return a mask of poses that random machines within tolerance reach at the same readings.
 
-    Beside a singularity, or at the border of what legs can do, small errors decide that.
+    Near a singularity, or at the boundary of the workspace, small errors make poses unreachable.
     """
     reached = np.ones(len(poses.poses), dtype=np.bool_)
     if not machine.is_determined or not len(reached):
@@ -82,31 +82,35 @@ def surely_reached(
         drawn = drawn_legs(legs, wider, rng)
         R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
         ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
-        A, wanted = _at_readings(drawn, poses.readings)
+        A, target_length = _at_readings(drawn, poses.readings)
         length = np.linalg.norm(ends - A, axis=2)
-        off = np.abs(length - wanted)[:, measured].max(axis=1)
+        residual = np.abs(length - target_length)[:, measured].max(axis=1)
         moved = np.linalg.norm(t - t_nearby, axis=1)
-        reached &= (off < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
+        reached &= (residual < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
     return reached
 
 
 def _at_readings(legs: Sequence[Leg], q: Array) -> tuple[Array, Array]:
-    """Return joints at A (k, n_legs, 3) and lengths (k, n_legs) [m] that readings q ask for."""
+    """Joints at A (k, n_legs, 3) and leg lengths (k, n_legs) [m] at readings q."""
     A = np.tile([leg.A for leg in legs], (len(q), 1, 1))
-    wanted = q * [leg.sign for leg in legs] + [leg.q0 for leg in legs]
+    lengths = q * [leg.sign for leg in legs] + [leg.q0 for leg in legs]
     for j, leg in enumerate(legs):
         if leg.actuator is not None:
-            A[:, j], wanted[:, j] = leg.actuator.at(leg.A, q[:, j]), leg.q0
-    return A, wanted
+            A[:, j], lengths[:, j] = leg.actuator.at(leg.A, q[:, j]), leg.q0
+    return A, lengths
 
 
 def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:
-    """Return legs, and arms that are seen, as they may be: within the prior errors of a machine."""
-    found = legs.parametrization
-    size = np.where([unit == "m" for unit in found.units], setting.length, setting.angle)
-    arms = np.array([ParameterId.parse(name).kind in ARMS for name in found.names])
-    size = size * (arms | [not is_held_by_default(name) for name in found.names])
-    return moved_legs(legs.nominal, found.place, size * rng.uniform(-1.0, 1.0, len(size)))
+    """Draw legs, and visible arms, within the tolerance of the machine."""
+    parametrization = legs.parametrization
+    spread = np.where(
+        [unit == "m" for unit in parametrization.units], setting.length, setting.angle
+    )
+    arms = np.array([ParameterId.parse(name).kind in ARMS for name in parametrization.names])
+    spread = spread * (arms | [not is_held_by_default(name) for name in parametrization.names])
+    return moved_legs(
+        legs.nominal, parametrization.place, spread * rng.uniform(-1.0, 1.0, len(spread))
+    )
 
 
 def poses_near(
@@ -117,30 +121,30 @@ def poses_near(
     step: float,  # of the travel
     rng: np.random.Generator,
 ) -> Configurations:
-    """Return poses, and others a little beside them that the machine can take."""
+    """Add feasible poses near each pose."""
     feasibility = Feasibility(machine)
     columns = slider_columns(machine, machine.motors)[0]
     lower, upper = motor_travel(machine)
-    found: list[Array] = []
+    nearby: list[Array] = []
     for configuration in poses.configurations:
         for _ in range(N_NEAR if machine.is_determined else 0):
             q = configuration[columns] + step * (upper - lower) * rng.normal(size=len(columns))
             q = np.clip(q, lower, upper)
             try:
-                there = follow(machine, configuration, q, min_step=_HALF_WAY)
+                reached = follow(machine, configuration, q, min_step=_HALF_WAY)
             except DidNotConverge:
                 continue
-            if feasibility.problem(there, of_motors=False) is None:
-                found.append(there)
-    if not found:
+            if feasibility.problem(reached, of_motors=False) is None:
+                nearby.append(reached)
+    if not nearby:
         return poses
-    kept = surely_reached(machine, legs, setting, poses_at(machine, found))
-    more = [found[k] for k in np.flatnonzero(kept)]
+    kept = surely_reached(machine, legs, setting, poses_at(machine, nearby))
+    more = [nearby[k] for k in np.flatnonzero(kept)]
     return poses_at(machine, [*poses.configurations, *more])
 
 
 def some_of(poses: Configurations, which: Sequence[int]) -> Configurations:
-    """Return some of the poses, in that order."""
+    """Select poses by index, in that order."""
     index = np.array(which, dtype=np.intp)
     chosen = [poses.poses[i] for i in which]
     return Configurations(poses.configurations[index], poses.readings[index], chosen)

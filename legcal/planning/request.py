@@ -1,4 +1,4 @@
-"""``legcal.plan``: what is asked of a plan, checked, and the plan that answers it."""
+"""``legcal.plan``: options of a plan, their checks, and the fewest images for a target."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SAME_MACHINE = 0.025  # mean leg lengths between joints of the model and of a da
 SAME_AXES = 5.0  # [deg] the same between their axes
 _ROUNDS = 5  # plans, until the fewest images are found that reach a target
 _BEGIN = 24  # images of the first of them
-_NEARLY = 0.9  # of the images of a plan that reaches it: another with so many is tried
+_NEARLY = 0.9  # next number of images, over that of a plan that reaches the target
 
 
 def plan(
@@ -71,7 +71,7 @@ def plan(
     progress: Progress = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> Plan:
-    """Choose poses and camera places of a session that determine a machine best.
+    """Plan poses and camera places of a session that determine a machine best.
 
     Parameters
     ----------
@@ -85,15 +85,15 @@ def plan(
         Expected error of the platform, mean over the workspace [m]: the fewest images that reach
         it, in place of a number of images.
     criterion : Goal or str
-        What is made small: ``mean`` or ``worst`` error of the platform over the workspace, ``d``
+        Minimised quantity: ``mean`` or ``worst`` error of the platform over the workspace, ``d``
         (determinant of the covariance of all parameters), or sigma of ``parameters``.
     parameters : sequence of str
-        Names of parameters, for that criterion.
+        Names of parameters, for the last criterion.
     camera : path or Camera, optional
-        The camera, or its file; 1024 x 768 pixels and 43 degrees wide by default, or that of the
-        dataset that is given.
+        The camera, or its file; by default the camera of the given dataset, or 1024 x 768 pixels
+        and 43 degrees wide.
     noise : PredictedNoise or path
-        Errors of outlines, or the folder of an earlier result that has them.
+        Noise of outlines, or the folder of an earlier result.
     encoder_sigma : float or str, optional
         One standard deviation of a reading: a number [m, of motors that turn rad], or a text with
         its unit ('0.5deg'), which is that of the motors that slide, or turn. By default 2 um,
@@ -103,23 +103,23 @@ def plan(
     places : path, optional
         A file of places of tripods, from which cameras are chosen.
     given : path or Dataset, optional
-        What was shot already; the plan says what to add.
+        Existing images; the plan adds to them.
     board : str, path or Board, optional
-        A calibration board on the base that every image shows, as ``legcal camera`` takes it.
+        A calibration board on the base, visible in every image, as in ``legcal camera``.
     hand_held : bool
-        Every image from a place of its own; with a board.
+        Hand-held camera: a new pose for every image; requires a board.
     setting : Setting
-        How well tripods are set, and what is known of the machine before.
+        Tolerances of tripods and of the machine.
     seed : int
-        Of everything that is drawn: the same gives the same plan.
+        Random seed.
     workers : int, str or executor
-        Work in that many processes; with more than one, the program that calls this must be safe
-        to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address of its
-        scheduler, a client, or another object with ``submit``, as executors have it.
+        Number of processes; with more than one, the calling program must be safe to import (``if
+        __name__ == "__main__":``). Or a Dask cluster: the address of its scheduler, a client, or
+        another object with ``submit``, like an executor.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     stop : callable
-        Asked between steps: once it is true, the best so far is the plan.
+        Called between steps; once it returns true, the best plan so far is returned.
 
     Returns
     -------
@@ -145,25 +145,29 @@ def plan(
     _check(
         criterion, parameters, target, bounds, listed, board, hand_held, setting, seed, machine.size
     )
-    shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
-    before = () if shot is None else _given(machine, shot)
+    given_dataset = (
+        given if isinstance(given, Dataset) or given is None else _load_given(Path(given))
+    )
+    given_views = () if given_dataset is None else _given_candidates(machine, given_dataset)
     if camera is None:
-        chosen = sample_camera() if shot is None else shot.measurements.views[0].camera
+        selected_camera = (
+            sample_camera() if given_dataset is None else given_dataset.measurements.views[0].camera
+        )
     else:
-        chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
+        selected_camera = camera if isinstance(camera, Camera) else read_camera(Path(camera))
     usual_q = SIGMA_READING * machine.size
     sigma_q, sigma_by_joint = usual_q, dict[str, float]()
     if encoder_sigma is not None:
         sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
         sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
         sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=usual_q)
-    elif shot is not None:
-        sigma_q = shot.measurements.sigma_q
-        sigma_by_joint = dict(shot.measurements.sigma_by_joint)
-    errors = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
-    lengths, counted = _measured_length(machine, board=board is not None)
+    elif given_dataset is not None:
+        sigma_q = given_dataset.measurements.sigma_q
+        sigma_by_joint = dict(given_dataset.measurements.sigma_by_joint)
+    predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
+    lengths, scale_notes = _measured_length(machine, board=board is not None)
     task = Task(
-        Predictor(machine, chosen, errors, sigma_q, lengths, sigma_by_joint),
+        Predictor(machine, selected_camera, predicted_noise, sigma_q, lengths, sigma_by_joint),
         n_images,
         n_views,
         setting,
@@ -171,27 +175,29 @@ def plan(
         tuple(parameters),
         bounds,
         listed,
-        before,
-        "" if shot is None else str(shot.folder),
-        None if board is None else _on_base(board),
+        given_views,
+        "" if given_dataset is None else str(given_dataset.folder),
+        None if board is None else _load_board(board),
         hand_held,
         seed,
     )
     pool = worker_pool(workers, "The session could not be planned")
     with shown_progress(progress) as report, pool as run:
         if target is None:
-            found = plan_session(task, report, stop, run)
+            result = plan_session(task, report, stop, run)
         else:
-            found = _fewest(task, target, report, stop, run)
-        return replace(found, notes=(*found.notes, *counted, *_to_come(shot)))
+            result = _plan_for_target(task, target, report, stop, run)
+        return replace(
+            result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(given_dataset))
+        )
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
-    """Return the length that a plan counts on where readings carry none, and a note on it."""
-    found = machine.rod_for_scale(has_length=board)
-    if found is None:
+    """Assume a measured length where readings carry none; return it with a note."""
+    rod_and_ends = machine.rod_for_scale(has_length=board)
+    if rod_and_ends is None:
         return NO_CHOICES, ()
-    rod, ends = found
+    rod, ends = rod_and_ends
     sigma = SIGMA_LENGTH * machine.size
     return Choices(priors={f"{rod.name}.length": Prior(rod.q0, sigma)}), (
         f"Readings of motors that turn carry no length: the plan counts on the rod of {rod.name} "
@@ -200,50 +206,50 @@ def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[s
     )
 
 
-def _fewest(
+def _plan_for_target(
     task: Task, target: float, progress: Report, stop: Callable[[], bool], run: Run
 ) -> Plan:
-    """Return the plan with the fewest images that reaches a target [m].
+    """Plan with the fewest images that reach a target [m].
 
-    The error of a plan says how many images the next one needs; what limits plans of any size is
-    told where none reaches it.
+    The growth of each plan predicts the number of images for the next one. An unreachable target is
+    refused with its limiting source of error.
     """
     n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
     for _ in range(_ROUNDS):
-        found = plan_session(replace(task, n_images=n), progress, stop, run)
-        if found.error is None:
+        candidate = plan_session(replace(task, n_images=n), progress, stop, run)
+        if candidate.error is None:
             raise UsageError(
-                f"--target could not be used: found that {task.machine.undetermined}, needed a "
-                "machine whose readings give the pose; give --images."
+                f"--target could not be used: {task.machine.undetermined}, so that the error of "
+                "the platform is not predicted; give --images."
             )
-        error = found.error.mean_displacement
+        error = candidate.error.mean_displacement
         if error <= target:
-            best = found if best is None or found.n_images < best.n_images else best
+            best = candidate if best is None or candidate.n_images < best.n_images else best
         else:
             least = max(least, n)
         if stop():
             if best is not None:
                 return best
-            missed = f"It is expected to reach {1e3 * error:.3f} mm, not {1e3 * target:g} mm."
-            return replace(found, notes=(*found.notes, missed))
-        enough = _images_for(found, error, target)
-        if enough > MOST_IMAGES and best is None:
+            note = f"The expected error is {1e3 * error:.3f} mm, not {1e3 * target:g} mm."
+            return replace(candidate, notes=(*candidate.notes, note))
+        n_needed = _images_for(candidate, error, target)
+        if n_needed > MOST_IMAGES and best is None:
             break
         if best is not None:
-            enough = min(enough, int(_NEARLY * best.n_images))
-        wanted = max(enough, least + 1, 2 * task.n_views)
-        if wanted > MOST_IMAGES or (best is not None and wanted >= best.n_images):
+            n_needed = min(n_needed, int(_NEARLY * best.n_images))
+        n_next = max(n_needed, least + 1, 2 * task.n_views)
+        if n_next > MOST_IMAGES or (best is not None and n_next >= best.n_images):
             break
-        n = wanted
+        n = n_next
     if best is not None:
         return best
-    raise NotIdentifiable(_unreached(task, found, target))
+    raise NotIdentifiable(_unreachable_target(task, candidate, target))
 
 
-def _images_for(found: Plan, error: float, target: float) -> int:
-    """Return with how many images an error goes down to a target, as the growth of a plan says."""
-    n, value = np.log(found.growth[np.isfinite(found.growth[:, 1])]).T
-    scaled = value + np.log(error) - value[n == np.log(found.n_images)][0]
+def _images_for(planned: Plan, error: float, target: float) -> int:
+    """Return the number of images for a target, interpolated in the growth of a plan."""
+    n, value = np.log(planned.growth[np.isfinite(planned.growth[:, 1])]).T
+    scaled = value + np.log(error) - value[n == np.log(planned.n_images)][0]
     if scaled.min() > np.log(target):
         return 10 * MOST_IMAGES
     k = int(np.argmax(scaled <= np.log(target)))
@@ -251,30 +257,30 @@ def _images_for(found: Plan, error: float, target: float) -> int:
     return int(np.ceil(np.exp(n[k] if k == 0 else n[k - 1] + share * (n[k] - n[k - 1]))))
 
 
-def _unreached(task: Task, found: Plan, target: float) -> str:
-    """Return why no number of images reaches a target, and what limits it."""
-    without = min(found.limits, key=lambda what: found.limits[what], default="")
-    error = 0.0 if found.error is None else found.error.mean_displacement
+def _unreachable_target(task: Task, planned: Plan, target: float) -> str:
+    """Describe why no number of images reaches a target, and the limiting error."""
+    source = min(planned.limits, key=lambda what: planned.limits[what], default="")
+    error = 0.0 if planned.error is None else planned.error.mean_displacement
     limit = "the noise of single outlines"
-    if without and found.limits[without] < 0.8 * found.value:
-        share = error * found.limits[without] / found.value
-        limit = f"{without} (without them {1e3 * share:.3f} mm)"
+    if source and planned.limits[source] < 0.8 * planned.value:
+        share = error * planned.limits[source] / planned.value
+        limit = f"{source} (without them {1e3 * share:.3f} mm)"
     more = ""
-    n, value = found.growth[found.growth[:, 0] <= MOST_IMAGES][-1]
-    if n > found.n_images:
-        more = f" and about {1e3 * error * value / found.value:.3f} mm with {n:.0f} of their kind"
+    n, value = planned.growth[planned.growth[:, 0] <= MOST_IMAGES][-1]
+    if n > planned.n_images:
+        more = f" and about {1e3 * error * value / planned.value:.3f} mm with {n:.0f} of their kind"
     return (
         f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm could not be planned: found "
-        f"{1e3 * error:.3f} mm with {found.n_images} images{more}, limited by {limit}, needed "
+        f"{1e3 * error:.3f} mm with {planned.n_images} images{more}, limited by {limit}, needed "
         "fewer such errors; use better light or a camera of a longer focal length, more --cameras, "
         "--board, or a larger --target."
     )
 
 
 def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
-    """Return the number of camera places."""
+    """Return the checked number of camera places."""
     n = min(3, n_places) if cameras is None and n_places else (cameras or 3)
-    n = _whole("--cameras", n if cameras is None else cameras, 1, MOST_VIEWS)
+    n = _checked_number("--cameras", n if cameras is None else cameras, 1, MOST_VIEWS)
     if n_places and n > n_places:
         raise UsageError(
             f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for {n} "
@@ -290,7 +296,7 @@ def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
 
 
 def _n_images(images: int | None, per_view: int | None, n_views: int, target: float | None) -> int:
-    """Return the number of photographs of the session."""
+    """Return the checked number of photographs of the session."""
     if images is not None and per_view is not None:
         raise UsageError(
             f"The plan could not be made: found {images} images and {per_view} images per view, "
@@ -302,8 +308,12 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
             "two; leave out --target, or the number."
         )
     if per_view is not None:
-        return n_views * _whole("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
-    n = 3 * IMAGES_PER_VIEW if images is None else _whole("--images", images, 1, MOST_IMAGES)
+        return n_views * _checked_number("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
+    n = (
+        3 * IMAGES_PER_VIEW
+        if images is None
+        else _checked_number("--images", images, 1, MOST_IMAGES)
+    )
     if n < n_views:
         raise UsageError(
             f"The plan could not be made: found {n} images for {n_views} cameras, needed one for "
@@ -324,7 +334,7 @@ def _check(
     seed: int,
     size: float,  # of the machine [m]
 ) -> None:
-    """Refuse what contradicts itself."""
+    """Refuse contradictory options."""
     start, problems = "The plan could not be made: found", []
     if criterion not in list(Goal):
         problems.append(
@@ -356,15 +366,15 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    for what, off, most, unit, remedy in (
+    for quantity, error, most, unit, remedy in (
         ("a model error of", setting.length, MAX_LENGTH * size, "m", "correct --model-error"),
         ("axes off by", setting.angle, MAX_ANGLE, "rad", "correct the setting"),
         ("cameras off by", setting.shift, MAX_LENGTH * size, "m", "correct the setting"),
         ("cameras turned by", setting.turn, MAX_ANGLE, "rad", "correct the setting"),
     ):
-        if not 0.0 <= off <= most:
+        if not 0.0 <= error <= most:
             problems.append(
-                f"{start} {what} {off:g} {unit}, needed 0 to {most:.3g} {unit}; {remedy}."
+                f"{start} {quantity} {error:g} {unit}, needed 0 to {most:.3g} {unit}; {remedy}."
             )
     if not 1 <= setting.draws <= MAX_DRAWS:
         problems.append(
@@ -374,20 +384,20 @@ def _check(
         raise UsageError(problems)
 
 
-def _on_base(board: str | Path | Board) -> Board:
-    """Return a board. Raises DatasetError if a dataset could not use it."""
-    found = board_of(board)
-    parse_board(board_document(found), Path("--board"))
-    return found
+def _load_board(board: str | Path | Board) -> Board:
+    """Load a board; DatasetError if a dataset could not use it."""
+    loaded = board_of(board)
+    parse_board(board_document(loaded), Path("--board"))
+    return loaded
 
 
-def _shot(folder: Path) -> Dataset:
-    """Return a dataset, whose images are not looked at."""
+def _load_given(folder: Path) -> Dataset:
+    """Load a dataset without reading its images."""
     return load_dataset(folder, check_images=False)
 
 
-def _to_come(shot: Dataset | None) -> tuple[str, ...]:
-    """Return a note on photographs of a given dataset that are not there."""
+def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:
+    """Note on missing photographs of a given dataset."""
     if shot is None or shot.observations is not None:
         return ()
     n = shot.measurements.n_rows
@@ -396,29 +406,29 @@ def _to_come(shot: Dataset | None) -> tuple[str, ...]:
     if not missing:
         return ()
     return (
-        f"{missing} of {n} photographs of {shot.folder} are not there: the plan counts on them as "
-        "if they were.",
+        f"{missing} of {n} photographs of {shot.folder} are missing: the plan assumes that they "
+        "will be taken.",
     )
 
 
 def difference(machine: Machine, other: Machine) -> str:
-    """Return in words by what another model is of another machine; nothing if it may be the same.
+    """Describe why two models are of different machines; empty if they may be the same.
 
     Models before and after a calibration are of the same machine.
     """
     kinds = [
-        [(leg.base_joint, leg.kind, leg.platform_joint) for leg in one.legs]
-        for one in (machine, other)
+        [(leg.base_joint, leg.kind, leg.platform_joint) for leg in model.legs]
+        for model in (machine, other)
     ]
     if other.leg_names != machine.leg_names or kinds[0] != kinds[1]:
         return f"other legs ({other.name})"
-    both = list(zip(machine.legs, other.legs, strict=True))
-    off = max(max(np.abs(a.A - b.A).max(), np.abs(a.B - b.B).max()) for a, b in both)
-    if off > SAME_MACHINE * machine.size:
-        return f"joints up to {1e3 * off:.0f} mm from those of the model"
+    pairs = list(zip(machine.legs, other.legs, strict=True))
+    distance = max(max(np.abs(a.A - b.A).max(), np.abs(a.B - b.B).max()) for a, b in pairs)
+    if distance > SAME_MACHINE * machine.size:
+        return f"joints up to {1e3 * distance:.0f} mm from those of the model"
     aligned = [
         abs(float(x @ y))
-        for a, b in both
+        for a, b in pairs
         for x, y in ((a.base_axis, b.base_axis), (a.platform_axis, b.platform_axis))
         if x is not None and y is not None
     ]
@@ -428,37 +438,37 @@ def difference(machine: Machine, other: Machine) -> str:
     return ""
 
 
-def _given(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]:
-    """Return views and poses of a dataset. Raises DatasetError if it is of another machine."""
-    m, found = shot.measurements, difference(machine, shot.machine)
-    if found:
+def _given_candidates(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]:
+    """Return views and poses of a dataset; DatasetError if it is of another machine."""
+    m, mismatch = shot.measurements, difference(machine, shot.machine)
+    if mismatch:
         raise DatasetError(
-            f"{shot.folder}: the dataset could not be planned with: found {found}, needed images "
-            f"of {machine.name}; correct --given or MODEL."
+            f"{shot.folder}: the dataset could not be used for planning: found {mismatch}, needed "
+            f"images of {machine.name}; correct --given or MODEL."
         )
     missing = [view.name for view in m.views if view.T_base_camera is None]
     if missing or not machine.is_determined:
-        what = f"no T_base_camera of view {missing[0]}" if missing else "readings without poses"
+        problem = f"no T_base_camera of view {missing[0]}" if missing else "readings without poses"
         raise DatasetError(
-            f"{shot.folder}: the dataset could not be planned with: found {what}, needed where its "
-            "images were taken; write T_base_camera of a result into dataset.yaml."
+            f"{shot.folder}: the dataset could not be used for planning: found {problem}, needed "
+            "the camera poses of its images; write T_base_camera of a result into dataset.yaml."
         )
-    found_views = []
+    views = []
     for v, view in enumerate(m.views):
         rows = np.flatnonzero(m.view == v)
         if view.T_base_camera is None or not len(rows):
             continue
         place = Place(view.T_base_camera, view.name, fixed=True)
         configurations = list(follow_each(machine, m.q[rows][:, list(machine.motors)]))
-        found_views.append(Candidates(place, poses_at(machine, configurations)))
-    return tuple(found_views)
+        views.append(Candidates(place, poses_at(machine, configurations)))
+    return tuple(views)
 
 
-def _whole(name: str, found: int, least: int, most: int) -> int:
-    """Return a number of an option between limits."""
-    if not least <= found <= most:
+def _checked_number(name: str, number: int, least: int, most: int) -> int:
+    """Check the number of an option against limits."""
+    if not least <= number <= most:
         raise UsageError(
-            f"The plan could not be made: found {name} {found}, needed {least} to {most}; correct "
+            f"The plan could not be made: found {name} {number}, needed {least} to {most}; correct "
             "it."
         )
-    return found
+    return number

@@ -1,7 +1,7 @@
-"""The folder of a planned session: a dataset whose photographs are still to be taken.
+"""The folder of a planned session: a dataset without its photographs.
 
 ``dataset.yaml``, ``measurements.csv``, the model and the camera file are those of the dataset;
-``poses.csv`` says in millimetres and degrees what to set, ``plan.json`` what to expect.
+``poses.csv`` has the settings in millimetres and degrees, ``plan.json`` the expected errors.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from legcal.vision.board_file import board_document
 from legcal.vision.camera_file import camera_info
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
-HAND = "hand"  # the view of a camera in the hand
+HAND = "hand"  # the view of a hand-held camera
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 
 
 def check_session(output: str | Path, *, force: bool = False) -> Path:
-    """Return the folder of a session; refuse one that holds anything that must not be replaced."""
+    """Return the folder of a session; refuse to replace other files."""
     destination = output_path(output, PLANNED)
     check_destination(destination, PLANNED)
     if destination.is_dir() and holds_files(destination) and not force:
@@ -67,7 +67,7 @@ def write_session(
     force: bool = False,
     pictures: Mapping[str, str | bytes] | None = None,
 ) -> list[Path]:
-    """Write the folder of a session, complete or not at all, and return its files.
+    """Write the folder of a session atomically, and return its files.
 
     *pictures* are further files by their names: drawings and pages.
     """
@@ -90,18 +90,18 @@ def write_session(
 
 
 def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
-    """Return view, image, label of the pose, and the numbers of view and pose of every image.
+    """Return view, image file, label of the pose, and indices of view and pose of every image.
 
-    All images of a camera in the hand are of one view.
+    All images of a hand-held camera are of one view.
     """
     labels = plan.labels
-    found: list[tuple[str, str, str, int, int]] = []
+    images: list[tuple[str, str, str, int, int]] = []
     for v, view in enumerate(plan.views):
         name = HAND if plan.hand_held else view.name
         for k in range(len(view.poses.poses)):
-            label = labels[len(found)]
-            found.append((name, f"images/{name}_{label}.jpg", label, v, k))
-    return found
+            label = labels[len(images)]
+            images.append((name, f"images/{name}_{label}.jpg", label, v, k))
+    return images
 
 
 def _dataset(plan: Plan, model: str) -> str:
@@ -136,14 +136,14 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     """Return the standard deviation of readings [m], by motor [m or rad] where they differ."""
     legs = [plan.machine.legs[j] for j in plan.machine.motors]
     sigma = sigmas_of_legs(legs, plan.sigma_q, plan.sigma_by_joint).tolist()
-    found = {str(leg.prismatic): own for leg, own in zip(legs, sigma, strict=True)}
-    if any(leg.reads_angle for leg in legs) or set(found.values()) - {plan.sigma_q}:
-        return found
+    sigma_of_motor = {str(leg.prismatic): value for leg, value in zip(legs, sigma, strict=True)}
+    if any(leg.reads_angle for leg in legs) or set(sigma_of_motor.values()) - {plan.sigma_q}:
+        return sigma_of_motor
     return plan.sigma_q
 
 
 def _measurements(plan: Plan) -> str:
-    """Return ``measurements.csv``: the planned readings, to be replaced by what encoders say."""
+    """Return ``measurements.csv`` with the planned readings, to be replaced by measured ones."""
     motors = list(plan.machine.motors)
     rows = [
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]

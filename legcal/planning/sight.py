@@ -1,9 +1,9 @@
-"""What a camera will see of a machine: the visible stretch of every part of legs, and of arms.
+"""Visibility prediction: the visible segment of every part of legs and arms in an image.
 
-A stretch counts where it is in the picture by a margin, in front of the camera, and behind neither
-another leg or arm nor the plates that the joints of base and platform span; joints on carriages and
-arms span none. It is found along rays to points of the axis, of many poses at once; its outlines
-follow from eqs (3) and (5).
+A segment is visible if it is in the picture with a margin, in front of the camera, and not behind
+another leg or arm or a plate. The joints of base and platform span plates; joints on carriages and
+arms do not. Points of the axes are tested along rays, for many poses at once; outlines follow from
+eqs (3) and (5).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _THIN = 1e-3  # of the largest extent of joints that span no plate
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """What stands before a camera: the legs of a machine, then its arms that are cylinders."""
+    """The legs of a machine, followed by its cylindrical arms."""
 
     A: Array  # (n_images, n, 3) one end of each in the base link [m]
     B: Array  # (n_images, n, 3) the other
@@ -60,7 +60,7 @@ class Bodies:
 
     @classmethod
     def at(cls, machine: Machine, legs: Sequence[Leg], poses: Sequence[RigidTransform]) -> Bodies:
-        """Return those of legs in R_b and R_e at poses T_Rb_Re, as thick as the model says."""
+        """Place legs in R_b and R_e at poses T_Rb_Re, with the radii of the model."""
         (R, t), T = Frames.of(poses), machine.T_base_Rb
         A, B = ends_in_base(legs, T, R, t)
         pose = np.arange(len(poses), dtype=np.intp)
@@ -76,24 +76,24 @@ class Bodies:
         )
 
     def before(self, T_base_camera: RigidTransform) -> Bodies:
-        """Return the same in the frame of a camera."""
+        """Transform to the frame of a camera."""
         T = T_base_camera.as_matrix()
         A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (self.A, self.B))
         return replace(self, A=A, B=B)
 
     @property
     def nearest(self) -> float:
-        """How far points are before a camera at least [m]."""
+        """Least depth of visible points [m]."""
         return NEAREST * self.size
 
     @property
     def radius(self) -> Array:
-        """The largest radius of each, (n,) [m]."""
+        """Largest radius of each body, (n,) [m]."""
         return np.array([max((c.radius for c in some), default=0.0) for some in self.cylinders])
 
     @property
     def axes(self) -> tuple[Array, Array]:
-        """Direction (n_images, n, 3) and length (n_images, n) [m] of each."""
+        """Direction (n_images, n, 3) and length (n_images, n) [m] of each body."""
         along = self.B - self.A
         length = np.linalg.norm(along, axis=-1)
         return along / length[..., None], length
@@ -101,7 +101,7 @@ class Bodies:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Visible stretches of legs and arms in images of one camera, n of them."""
+    """The n visible segments of legs and arms in images of one camera."""
 
     image: IntArray  # (n,)
     leg: IntArray  # (n,)
@@ -112,7 +112,7 @@ class Seen:
     length_px: Array  # (n,)
 
     def outlines(self, sigma_px: float, row: IntArray) -> Outlines:
-        """Return the outlines with errors of so much in every pixel of length; rows of images."""
+        """Return the outlines with noise *sigma_px* per pixel of length; *row* of each image."""
         n = len(self.leg)
         of_ends = np.array([[4.0, -2.0], [-2.0, 4.0]])  # of a line through many points
         covariance = (sigma_px**2 / self.length_px)[:, None, None] * of_ends
@@ -131,20 +131,20 @@ class Seen:
         )
 
     def only(self, image: int) -> Seen:
-        """Return what one image shows."""
-        own = np.flatnonzero(self.image == image)
+        """Select the segments of one image."""
+        selected = np.flatnonzero(self.image == image)
         return Seen(
-            np.zeros(len(own), dtype=np.intp),
-            self.leg[own],
-            self.is_arm[own],
-            tuple(self.part[i] for i in own),
-            self.h[own],
-            self.ends[own],
-            self.length_px[own],
+            np.zeros(len(selected), dtype=np.intp),
+            self.leg[selected],
+            self.is_arm[selected],
+            tuple(self.part[i] for i in selected),
+            self.h[selected],
+            self.ends[selected],
+            self.length_px[selected],
         )
 
     def legs_in(self, n_images: int, n_legs: int) -> BoolArray:
-        """Return which legs each image shows, (n_images, n_legs)."""
+        """Return a mask of the legs in each image, (n_images, n_legs)."""
         shown, along = np.zeros((n_images, n_legs), dtype=np.bool_), ~self.is_arm
         shown[self.image[along], self.leg[along]] = True
         return shown
@@ -154,9 +154,9 @@ def what_is_seen(
     camera: Camera,
     T_base_camera: RigidTransform,
     bodies: Bodies,
-    margin_px: float = 0.0,  # that stays free at the border of the picture
+    margin_px: float = 0.0,  # free margin at the border of the picture
 ) -> Seen:
-    """Return the visible stretches of legs and arms in images of one camera."""
+    """Return the visible segments of legs and arms in images of one camera."""
     bodies = bodies.before(T_base_camera)
     A, (u, length) = bodies.A, bodies.axes
     body, link, radius, start, end = _parts(bodies.cylinders, length)
@@ -164,65 +164,65 @@ def what_is_seen(
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, body]
     P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
-    seen = (end > start)[..., None] & in_picture(camera, P, bodies.nearest, margin_px)
+    is_visible = (end > start)[..., None] & in_picture(camera, P, bodies.nearest, margin_px)
     foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
-    seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
-    of_body = np.zeros(len(bodies.leg))
-    np.maximum.at(of_body, body, radius)
-    seen &= ~_behind_others(P, body, radius, A, u, length, of_body)
-    thick, n = _IN_PLATE * float(of_body[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
-    seen &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)
-    seen &= ~behind_plate(P, bodies.B[:, :n], thick)
-    first, last = longest_runs(seen)
+    is_visible &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
+    largest_radius = np.zeros(len(bodies.leg))
+    np.maximum.at(largest_radius, body, radius)
+    is_visible &= ~_behind_others(P, body, radius, A, u, length, largest_radius)
+    thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
+    is_visible &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)
+    is_visible &= ~behind_plate(P, bodies.B[:, :n], thick)
+    first, last = longest_runs(is_visible)
     image, part = np.nonzero(last > first)
-    begin, finish = (s[image, part, k[image, part]] for k in (first, last))
+    first_end, last_end = (s[image, part, k[image, part]] for k in (first, last))
     u_seen, M = u_part[image, part], A[image, body[part]]
     h = outlines_of_axis(u_seen, M, radius[part])
-    axis = M[:, None] + np.stack([begin, finish], axis=1)[..., None] * u_seen[:, None]
+    axis = M[:, None] + np.stack([first_end, last_end], axis=1)[..., None] * u_seen[:, None]
     # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
     touching = EPSILON[:, None, None] * radius[part][:, None, None, None] * h[:, :, None]
     ends = camera.project(axis[:, None] - touching)
     length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
     width_px = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean(axis=1)
-    kept = length_px >= least_length(width_px)
-    parts = part[kept]
+    is_long = length_px >= least_length(width_px)
+    parts = part[is_long]
     return Seen(
-        image[kept],
+        image[is_long],
         bodies.leg[body[parts]],
         body[parts] >= bodies.n_legs,
         tuple(link[k] for k in parts),
-        h[kept],
-        ends[kept],
-        length_px[kept],
+        h[is_long],
+        ends[is_long],
+        length_px[is_long],
     )
 
 
 def _parts(
     cylinders: Sequence[Sequence[Cylinder]], length: Array
 ) -> tuple[IntArray, list[str], Array, Array, Array]:
-    """Return body, link and radius of all parts, and their stretches (n_images, n_parts) each [m].
+    """Body, link and radius of all parts, and starts and ends (n_images, n_parts) each [m].
 
-    Stretches of parts that a length leaves no room for are empty.
+    Segments are empty where the leg is too short for a part.
     """
-    of_image = [
+    segments_of_images = [
         [visible_segments(some, float(long)) for some, long in zip(cylinders, row, strict=True)]
         for row in length
     ]
-    number: dict[tuple[int, str], int] = {}
+    index: dict[tuple[int, str], int] = {}
     radius: list[float] = []
-    for row in of_image:
+    for row in segments_of_images:
         for j, segments in enumerate(row):
             for segment in segments:
-                if number.setdefault((j, segment.link), len(number)) == len(radius):
+                if index.setdefault((j, segment.link), len(index)) == len(radius):
                     radius.append(segment.radius)
-    start, end = np.zeros((2, len(length), len(number)))
-    for k, row in enumerate(of_image):
+    start, end = np.zeros((2, len(length), len(index)))
+    for k, row in enumerate(segments_of_images):
         for j, segments in enumerate(row):
             for segment in segments:
-                i = number[j, segment.link]
+                i = index[j, segment.link]
                 start[k, i], end[k, i] = segment.start, segment.end
-    leg = np.array([j for j, _ in number], dtype=np.intp)
-    return leg, [link for _, link in number], np.array(radius), start, end
+    leg = np.array([j for j, _ in index], dtype=np.intp)
+    return leg, [link for _, link in index], np.array(radius), start, end
 
 
 def _behind_others(
@@ -234,7 +234,7 @@ def _behind_others(
     length: Array,  # (k, n)
     of_body: Array,  # (n,) the largest radius that is seen
 ) -> BoolArray:
-    """Return which points have another leg or arm in front of them, wholly or in part."""
+    """Mask of points occluded by another leg or arm, at least partly."""
     rays = rays_past_axes(P.reshape(len(P), -1, 3), A, u, length)
     distance, depth, square = (x.reshape(*P.shape[:-1], *x.shape[2:]) for x in rays)
     # A ray to the edge of a body itself passes at its radius, as far as the other is nearer.
@@ -245,10 +245,10 @@ def _behind_others(
 
 
 def behind_plate(P: Array, joints: Array, thick: float, *, surely: bool = True) -> BoolArray:
-    """Return which points (k, n, m, 3) have the plate between joints (k, n_legs, 3) before them.
+    """Return a mask of points (k, n, m, 3) occluded by the plate spanned by joints (k, n_legs, 3).
 
-    Points in the plate are not behind it, by its thickness [m]: so are legs of a planar machine.
-    Without *surely* those count too that a plate of another shape may hide.
+    Points within the thickness *thick* [m] of the plate are not occluded, as legs of a planar
+    machine. Without *surely*, also points that a plate of another shape may occlude.
     """
     if joints.shape[1] < 3:
         return np.zeros(P.shape[:-1], dtype=np.bool_)
@@ -258,22 +258,22 @@ def behind_plate(P: Array, joints: Array, thick: float, *, surely: bool = True) 
         return np.zeros(P.shape[:-1], dtype=np.bool_)
     x, y, normal = (axes[:, i] for i in range(3))
     across = np.einsum("kpmx,kx->kpm", P, normal)
-    where = np.sum(normal * middle[:, 0], axis=-1)[:, None, None] / np.where(
+    depth_ratio = np.sum(normal * middle[:, 0], axis=-1)[:, None, None] / np.where(
         np.abs(across) < 1e-12, 1e-12, across
     )
-    before = (where > 0.0) & ((1.0 - where) * np.linalg.norm(P, axis=-1) > thick)
-    hit = where[..., None] * P - middle[:, :, None]
+    is_in_front = (depth_ratio > 0.0) & ((1.0 - depth_ratio) * np.linalg.norm(P, axis=-1) > thick)
+    hit = depth_ratio[..., None] * P - middle[:, :, None]
     inside = np.ones(P.shape[:-1], dtype=np.bool_)
     flat = np.stack([np.einsum("klx,kx->kl", joints - middle, axis) for axis in (x, y)], axis=-1)
-    at = np.stack([np.einsum("kpmx,kx->kpm", hit, axis) for axis in (x, y)], axis=-1)
+    hit_flat = np.stack([np.einsum("kpmx,kx->kpm", hit, axis) for axis in (x, y)], axis=-1)
     for k, corners in enumerate(flat):
         if not surely:
             reach = _ROUND * np.linalg.norm(corners, axis=-1).max()
-            inside[k] = np.linalg.norm(at[k], axis=-1) < reach
+            inside[k] = np.linalg.norm(hit_flat[k], axis=-1) < reach
             continue
         try:
             sides = ConvexHull(corners * _PLATE).equations
         except QhullError:
             return np.zeros(P.shape[:-1], dtype=np.bool_)
-        inside[k] = np.all(at[k] @ sides[:, :2].T + sides[:, 2] < 0.0, axis=-1)
-    return np.asarray(before & inside)
+        inside[k] = np.all(hit_flat[k] @ sides[:, :2].T + sides[:, 2] < 0.0, axis=-1)
+    return np.asarray(is_in_front & inside)
