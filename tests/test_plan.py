@@ -36,7 +36,7 @@ from legcal.machine.model import slider_columns
 from legcal.machine.model_builder import create_model
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
-from legcal.planning import planner
+from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
 from legcal.planning.noise import read_noise
@@ -149,7 +149,7 @@ def test_the_command_writes_what_python_plans(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setitem(request.plan.__kwdefaults__, "setting", FEW)
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
@@ -185,7 +185,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr(planner, "choose", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setitem(request.plan.__kwdefaults__, "setting", FEW)
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
@@ -435,11 +435,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
     ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
-    ({"criterion": "best"}, UsageError, "mean, worst, d, parameters"),
-    ({"criterion": "d", "target": 1e-4}, UsageError, "leave out --criterion"),
     ({"target": 0.0}, UsageError, "more than 0"),
     ({"seed": -1}, UsageError, "--seed"),
-    ({"parameters": ["leg2.base.x"]}, UsageError, "--criterion parameters"),
     ({"hand_held": True, "cameras": None}, UsageError, "--board"),
     ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
     ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
@@ -453,7 +450,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
     ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
     ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
-    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
+    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; plan with a smaller length"),
     ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
     ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]
@@ -619,18 +616,13 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path, tmp_path:
     refused(NotVisible, "; use a board of larger squares", board="chessboard:9x6:5mm")
     for name in ("dataset.yaml", "plan.json"):  # their views are places too
         refused(UsageError, "found 2 places for 3", places=shot / "session" / name, cameras=3)
-    refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],
-            places=places(tmp_path))  # fmt: skip
     refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))
     assert difference(upright, tilted) == "axes of joints up to 15 deg from those of the model"
     assert not difference(tilted, tilted)
-    with pytest.raises(UsageError, match="--force"):
+    with pytest.raises(UsageError, match="found an earlier session"):
         write_session(planned, shot / "session")
     for text in ("1m", "0m:1m,0m:1m,1m:0m", "0m:1m,0m:1m,0m:1kg"):
         with pytest.raises(UsageError, match="--bounds"):
             parse_bounds(text)
-    (shot / "session" / "images").mkdir()
-    with pytest.raises(UsageError, match="photographs"):
-        write_session(planned, shot / "session", force=True)

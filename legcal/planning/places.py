@@ -176,7 +176,7 @@ def places_around(
             f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
             f"of it in the picture, tripods set to {1e2 * setting.shift:g} cm and "
             f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
-            "correct the focal length in its file, or name --places."
+            "correct the focal length in its file."
         )
     if bounds is None:
         return found
