@@ -521,12 +521,11 @@ def _look_at_legs(
     found: _Found, seen: Detection, views: Sequence[ViewCondition], choices: Choices
 ) -> None:
     """Judge what the images show of the legs, and what that determines."""
-    n_found, n_visible, n_used, n_outlines = (
-        sum(getattr(view, name) or 0 for view in views)
-        for name in ("legs_found", "legs_visible", "outlines_used", "outlines")
-    )
+    outlines = seen.outlines
     found.checks["legs"] = (
-        f"{n_found} of {n_visible} found, {n_used} of {n_outlines} outlines can be used"
+        f"{sum(view.legs_found or 0 for view in views)} of "
+        f"{sum(view.legs_visible or 0 for view in views)} found, "
+        f"{np.count_nonzero(outlines.used)} of {len(outlines)} outlines can be used"
     )
     for what in unplaced_notes(seen.unplaced):
         found.add("legs", "error", what)

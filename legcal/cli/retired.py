@@ -48,7 +48,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--camera": "a plan takes the camera of --given DATASET, or in Python "
         "legcal.plan(camera=FILE)",
         "--places": "say with --bounds where cameras may stand, or in Python "
-        "legcal.plan(places=FILE)",
+        "legcal.plan(places=[...])",
         "--model-error": "a plan allows for 2 mm, or in Python "
         "legcal.plan(setting=legcal.planning.places.Setting(length=METRES))",
         "--encoder-sigma": "a plan takes the encoder_sigma of --given DATASET, or in Python "

@@ -26,7 +26,6 @@ from legcal.planning.places import (
     USUAL,
     Place,
     Setting,
-    read_places,
 )
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
@@ -59,7 +58,7 @@ def plan(
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
     encoder_sigma: float | str | None = None,
     bounds: Array | None = None,
-    places: str | Path | None = None,
+    places: Sequence[Place] = (),
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
     hand_held: bool = False,
@@ -93,8 +92,8 @@ def plan(
         0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
     bounds : (3, 2) array, optional
         Lowest and highest x, y, z of cameras in the base link [m].
-    places : path, optional
-        A file of places of tripods, from which cameras are chosen.
+    places : sequence of Place
+        Tripods with their names, to choose from in place of those around the machine.
     given : path or Dataset, optional
         What was shot already; the plan says what to add.
     board : str, path or Board, optional
@@ -131,7 +130,7 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    listed = () if places is None else tuple(read_places(Path(places), machine))
+    listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
     _check(target, bounds, listed, board, hand_held, setting, seed)
