@@ -25,7 +25,6 @@ from legcal.pages.document import (
     MAX_ROWS,
     Cell,
     Items,
-    Link,
     Number,
     OutlineEditor,
     Page,
@@ -127,18 +126,12 @@ def _share(part: int | None, whole: int | None) -> Cell:
 def examination_page(found: Examination, detection: Detection) -> str:
     """Return the text of ``index.html``."""
     files, names = detection.overlay_files, row_names(detection.dataset.measurements)
-    by_view = {view.view: view for view in found.views}
-    anchors = dict(zip(by_view, unique_names(f"view-{view}" for view in by_view), strict=True))
+    anchors = unique_names(f"view-{view.view}" for view in found.views)
     editor = _outline_editor(detection)
     correct = [Text([_TOO_MANY])] if editor is None else [Text([_HOW_TO_CORRECT]), editor]
-    tables = [
-        Table(t.columns, [[Link(str(row[0]), f"#{anchors[str(row[0])]}"), *row[1:]]
-                          for row in t.rows])
-        if t.columns[0] == "view" else t
-        for t in tables_of(found)
-    ]  # fmt: skip
+    checks, *tables = tables_of(found)
     findings = Items([f"{one.severity}: {one.what}" for one in found.findings])
-    blocks: list[Any] = [*tables[:1], findings, *tables[1:]]
+    blocks: list[Any] = [checks, findings, *tables]
     sections = [
         Section("found", "What was found", blocks),
         Section("correct", "To correct an outline", correct),
@@ -148,15 +141,15 @@ def examination_page(found: Examination, detection: Detection) -> str:
     if len(shown) < len(files):
         few = f"The {len(shown)} of {len(files)} images with the fewest used outlines are shown."
         blocks.append(Text([few]))
-    for view, to in anchors.items():
-        rows = [row for row in files if row in shown and detection.view_of(row) == view]
+    for view, anchor in zip(found.views, anchors, strict=True):
+        rows = [row for row in files if row in shown and detection.view_of(row) == view.view]
         pictures = [
             Picture(files[row], *_summary(detection, names, row), place.get(row)) for row in rows
         ]
-        problem = [Text([text])] if (text := by_view[view].problem) else []
-        sections.append(Section(to, view, [*problem, Row(pictures)]))
-    verdict = _verdict(found)
-    return page_html(Page(f"Outlines of {found.mechanism}", found.dataset, verdict, sections))
+        problem = [Text([view.problem])] if view.problem else []
+        sections.append(Section(anchor, view.view, [*problem, Row(pictures)]))
+    title = f"Outlines of {found.mechanism}"
+    return page_html(Page(title, found.dataset, _verdict(found), sections))
 
 
 def _verdict(found: Examination) -> Verdict:
