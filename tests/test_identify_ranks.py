@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import outline_sessions
 import pytest
+from hexapod_sessions import nominal_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from machines import made
@@ -37,8 +38,6 @@ from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation.hexapod import PaperHexapod
-from legcal.simulation.paper import nominal_of
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))
@@ -187,7 +186,7 @@ def shared_poses(session: PredictedObservations) -> PredictedObservations:
     return replace(session, R=session.R[:n], t=session.t[:n], pose=pose)
 
 
-def true_base(machine: PaperHexapod, joints: JointsInCamera) -> JointsInBase:
+def true_base(machine: Machine, joints: JointsInCamera) -> JointsInBase:
     """Return the base of a machine of point-like joints as step 2 would, without solving."""
     nominal = nominal_of(machine)
     cameras = register_views(nominal, joints)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from hexapod_sessions import nominal_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_legs import closed_leg
@@ -49,7 +50,6 @@ from legcal.paper.platform import locate_platform_joints
 from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
 from legcal.paper.platform_printed import fixed_direction, locate_passive_end, revolute_axis
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.paper import nominal_of
 
 TRANSFORMATIONS: tuple[Transformation, ...] = ("points", "cross_product")
 
@@ -67,10 +67,9 @@ def test_a_motor_that_counts_backwards_changes_nothing() -> None:
     backwards = replace(
         session, measurements=replace(session.measurements, q=session.measurements.q * sign)
     )
-    machine = nominal_of(nominal)
-    legs = tuple(replace(leg, sign=s) for leg, s in zip(machine.legs, sign.tolist(), strict=True))
-    turned = replace(machine, legs=legs)
-    forth = run_steps(machine, session.axes, session.measurements)
+    legs = tuple(replace(leg, sign=s) for leg, s in zip(nominal.legs, sign.tolist(), strict=True))
+    turned = replace(nominal, legs=legs)
+    forth = run_steps(nominal, session.axes, session.measurements)
     back = run_steps(turned, backwards.axes, backwards.measurements)
     assert np.allclose(back.parameters.offsets, forth.parameters.offsets, rtol=0.0, atol=1e-12)
 
@@ -107,7 +106,7 @@ def test_a_leg_fixed_to_the_platform_has_no_distance_to_others() -> None:
 
 def test_the_covariance_of_leg_ends_follows_directions_and_readings() -> None:
     session, nominal = noisy_session(0, OutlineNoise(), n_poses=8)
-    base = run_base_steps(nominal_of(nominal), session.axes, session.measurements)
+    base = run_base_steps(nominal, session.axes, session.measurements)
     directions = directions_through_joints(session.axes, session.measurements, base)
     q0, sigma_q, h = base.machine.parameters.offsets, 1e-3, 1e-6
     u, e = directions.u, np.swapaxes(directions.basis, 0, 1)

@@ -8,6 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from fit_sessions import SHIPPED
+from hexapod_sessions import (
+    disturbed_hexapod,
+    extreme_poses,
+    nominal_of,
+    paper_session,
+    with_parameters,
+)
 from scipy.spatial.transform import Rotation
 from staged_sessions import (
     Observed,
@@ -26,7 +33,7 @@ from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegKind
+from legcal.machine.leg import LegKind, point_like_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import from_vector, parametrize, to_vector
 from legcal.paper.criteria import Criteria, Transformation
@@ -40,16 +47,8 @@ from legcal.paper.platform import RigidProblem, build_rigid_platform
 from legcal.paper.platform_pose import build_rays
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.unknowns import Unknowns
-from legcal.simulation.hexapod import (
-    PAPER_VIEWS,
-    extreme_poses,
-    hexapod_cameras,
-    hexapod_session,
-    paper_hexapod,
-    perturb,
-)
 from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
-from legcal.simulation.paper import nominal_of, platform_errors
+from legcal.simulation.paper import PAPER_VIEWS, platform_errors
 
 # (14) does not see the length that all rods of an ideal linear Delta have.
 MACHINES = [name for name in SHIPPED if name != "linear-delta"]
@@ -123,20 +122,14 @@ def test_exact_recovery_of_hexapods_from_5_mm(seed: int, options: dict[str, Any]
 
 @pytest.mark.parametrize("criteria", ["default", "literal"])
 def test_legs_that_meet_in_one_platform_joint_are_no_pair(criteria: Criteria) -> None:
-    rng = np.random.default_rng(0)
-    machine = perturb(paper_hexapod(), rng, 0.002)
-    machine, nominal = (
-        replace(
-            m,
-            parameters=replace(
-                m.parameters, platform_joints=m.parameters.platform_joints[[0, 0, 2, 2, 4, 4]]
-            ),
-        )
-        for m in (machine, five_millimetres_away(machine))
+    drawn = disturbed_hexapod()
+    true, wrong = (
+        replace(p, platform_joints=p.platform_joints[[0, 0, 2, 2, 4, 4]])
+        for p in (drawn.parameters, five_millimetres_away(drawn).parameters)
     )
-    cameras = hexapod_cameras(machine, rng)
-    session = hexapod_session(machine, cameras, rng, noise=OutlineNoise(), noisy=False, n_poses=6)
-    found = staged(session, nominal, criteria).parameters
+    machine = with_parameters(drawn, true)
+    nominal = replace(nominal_of(machine), legs=point_like_legs(wrong))
+    found = staged(paper_session(machine, OutlineNoise()), nominal, criteria).parameters
     assert np.abs(found.offsets - machine.parameters.offsets).max() < 1e-8
     if criteria == "default":
         assert errors(found, machine).max() < 1e-9
@@ -207,11 +200,12 @@ def test_literal_criteria_never_move_z_from_a_coplanar_nominal_model() -> None:
     session = exact_session()
     true = session.machine.parameters
     assert np.abs(true.base_joints[:, 2]).max() > 5e-4
-    literal = staged(session, paper_hexapod(), "literal").parameters
+    flat = nominal_of(load_mechanism("hexapod"))
+    literal = staged(session, flat, "literal").parameters
     for joints in (literal.base_joints, literal.platform_joints):
         assert np.abs(joints[:, 2]).max() < 1e-9
     assert errors(literal, session.machine).max() > 5e-4
-    assert errors(staged(session, paper_hexapod()).parameters, session.machine).max() < 1e-9
+    assert errors(staged(session, flat).parameters, session.machine).max() < 1e-9
 
 
 def test_literal_criteria_accept_a_mirror_image_that_the_rigid_ones_correct() -> None:
@@ -220,7 +214,7 @@ def test_literal_criteria_accept_a_mirror_image_that_the_rigid_ones_correct() ->
     mirrored = replace(
         true, base_joints=true.base_joints * up, platform_joints=true.platform_joints * up
     )
-    nominal = replace(session.machine, parameters=mirrored)
+    nominal = replace(nominal_of(session.machine), legs=point_like_legs(mirrored))
     literal = staged(session, nominal, "literal").parameters
     assert errors(literal, nominal).max() < 1e-6
     assert errors(staged(session, nominal).parameters, session.machine).max() < 1e-9
@@ -382,7 +376,8 @@ def test_scaling_all_lengths_scales_the_result(scale: float) -> None:
     )
     vector = partial(to_vector, frame_legs=nominal.frame_legs)
     scaled = from_vector(scale * vector(nominal.parameters), 6, nominal.frame_legs)
-    first, second = staged(session, nominal), staged(larger, replace(nominal, parameters=scaled))
+    first = staged(session, nominal)
+    second = staged(larger, replace(nominal, legs=point_like_legs(scaled)))
     apart = scale * vector(first.parameters) - vector(second.parameters)
     assert np.abs(apart).max() < 1e-8 * scale
 
@@ -414,22 +409,21 @@ def test_the_default_improves_the_model_fivefold_and_the_literal_criteria_make_i
     for seed in range(2):
         session, nominal = noisy_session(seed, noise)
         machine = session.machine
-        poses = extreme_poses(machine, 5, np.random.default_rng(99))
+        poses = extreme_poses(machine, 5, 99)
         found = staged(session, nominal, criteria)
-        for k, parameters in enumerate((nominal.parameters, found.parameters)):
-            means[k] += platform_errors(machine, parameters, poses).dX
+        for k, legs in enumerate((nominal.legs, found.legs)):
+            means[k] += platform_errors(machine, legs, poses).dX
     assert low < means[0] / means[1] < high
 
 
 def test_wrong_outlines_are_named_and_hardly_matter() -> None:
     session, nominal = noisy_session(0, OutlineNoise())
-    assert session.outlines is not None
     offsets = np.zeros((len(session.outlines), 2))
     offsets[::40] = 15.0
-    camera = session.cameras[0].camera
+    camera = session.measurements.views[0].camera
     h, ends = shifted_outlines(camera, session.outlines.h, session.outlines.ends, offsets)
     wrong = replace(session.outlines, h=h, ends=ends)
-    axes = axes_from_outlines(wrong, session.measurements, session.machine.radius_of_part())
+    axes = axes_from_outlines(wrong, session.measurements, session.radii)
     result = staged(replace(session, axes=axes), nominal)
     assert len(result.diagnostics) == 9
     assert "Leg leg1 in image 1 was left out of steps 3 and 4" in result.diagnostics[0]
@@ -494,7 +488,7 @@ def test_derivatives_of_all_problems_are_those_of_differences(name: str) -> None
 
 def test_printed_criteria_have_the_equations_that_the_paper_counts() -> None:
     session = exact_session(n_poses=6)
-    machine = nominal_of(five_millimetres_away(session.machine))
+    machine = five_millimetres_away(session.machine)
     base = run_base_steps(machine, session.axes, session.measurements)
     single = observed_directions(session.axes, session.measurements, machine, base.in_cameras)
     unknowns = Unknowns.of_platform(machine)

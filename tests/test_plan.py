@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,8 +50,7 @@ from legcal.planning.request import difference
 from legcal.planning.session import write_session
 from legcal.report.plan import checklist, plan_table
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import ParameterErrors, SimulationSettings
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
 FEW = Setting(draws=3)
@@ -156,7 +156,7 @@ def test_the_command_writes_what_python_plans(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
-    monkeypatch.setitem(request.plan.__kwdefaults__, "setting", FEW)
+    monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
@@ -192,7 +192,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr(planner, "choose", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setitem(request.plan.__kwdefaults__, "setting", FEW)
+    monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
