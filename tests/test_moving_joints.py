@@ -144,7 +144,6 @@ def test_counts_by_analogy_are_those_written_out() -> None:
 def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: str) -> None:
     analysis = Analysis(session(name))
     assert (analysis.full.rank, analysis.full.of) == (RANKS[name], RANKS[name])
-    assert analysis.staged.rank == RANKS[name]
     found = scale_sources(analysis)
     assert [s.source for s in found] == (
         ["length", "base_board", "platform_board", "radii"] if name in TURNING else []
@@ -174,7 +173,6 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
     report: Any = SimpleNamespace(
         identifiable=True,
         full=analysis.full,
-        staged=analysis.staged,
         platform_sigma=RmsMotion(1e-4, 1e-3),
         scale=scale_sources(analysis),
         conditions=(),
@@ -211,14 +209,6 @@ def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None
     assert found["hexaglide"].rank == 42  # its readings tell of it
     (weak,) = found["delta"].weak
     assert all("2" in name.partition(".")[0] for name in weak.parameters)
-
-
-def test_views_of_two_arms_leave_open_to_the_steps_what_readings_tell_the_fit() -> None:
-    """Both turn a platform that only translates about a line in the plane of its joints."""
-    arms = Analysis(session("delta", views=((2, 3, 4, 5), (0, 1, 4, 5), (2, 3, 4, 5))))
-    assert (arms.full.rank, arms.staged.rank) == (42, 41)
-    (weak,) = arms.staged.weak
-    assert weak.direction == "z of platform joints 2, 4 and 6 together"
 
 
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(
