@@ -51,7 +51,7 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisi
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
-from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
 from legcal.perception.outline import measure_in_brief
@@ -77,7 +77,6 @@ def calibrate(
     output: str | Path | None = None,
     progress: Progress = False,
     criteria: Criteria = "default",
-    transformation: Transformation | None = None,
     use_cache: bool = True,
     workers: Workers = 1,
     priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
@@ -98,10 +97,8 @@ def calibrate(
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     criteria : {"default", "literal"}
-        What the four steps minimise: legcal's criteria, or the paper's as printed.
-    transformation : {"points", "cross_product"}, optional
-        How they compute where the platform is, eq (18): by point equality, or as printed. By
-        default as the criteria are.
+        The weights of the four steps: from the covariances of the axes, or all one, as the paper
+        has them.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
     workers : int, str or executor
@@ -159,7 +156,7 @@ def calibrate(
     key = outline_key(dataset, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
-        estimate = estimate_parameters(data, fitted, Options(choices, criteria, transformation))
+        estimate = estimate_parameters(data, fitted, Options(choices, criteria))
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 
