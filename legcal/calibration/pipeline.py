@@ -5,8 +5,8 @@
    Measure: the outlines of the legs are measured near where that has them (section 3.1).
 3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. Joint fit of all parameters, started from the nominal model and from the steps.
-5. Measure again: all photographs are searched close to that fit and measured with all care, and 3
-   and 4 are repeated. What outlines are given, the fit of them does not depend on where it began.
+5. Measure again: all photographs are searched close to that fit and measured with all care, and 4
+   is repeated. What outlines are given, the fit of them does not depend on where it began.
    Where outlines show the gamma of a camera that is not given, this is done again with others, up
    to four times.
 6. Judge what the platform gains, and write the result.
