@@ -423,7 +423,7 @@ def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
         buttons = browser.find_elements("css selector", ".rows button")
         name = buttons[lost].text.splitlines()[0]
         editor.choose(name)
-        assert editor.state(name) == "not found: no edges"
+        assert editor.state(name) == "not found: no convincing edge"
         editor.press("u", "1", "Left", "Shift Down")
         assert editor.state(name) == "used (edited)"
         editor.close()
