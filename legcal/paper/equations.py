@@ -184,15 +184,32 @@ def mean_distance() -> ca.Function:
 
 @cache
 def point_on_ray() -> ca.Function:
-    """Return (18): (step; error; R, t, point, seen, centre, N) -> (R P + t) x P_c (2,) [m^2].
+    """Return (18): (P, step; error; known, R, t, centre, N, seen) -> (R P + t) x P_c (2,), range.
 
-    Both sides of the product begin at the centre of the camera; N has two directions across it.
+    Both sides of the product [m^2] begin at the centre of the camera; N has two directions across
+    it. The third residual is what the product leaves out: by how much the point is too far along
+    the ray [m]. *known* are the coordinates of P that are no unknowns.
     """
-    step, error, R, t = ca.SX.sym("step", 6), ca.SX.sym("error", 3), *_pose()
-    point, seen, centre = (ca.SX.sym(name, 3) for name in ("point", "seen", "centre"))
-    N = ca.SX.sym("N", 2, 3)
-    product = ca.cross(moved_points(step, R, t, point) - centre, seen + error - centre)
-    return ca.Function("ray", [step, error, R, t, point, seen, centre, N], [N @ product])
+    local, error, seen = ca.SX.sym("local", 9), ca.SX.sym("error", 3), ca.SX.sym("seen", 3)
+    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    point = moved_points(local[3:], R, t, local[:3] + known)
+    residual = _off_ray(point, seen + error, centre, N)
+    return ca.Function("ray", [local, error, known, R, t, centre, N, seen], [residual])
+
+
+@cache
+def end_on_ray() -> ca.Function:
+    """Return (18) of the end of a leg (13): (q0, B, step; error; known, R, t, centre, N, leg).
+
+    The residuals are those of :func:`point_on_ray`; errors are those of u, the reading, and A.
+    """
+    local, error = ca.SX.sym("local", 10), ca.SX.sym("error", END_ERRORS + 3)
+    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    leg = ca.SX.sym("leg", 13)
+    point = moved_points(local[4:], R, t, local[1:4] + known)
+    end = leg_end(local[0], leg, error) + error[END_ERRORS:]
+    residual = _off_ray(point, end, centre, N)
+    return ca.Function("end_on_ray", [local, error, known, R, t, centre, N, leg], [residual])
 
 
 @cache
@@ -249,12 +266,22 @@ def _distance(q0: ca.SX, legs: ca.SX, error: ca.SX) -> ca.SX:
     return ca.norm_2(first - second)
 
 
+def _off_ray(point: ca.SX, seen: ca.SX, centre: ca.SX, N: ca.SX) -> ca.SX:
+    """Return how far a point is from the one seen: across its ray as in (18), and along it."""
+    along = ca.cross(N[0, :].T, N[1, :].T)
+    return ca.vertcat(N @ ca.cross(point - centre, seen - centre), ca.dot(along, point - seen))
+
+
 def _two_legs(name: str) -> ca.SX:
     return ca.SX.sym(name, 13, 2)
 
 
 def _pose() -> tuple[ca.SX, ca.SX]:
     return ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3)
+
+
+def _ray() -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("centre", 3), ca.SX.sym("N", 2, 3)
 
 
 def _direction() -> tuple[ca.SX, ca.SX]:

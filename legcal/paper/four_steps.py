@@ -63,7 +63,7 @@ def run_base_steps(
     """Locate base joints and cameras by steps 1 and 2 (3.2 and 3.3), as :func:`run_steps`."""
     weighted = criteria == "default"
     joints = locate_joints_in_cameras(machine, axes, measurements, weighted=weighted)
-    return locate_joints_in_base(machine, joints, weighted=weighted)
+    return locate_joints_in_base(machine, joints, measurements, weighted=weighted)
 
 
 def run_platform_steps(

@@ -7,7 +7,7 @@ all pairs of vectors of V, squares included, are equal in the camera and in R_b 
 
 Scalar products are even in a coordinate normal to coplanar joints, and equal for a mirror image:
 (9) decides neither z nor the handedness. With weights, what it says less of than the nominal model
-stays nominal.
+stays nominal, until (18) of all joints in all cameras shows it.
 
 Where actuators move joints at A (ours, not the paper's) these count at reading 0. As printed (8',
 9'), V has also the axis of every actuator of the view, and the arm from that of a revolute to the
@@ -21,8 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.motions import components, motion_of
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import LegColumns
 from legcal.paper.camera_poses import candidate_camera_poses
@@ -32,7 +34,8 @@ from legcal.paper.equations import (
     products_in_base,
     vectors_of_view,
 )
-from legcal.paper.joints_in_camera import JointsInCamera, points_in_both
+from legcal.paper.gibbs import stepped_poses
+from legcal.paper.joints_in_camera import JointsInCamera, adjusted_to_base, points_in_both
 from legcal.paper.least_squares import (
     LeastSquares,
     Term,
@@ -41,12 +44,16 @@ from legcal.paper.least_squares import (
     solve_least_squares,
 )
 from legcal.paper.nominal import NominalMachine
+from legcal.paper.platform_pose import SeenPoints, poses_on_rays
 from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal
+from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
 
 _PLACES = np.r_[
     LegColumns.A, LegColumns.BASE_AXIS, ActuatorColumns.AXIS, ActuatorColumns.POINT
 ]  # of a leg among its numbers, as (9) has them
+
+
+Cameras = tuple[RigidTransform | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +62,7 @@ class JointsInBase:
 
     # with A, the revolute axes at the base and actuators as they were located
     machine: NominalMachine
-    T_Rb_camera: tuple[RigidTransform | None, ...]  # None for a view whose joints do not fix it
+    T_Rb_camera: Cameras  # None for a view whose joints do not fix it
     in_cameras: JointsInCamera  # what they were located from
     diagnostics: tuple[str, ...]  # what was left out or left at nominal, and why
 
@@ -66,12 +73,12 @@ class JointsInBase:
 
 
 def locate_joints_in_base(
-    machine: NominalMachine, joints: JointsInCamera, *, weighted: bool
+    machine: NominalMachine, joints: JointsInCamera, measurements: Measurements, *, weighted: bool
 ) -> JointsInBase:
     """Locate base joint centres and revolute axes in R_b from those in the camera frames.
 
-    Raises NotIdentifiable if a joint or an axis is in no product, or products are too few, and
-    DidNotConverge.
+    With weights, joints in the cameras are those in R_b. Raises NotIdentifiable if a joint or an
+    axis is in no product, or products are too few, and DidNotConverge.
     """
     unknowns = Unknowns.of_base(machine)
     _check_products(machine, joints)
@@ -83,13 +90,21 @@ def locate_joints_in_base(
             f"{_counts(joints.located)}), needed at least as many; turn a camera so that it "
             "shows more legs at once."
         )
-    left = tuple[str, ...]()
+    held = np.zeros(0, dtype=np.intp)
     if weighted:
-        problem, left = hold_at_nominal(problem, machine, unknowns, "Step 2 (9)", weighted=True)
+        problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
     x = solve_least_squares(problem, weighted=weighted).x
     located = replace(machine, legs=unknowns.legs(x, machine.legs))
-    diagnostics = (*joints.diagnostics, *left)
-    return JointsInBase(located, register_views(located, joints), joints, diagnostics)
+    cameras = register_views(located, joints)
+    if machine.spatial and any(T is not None for T in cameras):
+        if weighted and not machine.actuators:
+            located, cameras, shown = _joints_on_rays(located, unknowns, joints, cameras)
+            joints = _joints_of_base(located, joints, cameras, measurements)
+            held = np.setdiff1d(held, shown)
+        else:
+            cameras = _cameras_on_rays(located, joints, cameras, weighted=weighted)
+    left = left_near_nominal("Step 2", machine, unknowns, held)
+    return JointsInBase(located, cameras, joints, (*joints.diagnostics, *left))
 
 
 def build_scalar_products(
@@ -168,9 +183,7 @@ def _products_seen(
     return np.einsum("vmi,vmi->vm", Vp, Vq), np.sqrt(variance)
 
 
-def register_views(
-    machine: NominalMachine, joints: JointsInCamera
-) -> tuple[RigidTransform | None, ...]:
+def register_views(machine: NominalMachine, joints: JointsInCamera) -> Cameras:
     """Return T_Rb_camera of each view whose joints and axes fix it, in closed form, unweighted."""
     found = list[RigidTransform | None]()
     for v, with_axis in enumerate(joints.axis_located):
@@ -179,6 +192,90 @@ def register_views(
         poses, is_all = candidate_camera_poses(A_Rb, v_Rb, A_camera, v_camera)
         found.append(poses[0] if is_all and len(poses) == 1 else None)
     return tuple(found)
+
+
+# Cameras, and joints with them
+
+
+def _cameras_on_rays(
+    machine: NominalMachine, joints: JointsInCamera, cameras: Cameras, *, weighted: bool
+) -> Cameras:
+    """Return the cameras by (18) of the base joints that they see."""
+    points, start, placed = _points_on_rays(machine, joints, cameras)
+    R, t, _ = poses_on_rays(points, start, weighted=weighted)
+    return _placed(cameras, placed, R, t)
+
+
+def _joints_on_rays(
+    machine: NominalMachine, unknowns: Unknowns, joints: JointsInCamera, cameras: Cameras
+) -> tuple[NominalMachine, Cameras, IntArray]:
+    """Return base joints and cameras by (18) together, and the unknowns that it shows.
+
+    What it shows less of than the nominal model stays where (9) has it.
+    """
+    points, (R, t), placed = _points_on_rays(machine, joints, cameras)
+    leg = np.nonzero(joints.located[placed])[1]
+    place = unknowns.place[leg, LegColumns.A]
+    wanted = np.unique(place[place >= 0])
+    renumbered = np.full(len(unknowns) + 1, -1)
+    renumbered[wanted] = np.arange(len(wanted))
+    steps = len(wanted) + np.arange(6 * len(R)).reshape(-1, 6)
+    term = points.term((R, t), steps[points.group], renumbered[place], unknowns.known_A[leg])
+    x = unknowns.vector(machine.legs)
+    start = np.concatenate([x[wanted], np.zeros(steps.size)])
+    problem = LeastSquares("The base joints and the cameras (eq 18)", (term,), start)
+    problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
+    found = solve_least_squares(problem, weighted=True).x
+    x[wanted] = found[: len(wanted)]
+    machine = replace(machine, legs=unknowns.legs(x, machine.legs))
+    cameras = _placed(cameras, placed, *stepped_poses(R, t, found[steps]))
+    return machine, cameras, np.setdiff1d(wanted, held)
+
+
+def _joints_of_base(
+    machine: NominalMachine, joints: JointsInCamera, cameras: Cameras, measurements: Measurements
+) -> JointsInCamera:
+    """Return joints in the cameras of views that are placed as all of these together have them.
+
+    Errors of the places of cameras are not counted.
+    """
+    A, C = joints.A.copy(), joints.covariance[:, :, :3, :3].copy()
+    information = np.zeros((machine.n_legs, 3, 3))
+    turns = [(v, T.rotation.as_matrix()) for v, T in enumerate(cameras) if T is not None]
+    for v, R in turns:
+        seen = joints.located[v]
+        information[seen] += R @ np.linalg.inv(C[v, seen]) @ R.T
+    for v, R in turns:
+        seen, T = joints.located[v], cameras[v]
+        C[v, seen] = R.T @ np.linalg.inv(information[seen]) @ R
+        A[v, seen] = (
+            A[v, seen] if T is None else T.inv().apply(machine.parameters.base_joints[seen])
+        )
+    return adjusted_to_base(machine, joints, A, C, measurements)
+
+
+def _points_on_rays(
+    machine: NominalMachine, joints: JointsInCamera, cameras: Cameras
+) -> tuple[SeenPoints, tuple[Array, Array], IntArray]:
+    """Return base joints as placed cameras see them, R and t of R_b in these, and their views."""
+    poses = {v: T.inv() for v, T in enumerate(cameras) if T is not None}
+    placed = np.array(list(poses), dtype=np.intp)
+    group, leg = np.nonzero(joints.located[placed])
+    view = placed[group]
+    A, C = joints.A[view, leg], joints.covariance[view, leg, :3, :3]
+    A_Rb = machine.parameters.base_joints[leg]
+    return SeenPoints(group, A_Rb, A, C, np.zeros_like(A)), components(list(poses.values())), placed
+
+
+def _placed(cameras: Cameras, placed: IntArray, R: Array, t: Array) -> Cameras:
+    """Return cameras, T_Rb_camera, with those of some views from poses of R_b in them."""
+    found = list(cameras)
+    for v, own_R, own_t in zip(placed.tolist(), R, t, strict=True):
+        found[v] = motion_of(own_R, own_t).inv()
+    return tuple(found)
+
+
+# Refusals
 
 
 def _check_products(machine: NominalMachine, joints: JointsInCamera) -> None:

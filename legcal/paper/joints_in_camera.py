@@ -68,6 +68,7 @@ class JointsInCamera:
     # that axis [m^2]; zero for what there is not, and without weights
     covariance: Array
     axes: LegAxes  # of located joints; with weights, adjusted to these
+    observed: LegAxes  # the same as the images gave them
     diagnostics: tuple[str, ...]  # which legs were left out of which views, and why
 
     @property
@@ -216,7 +217,9 @@ class _Bundles:
                 slope, n = derivatives(function, 0, own)[0], own.shape[1]
                 covariance[v, j][np.ix_(_JOINT, _JOINT)] = slope @ C[i, :n, :n] @ slope.T
         nowhere = np.zeros_like(A)
-        return JointsInCamera(A, nowhere, located, actuators, covariance, axes, tuple(said))
+        return JointsInCamera(
+            A, nowhere, located, actuators, covariance, axes, self.axes, tuple(said)
+        )
 
     def _blocks(self, jacobian: csc_array[np.float64]) -> list[Array]:
         """Return the information of a Jacobian on the unknowns of each bundle."""
@@ -267,6 +270,28 @@ def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> LegAxes:
     of_axes = axes.covariance.copy()
     of_axes[:, :2, :2] = directions * variances[:, None] @ np.swapaxes(directions, 1, 2)
     return replace(axes, u=u, basis=np.stack([e1, cross(u, e1)], axis=1), covariance=of_axes)
+
+
+def adjusted_to_base(
+    machine: NominalMachine,
+    joints: JointsInCamera,
+    A: Array,  # (n_views, n_legs, 3) in the cameras [m]
+    of_A: Array,  # (n_views, n_legs, 3, 3), its covariances
+    measurements: Measurements,
+) -> JointsInCamera:
+    """Return joints at A, with axes adjusted to it and revolute axes by the adjusted directions."""
+    axes = joints.observed
+    view, n = measurements.view[axes.row], len(axes)
+    local, C = np.zeros((n, 9)), np.zeros((n, 9, 9))
+    local[:, :3], C[:, :3, :3] = A[view, axes.leg], of_A[view, axes.leg]
+    stands = np.tile([1.0, 0.0, 0.0], (n, 1))
+    index = np.full((n, 9), -1)
+    term = Term(joint_on_axis(), index, (stands, axes.u, axes.M, axes.basis), axes.covariance)
+    covariance = joints.covariance.copy()
+    covariance[:, :, :3, :3] = of_A
+    axes = _adjusted(axes, term, local, C)
+    joints = replace(joints, A=A, covariance=covariance, axes=axes)
+    return oriented(machine, _with_axes(machine, joints, measurements, weighted=True))
 
 
 # Revolute axes

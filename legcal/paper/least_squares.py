@@ -59,6 +59,7 @@ class Term:
     # (n,), (n, a) or (n, a, b) each: the other arguments of the function
     observed: tuple[Array, ...]
     covariance: Array | None = None  # (n, k, k) of the errors; None: the weight is one
+    n_printed: int | None = None  # the first residuals, which the paper has; others weigh nothing
 
     @property
     def n_rows(self) -> int:
@@ -69,7 +70,10 @@ class Term:
     def unit_weights(self) -> Array:
         """Weights of one, (n, r, r); as numbers (n, r) where there are no others."""
         n, r = len(self.index), self.n_rows
-        return np.ones((n, r)) if self.covariance is None else np.tile(np.eye(r), (n, 1, 1))
+        if self.covariance is None:
+            return np.ones((n, r))
+        printed = np.arange(r) < (r if self.n_printed is None else self.n_printed)
+        return np.tile(np.diag(printed.astype(np.float64)), (n, 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +100,10 @@ class LeastSquares:
         """Return the derivative (m, n) of the unweighted residuals."""
         return _sparse(_compiled(self._structure()).jacobian(x, self._observed()))
 
-    def derivative_at_start(self, *, weighted: bool) -> Array:
+    def derivative_at_start(self, *, weighted: bool) -> csc_array[np.float64]:
         """Return the derivative (m, n) of the residuals at the start; in sigmas with weights."""
         J = self.jacobian(self.start)
-        return (_matrix(self._weights(self.start, None)) @ J if weighted else J).toarray()
+        return csc_array(_matrix(self._weights(self.start, None)) @ J) if weighted else J
 
     def _weights(self, x: Array, residuals: Array | None) -> list[Array]:
         """Return the matrices (n, r, r) by which residuals of each term have unit variance at x.

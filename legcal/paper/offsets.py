@@ -30,7 +30,7 @@ from legcal.paper.least_squares import (
 )
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal
+from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
 
 _APART = 1e-3  # mean leg lengths: nearer platform joints count as one
 
@@ -43,6 +43,7 @@ class LegDirections:
     view: IntArray  # (n,)
     leg: IntArray  # (n,)
     A: Array  # (n, 3): base joint centres in the frame of the group [m], at the readings
+    of_A: Array  # (n, 3, 3): covariances of these [m^2]; zero where actuators move them
     u: Array  # (n, 3): unit directions from base to platform
     basis: Array  # (n, 2, 3): e1, e2 normal to u
     reading: Array  # (n,) sign * q [m], length less offset; zero if constant, NaN if passive
@@ -88,13 +89,16 @@ def leg_directions(
     of_u = axes.covariance[first, :2, :2] / count[:, None, None]
     covariance[:, :2, :2] = onto @ of_u @ np.swapaxes(onto, 1, 2)
     covariance[:, 2, 2] = measurements.sigma_q**2
+    of_A = joints.covariance[v, j, :3, :3]
     for leg, actuator in machine.actuators.items():
+        of_A[j == leg] = 0.0
         turn[j == leg] = actuator.rotations(q[j == leg])
     return LegDirections(
         group=v * measurements.n_poses + k,
         view=v,
         leg=j,
         A=joints.A_at(v, j, q),
+        of_A=of_A,
         u=u,
         basis=basis,
         reading=machine.sign[j] * np.where(machine.constant[j], 0.0, q),
@@ -112,11 +116,12 @@ def identify_offsets(
     """
     pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     problem = build_consecutive(machine, directions)
-    with_held, left = problem, tuple[str, ...]()
+    with_held, held = problem, np.zeros(0, dtype=np.intp)
     if weighted:
-        with_held, left = hold_at_nominal(problem, machine, unknowns, "Step 3 (14)", weighted=True)
+        with_held, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
     x = solve_least_squares(with_held, weighted=weighted).x
     _check_identifiable(machine, directions, pairs, undetermined(problem.jacobian(x)))
+    left = left_near_nominal("Step 3 (14)", machine, unknowns, held)
     return replace(machine, legs=unknowns.legs(x, machine.legs)), left
 
 

@@ -5,8 +5,10 @@ of a view equal those in the platform frame R_e (16):
 
     C_3 = sum over views and pairs of legs (mean |B_j B_g| in R_c - |B_j B_g| in R_e)^2
 
-Where the platform is (18) gives revolute axes on the platform by v . u = 0 (7), the ends of passive
-legs by u x A B = 0 (19), universal axes and twists by the closure of legs without an S joint.
+With weights, joints, offsets and poses of the platform are then solved for together by (18), which
+shows z of coplanar joints too. Where the platform is gives revolute axes on it by v . u = 0 (7),
+the ends of passive legs by u x A B = 0 (19), universal axes and twists by the closure of legs
+without an S joint.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from legcal.paper.equations import (
     distance_of_ends,
     end_of_leg,
     end_on_axis,
+    end_on_ray,
     mean_distance,
 )
 from legcal.paper.gibbs import angles_of, axis_frames
@@ -40,9 +43,9 @@ from legcal.paper.least_squares import (
 )
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import LegDirections, pairs_of_legs
-from legcal.paper.platform_pose import PlatformPoses, camera_by_rays, locate_platform
+from legcal.paper.platform_pose import PlatformPoses, across_rays, locate_platform
 from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, with_prior
+from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal, with_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
@@ -64,9 +67,10 @@ def locate_platform_joints(
     determine something that moves the platform, and DidNotConverge.
     """
     unknowns = Unknowns.of_platform(machine, free_twists=free_twists)
-    problem, left = build_mean_distances(machine, unknowns, directions), tuple[str, ...]()
+    problem = build_mean_distances(machine, unknowns, directions)
+    held = np.zeros(0, dtype=np.intp)
     if weighted:
-        problem, left = hold_at_nominal(problem, machine, unknowns, "Step 4 (16)", weighted=True)
+        problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
     x = unknowns.vector(machine.legs)
     x[: len(problem.start)] = solve_least_squares(problem, weighted=weighted).x
     legs = unknowns.legs(x, machine.legs)
@@ -75,9 +79,17 @@ def locate_platform_joints(
         for name, leg in zip(machine.leg_names, legs, strict=True)
         if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
     ]
-    if not unposed:
+    on_rays = weighted and machine.spatial and not machine.actuators
+    if not unposed and not on_rays:
+        left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
         return replace(machine, legs=legs), left
     seen = _SeenLegs.of(machine, legs, base, directions, weighted=weighted)
+    if on_rays and len(seen.poses.R):
+        seen, legs, shown = _ends_on_rays(seen, unknowns, legs)
+        held = np.setdiff1d(held, shown)
+    left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
+    if not unposed:
+        return replace(machine, legs=legs), left
     if not len(seen.poses.R):
         number = "three" if machine.spatial else "two"
         shape = " that do not lie on one line" if machine.spatial else ""
@@ -130,6 +142,7 @@ class _SeenLegs:
     machine: NominalMachine  # as steps 2 and 3 have it
     directions: LegDirections
     in_base: BoolArray  # (n,) which are in R_b
+    centre: Array  # (n, 3) of the camera [m]
     poses: PlatformPoses
     weighted: bool
 
@@ -145,30 +158,30 @@ class _SeenLegs:
     ) -> _SeenLegs:
         """Locate cameras and platform by (18): each A, and each B, is on the ray that shows it."""
         A, u, basis = directions.A.copy(), directions.u.copy(), directions.basis.copy()
+        of_A = directions.of_A.copy()
         centre, in_base = np.zeros_like(A), np.zeros(len(A), dtype=np.bool_)
         for v, T in enumerate(base.T_Rb_camera):
             here = np.flatnonzero(directions.view == v)
             if T is None or not len(here):
                 continue
-            if machine.spatial:
-                seen, joints = np.unique(directions.leg[here]), base.in_cameras
-                of_A = joints.covariance[v, seen, :3, :3]
-                T = camera_by_rays(base.A_Rb[seen], joints.A[v, seen], of_A, T, weighted=weighted)
+            R = T.rotation.as_matrix()
+            of_A[here] = R @ of_A[here] @ R.T
             A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
             basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
             centre[here], in_base[here] = T.translation, True
-        directions, q0 = replace(directions, A=A, u=u, basis=basis), machine.offsets
+        directions = replace(directions, A=A, of_A=of_A, u=u, basis=basis)
+        q0 = machine.offsets
         slope = derivatives(end_of_leg(), 1, q0[directions.leg, None], directions.columns)
         poses = locate_platform(
             directions.groups(),
             np.array([leg.B for leg in legs])[directions.leg],
             directions.ends(q0),
-            slope @ directions.covariance @ np.swapaxes(slope, 1, 2),
+            slope @ directions.covariance @ np.swapaxes(slope, 1, 2) + of_A,
             centre,
             spatial=machine.spatial,
             weighted=weighted,
         )
-        return cls(machine, directions, in_base, poses, weighted)
+        return cls(machine, directions, in_base, centre, poses, weighted)
 
     def across(self, rows: IntArray) -> AcrossAxes:
         """Return some directions as (7) of one axis on the platform takes them."""
@@ -182,6 +195,56 @@ class _SeenLegs:
         found[:, :2, :2] = self.directions.covariance[rows, :2, :2]
         found[:, 2:, 2:] = self.poses.covariance[self.poses.pose[rows]]
         return found
+
+
+# Ends, offsets and poses together
+
+
+def _ends_on_rays(
+    seen: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
+) -> tuple[_SeenLegs, tuple[Leg, ...], IntArray]:
+    """Return legs with B and offsets, and where the platform is, by (18), and what it shows.
+
+    These are unknowns. What it shows less of than the nominal model stays where (14) and (16) have
+    it.
+    """
+    machine, directions, poses = seen.machine, seen.directions, seen.poses
+    q0 = machine.offsets
+    rows = np.flatnonzero(
+        (poses.pose >= 0) & np.isfinite(q0[directions.leg]) & ~machine.on_platform[directions.leg]
+    )
+    pose, leg = poses.pose[rows], directions.leg[rows]
+    place = np.column_stack(
+        [unknowns.place[leg, LegColumns.LENGTH], unknowns.place[leg, LegColumns.B]]
+    )
+    wanted = np.unique(place[place >= 0])
+    renumbered = np.full(len(unknowns) + 1, -1)
+    renumbered[wanted] = np.arange(len(wanted))
+    steps = len(wanted) + np.arange(6 * len(poses.R)).reshape(-1, 6)
+    covariance = np.zeros((len(rows), 6, 6))
+    covariance[:, :3, :3], covariance[:, 3:, 3:] = (
+        directions.covariance[rows],
+        directions.of_A[rows],
+    )
+    observed = (
+        unknowns.known_B[leg],
+        poses.R[pose],
+        poses.t[pose],
+        seen.centre[rows],
+        across_rays(directions.ends(q0)[rows], seen.centre[rows]),
+        directions.columns[rows],
+    )
+    index = np.hstack([renumbered[place], steps[pose]])
+    term = Term(end_on_ray(), index, observed, covariance, n_printed=2)
+    x = unknowns.vector(legs)
+    start = np.concatenate([x[wanted], np.zeros(steps.size)])
+    problem = LeastSquares("The platform joints and poses (eq 18)", (term,), start)
+    problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
+    found = solve_least_squares(problem, weighted=True).x
+    x[wanted] = found[: len(wanted)]
+    legs = unknowns.legs(x, legs)
+    seen = replace(seen, machine=replace(machine, legs=legs), poses=poses.stepped(found[steps]))
+    return seen, legs, np.setdiff1d(wanted, held)
 
 
 # Axes on the platform and passive ends
@@ -300,16 +363,16 @@ def _close_legs(
     if not seen.weighted:  # axes that nothing determines would end anywhere
         near = with_prior(problem, np.arange(len(wanted)))
         problem = replace(problem, start=solve_least_squares(near).x)
-    problem, left = hold_at_nominal(
+    problem, held = hold_at_nominal(
         problem,
         seen.machine,
         unknowns,
-        "Step 4",
         weighted=seen.weighted,
         wanted=wanted,
         nominal=np.zeros(len(wanted)),
     )
     x = solve_least_squares(problem, weighted=seen.weighted).x
+    left = left_near_nominal("Step 4", seen.machine, unknowns, held)
     return _closed(unknowns, legs, wanted, x), left
 
 

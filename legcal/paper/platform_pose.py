@@ -7,7 +7,12 @@ fix the pose of the platform. As printed,
 
 puts R B_e + t on the ray through the camera centre and B_c: three legs leave up to four solutions,
 and the known distance of B_c is not used. So it starts from point equality R B_e + t = B_c, in
-closed form. In a plane this is all.
+closed form, and with weights the distance along the ray counts too. In a plane point equality is
+all.
+
+With weights the points themselves are unknown in a second solution of (18): unlike (9) and (16) it
+decides z of coplanar joints, and the handedness. What it says less of than the nominal model stays
+where (9), (14) and (16) have it.
 """
 
 from __future__ import annotations
@@ -15,10 +20,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.motions import motion_of, register_groups, register_in_plane
+from legcal.geometry.motions import register_groups, register_in_plane
 from legcal.geometry.types import Array, IntArray
 from legcal.paper.equations import point_on_ray
 from legcal.paper.gibbs import stepped_poses
@@ -36,6 +40,10 @@ class PlatformPoses:
     t: Array  # (n_poses, 3) [m]
     covariance: Array  # (n_poses, 6, 6) of steps from them; zero without weights and in a plane
 
+    def stepped(self, steps: Array) -> PlatformPoses:
+        """Return the poses after steps (n_poses, 6), as well known."""
+        return PlatformPoses(self.pose, *stepped_poses(self.R, self.t, steps), self.covariance)
+
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
@@ -47,6 +55,24 @@ class SeenPoints:
     covariance: Array  # (n, 3, 3) of that
     centre: Array  # (n, 3) of the camera, in the frame of the group [m]
 
+    def term(
+        self, start: tuple[Array, Array], steps: IntArray, own: IntArray, known: Array
+    ) -> Term:
+        """Return (18) of points whose coordinates *own* (n, 3) are unknown, -1 where *known*.
+
+        *steps* (n, 6) are the places of the steps of their bodies from a start R (g, 3, 3), t.
+        """
+        (R, t), across = start, across_rays(self.seen, self.centre)
+        observed = known, R[self.group], t[self.group], self.centre, across, self.seen
+        index = np.hstack([own, steps])
+        return Term(point_on_ray(), index, observed, self.covariance, n_printed=2)
+
+
+def across_rays(seen: Array, centre: Array) -> Array:
+    """Return two directions (n, 2, 3) across the rays to points; their product is along these."""
+    ray = seen - centre
+    return normal_basis(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
 
 def poses_on_rays(
     points: SeenPoints, start: tuple[Array, Array], *, weighted: bool
@@ -56,25 +82,12 @@ def poses_on_rays(
     The covariances are those of steps; zero without weights.
     """
     R, t = start
-    n, group, ray = len(R), points.group, points.seen - points.centre
-    across = normal_basis(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-    observed = R[group], t[group], points.own, points.seen, points.centre, across
-    index, columns = 6 * group[:, None] + np.arange(6), np.arange(6 * n).reshape(n, 6)
-    term = Term(point_on_ray(), index, observed, points.covariance)
-    problem = LeastSquares("The pose of the platform (eq 18)", (term,), np.zeros(6 * n))
+    n, group, columns = len(R), points.group, np.arange(6 * len(R)).reshape(-1, 6)
+    term = points.term(start, columns[group], np.full((len(group), 3), -1), points.own)
+    problem = LeastSquares("The poses (eq 18)", (term,), np.zeros(6 * n))
     solution = solve_least_squares(problem, weighted=weighted)
     covariance = solution.covariances(columns) if weighted else np.zeros((n, 6, 6))
     return *stepped_poses(R, t, solution.x[columns]), covariance
-
-
-def camera_by_rays(
-    A_Rb: Array, A_camera: Array, covariance: Array, start: RigidTransform, *, weighted: bool
-) -> RigidTransform:
-    """Return T_Rb_camera by (18) of base joints (n, 3) that a camera sees, from a start."""
-    group, T = np.zeros(len(A_Rb), dtype=np.intp), start.inv().as_matrix()[None]
-    points = SeenPoints(group, A_Rb, A_camera, covariance, np.zeros_like(A_camera))
-    R, t, _ = poses_on_rays(points, (T[:, :3, :3], T[:, :3, 3]), weighted=weighted)
-    return motion_of(R[0], t[0]).inv()
 
 
 def _span_a_frame(points: Array, *, spatial: bool) -> bool:
@@ -110,8 +123,10 @@ def locate_platform(
     if not len(used):
         return PlatformPoses(pose, *(np.zeros((0, *n)) for n in ((3, 3), (3,), (6, 6))))
     own, seen, group = B_Re[used], ends[used], pose[used]
+    weight = 1.0 / np.einsum("nii->n", covariance[used]) if weighted else None
     if not spatial:
-        return PlatformPoses(pose, *register_in_plane(own, seen, group), np.zeros((n_poses, 6, 6)))
+        R, t = register_in_plane(own, seen, group, weight)
+        return PlatformPoses(pose, R, t, np.zeros((n_poses, 6, 6)))
     points = SeenPoints(group, own, seen, covariance[used], centre[used])
-    start = register_groups(own, seen, group)
+    start = register_groups(own, seen, group, weight)
     return PlatformPoses(pose, *poses_on_rays(points, start, weighted=weighted))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csc_array
 
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.directions import SHOWN, describe_direction
@@ -34,34 +35,60 @@ def hold_at_nominal(
     problem: LeastSquares,
     machine: NominalMachine,
     unknowns: Unknowns,
-    step: str,  # what it is, with its equation: "Step 2 (9)"
     *,
     weighted: bool,
     wanted: IntArray | None = None,  # which of the unknowns those of the problem are; the first
     nominal: Array | None = None,  # (n,) values; without it the start
-) -> tuple[LeastSquares, tuple[str, ...]]:
-    """Return a problem that holds what it says less of than the nominal model, and its name."""
-    n = len(problem.start)
-    wanted = np.arange(n) if wanted is None else wanted
-    nominal = problem.start if nominal is None else nominal
-    information = problem.derivative_at_start(weighted=weighted)
+) -> tuple[LeastSquares, IntArray]:
+    """Return a problem that holds what it says less of than the nominal model.
+
+    With it the unknowns that are held, of which :func:`left_near_nominal` tells.
+
+    What follows the unknowns among those of the problem are steps of poses, six each.
+    """
+    wanted = np.arange(min(len(problem.start), len(unknowns))) if wanted is None else wanted
+    n = len(wanted)
+    nominal = problem.start[:n] if nominal is None else nominal
+    information = _without_poses(problem.derivative_at_start(weighted=weighted), n)
     lengths = machine.offsets[np.isfinite(machine.offsets)]
     sigma_length = _SIGMA_LENGTH * float(np.mean(np.abs(lengths)))
     sigma = np.where(unknowns.is_angle, _SIGMA_AXIS, sigma_length)[wanted]
-    in_it = np.zeros(n, dtype=np.bool_)
+    in_it = np.zeros(len(problem.start), dtype=np.bool_)
     for term in problem.terms:
         in_it[term.index[term.index >= 0]] = True
-    part = np.flatnonzero(in_it)
+    part = np.flatnonzero(in_it[:n])
     rows = np.vstack([information[:, part] * sigma[part], np.zeros((len(part), len(part)))])
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
     held = np.zeros((np.count_nonzero(singular < 1.0), n))
     held[:, part] = vectors[singular < 1.0]
     if not len(held):
-        return problem, ()
-    shown = np.flatnonzero(np.any(np.abs(held) > SHOWN, axis=0)).tolist()
-    words = describe_direction([unknowns.names[wanted[i]] for i in shown], machine.leg_names)
+        return problem, wanted[:0]
+    shown: IntArray = wanted[np.any(np.abs(held) > SHOWN, axis=0)]
     rows = held / (_HELD * sigma)
     index = np.tile(np.arange(n), (len(rows), 1))
     term = Term(nominal_value(n), index, (rows, rows @ nominal))
-    problem = replace(problem, terms=(*problem.terms, term))
-    return problem, (f"{step} hardly shows {words}: it was left near nominal.",)
+    return replace(problem, terms=(*problem.terms, term)), shown
+
+
+def left_near_nominal(
+    step: str,  # with its equation: "Step 3 (14)"
+    machine: NominalMachine,
+    unknowns: Unknowns,
+    held: IntArray,
+) -> tuple[str, ...]:
+    """Return which unknowns are held, in words; nothing where there are none."""
+    if not len(held):
+        return ()
+    words = describe_direction([unknowns.names[i] for i in held], machine.leg_names)
+    return (f"{step} hardly shows {words}: it was left near nominal.",)
+
+
+def _without_poses(jacobian: csc_array[np.float64], n: int) -> Array:
+    """Return what residuals say of the first n unknowns when the poses after these are free."""
+    left = jacobian[:, :n].toarray()
+    for first in range(n, jacobian.shape[1], 6):
+        of_pose = jacobian[:, first : first + 6]
+        rows = np.unique(of_pose.indices)
+        by_pose, _ = np.linalg.qr(of_pose[rows].toarray())
+        left[rows] -= by_pose @ (by_pose.T @ left[rows])
+    return np.asarray(left)
