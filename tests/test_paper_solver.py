@@ -26,6 +26,7 @@ from legcal.paper.equations import (
     distance_of_ends,
     end_of_leg,
     end_on_axis,
+    end_on_ray,
     joint_on_axis,
     leg_across_axis,
     mean_distance,
@@ -156,6 +157,7 @@ def test_weights_follow_the_errors_of_each_equation() -> None:
         change_of_distance(),
         mean_distance(),
         point_on_ray(),
+        end_on_ray(),
         end_on_axis(),
         closure_of_leg(JointType.UNIVERSAL, JointType.UNIVERSAL),
     )

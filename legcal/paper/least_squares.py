@@ -30,7 +30,7 @@ _CONVERGED = 0.01  # relative change of a weight that no longer matters
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
 _LEAST = 1e-13  # of the largest information: what is known worse is not known
 _NONE = np.zeros(0, dtype=np.intp)
-_CACHE_SIZE = 12  # compiled structures: those of one run of the steps, with either criteria
+_CACHE_SIZE = 20  # compiled structures: those of one run of the steps, with either criteria
 _INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")  # return statuses
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
@@ -84,7 +84,8 @@ class LeastSquares:
     terms: tuple[Term, ...]
     start: Array  # (n,)
     # Second derivatives instead of J'J: for criteria that do not decide some unknown, as (9) and
-    # (16) with z; J'J vanishes in that direction.
+    # (16) with z, where J'J vanishes; and for (18) of poses that few legs fix, of which one is
+    # wrong.
     exact_hessian: bool = False
 
     @property

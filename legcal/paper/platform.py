@@ -31,7 +31,7 @@ from legcal.paper.equations import (
     end_on_ray,
     mean_distance,
 )
-from legcal.paper.gibbs import angles_of, axis_frames
+from legcal.paper.gibbs import angles_of, axis_frames, stepped_poses
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import AcrossAxes
 from legcal.paper.least_squares import (
@@ -83,7 +83,7 @@ def locate_platform_joints(
     if not unposed and not on_rays:
         left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
         return replace(machine, legs=legs), left
-    seen = _SeenLegs.of(machine, legs, base, directions, weighted=weighted)
+    seen = _SeenLegs.of(machine, legs, base, directions, weighted=weighted, by_rays=not on_rays)
     if on_rays and len(seen.poses.R):
         seen, legs, shown = _ends_on_rays(seen, unknowns, legs)
         held = np.setdiff1d(held, shown)
@@ -155,6 +155,7 @@ class _SeenLegs:
         directions: LegDirections,
         *,
         weighted: bool,
+        by_rays: bool,
     ) -> _SeenLegs:
         """Locate cameras and platform by (18): each A, and each B, is on the ray that shows it."""
         A, u, basis = directions.A.copy(), directions.u.copy(), directions.basis.copy()
@@ -180,6 +181,7 @@ class _SeenLegs:
             centre,
             spatial=machine.spatial,
             weighted=weighted,
+            by_rays=by_rays,
         )
         return cls(machine, directions, in_base, centre, poses, weighted)
 
@@ -238,12 +240,15 @@ def _ends_on_rays(
     term = Term(end_on_ray(), index, observed, covariance, n_printed=2)
     x = unknowns.vector(legs)
     start = np.concatenate([x[wanted], np.zeros(steps.size)])
-    problem = LeastSquares("The platform joints and poses (eq 18)", (term,), start)
+    name = "The platform joints and poses (eq 18)"
+    problem = LeastSquares(name, (term,), start, exact_hessian=True)
     problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
-    found = solve_least_squares(problem, weighted=True).x
-    x[wanted] = found[: len(wanted)]
+    found = solve_least_squares(problem, weighted=True)
+    x[wanted] = found.x[: len(wanted)]
     legs = unknowns.legs(x, legs)
-    seen = replace(seen, machine=replace(machine, legs=legs), poses=poses.stepped(found[steps]))
+    R, t = stepped_poses(poses.R, poses.t, found.x[steps])
+    poses = PlatformPoses(poses.pose, R, t, found.covariances(steps))
+    seen = replace(seen, machine=replace(machine, legs=legs), poses=poses)
     return seen, legs, np.setdiff1d(wanted, held)
 
 

@@ -40,10 +40,6 @@ class PlatformPoses:
     t: Array  # (n_poses, 3) [m]
     covariance: Array  # (n_poses, 6, 6) of steps from them; zero without weights and in a plane
 
-    def stepped(self, steps: Array) -> PlatformPoses:
-        """Return the poses after steps (n_poses, 6), as well known."""
-        return PlatformPoses(self.pose, *stepped_poses(self.R, self.t, steps), self.covariance)
-
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
@@ -84,7 +80,7 @@ def poses_on_rays(
     R, t = start
     n, group, columns = len(R), points.group, np.arange(6 * len(R)).reshape(-1, 6)
     term = points.term(start, columns[group], np.full((len(group), 3), -1), points.own)
-    problem = LeastSquares("The poses (eq 18)", (term,), np.zeros(6 * n))
+    problem = LeastSquares("The poses (eq 18)", (term,), np.zeros(6 * n), exact_hessian=weighted)
     solution = solve_least_squares(problem, weighted=weighted)
     covariance = solution.covariances(columns) if weighted else np.zeros((n, 6, 6))
     return *stepped_poses(R, t, solution.x[columns]), covariance
@@ -109,6 +105,7 @@ def locate_platform(
     *,
     spatial: bool,
     weighted: bool,
+    by_rays: bool,  # by (18); point equality alone without it, and in a plane
 ) -> PlatformPoses:
     """Locate the platform in the frame of every group that shows enough ends, by (18).
 
@@ -129,4 +126,6 @@ def locate_platform(
         return PlatformPoses(pose, R, t, np.zeros((n_poses, 6, 6)))
     points = SeenPoints(group, own, seen, covariance[used], centre[used])
     start = register_groups(own, seen, group, weight)
+    if not by_rays:
+        return PlatformPoses(pose, *start, np.zeros((n_poses, 6, 6)))
     return PlatformPoses(pose, *poses_on_rays(points, start, weighted=weighted))
