@@ -55,8 +55,7 @@ from legcal.perception.outline import WIDTH_TOLERANCE
 from legcal.planning.request import LENGTH_SIGMA
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines, noisy_outlines
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 
 N_VIEWS, N_POSES = 3, 15
 _CIRCLE = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 720)])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from datetime import date
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from outline_bound import (
@@ -43,7 +43,6 @@ from rich.console import RenderableType
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import NotIdentifiable
 from legcal.machine.parameters import vector_of
-from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.study import Record
 
 ERRORS = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
@@ -63,18 +62,6 @@ class BoundStudy(OutlineStudy):
     def record(self, design: Design, session: OutlineSession) -> Record:
         """Return the errors of the fit of a session."""
         return errors_of(design, session, one_fit(session, self.noise.radius_sigma))
-
-    def is_found(self, found: Any) -> bool:
-        """Return whether a document has the errors of a fit, or how it failed."""
-        if has_keys(found, {"failure"}):
-            return is_failure(found["failure"])
-        return (
-            has_keys(found, {"error", "of_sigma", "nse"})
-            and is_number(found["nse"])
-            and all(isinstance(found[key], list) for key in ("error", "of_sigma"))
-            and len(found["error"]) == len(found["of_sigma"]) > 0
-            and all(map(is_number, (*found["error"], *found["of_sigma"])))
-        )
 
     def judged(self, machine: str, records: Sequence[Record]) -> Found:
         """Return errors over the bound, normalised squared errors and coverage."""

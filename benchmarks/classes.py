@@ -24,8 +24,7 @@ import numpy as np
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 
 MODELS = Path(__file__).parents[1] / "models"
 HEADER = (

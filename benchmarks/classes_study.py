@@ -64,7 +64,6 @@ from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameters import vector_of
 from legcal.paper.criteria import Criteria
 from legcal.report.render import report
-from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.study import Record, failure_of
 
 NOMINAL, FIT = "nominal", "fit"
@@ -80,8 +79,6 @@ NSE = (0.9, 1.1)
 LARGEST_RATIO = 1.05
 _EXACT = 1e-6  # squared standard deviations
 _JUDGED = 0.1  # least part of a direction that is one of the parameters that are judged
-_PLATFORM = {"dX", "dE"}
-_NUMBERS = {"rank", "nse", "of_bound"}
 WORTH = ("determined", "runs", "error/bound", "nse", "covered", "verdict")
 NOTES = (
     "Directions determined: those of the kinematic parameters. The others do not move the platform "
@@ -122,12 +119,6 @@ class ClassesStudy(OutlineStudy):
         found[FIT] = _kept(fit)
         return found
 
-    def is_found(self, found: Any) -> bool:
-        """Return whether a document has errors or a failure of every estimator."""
-        return has_keys(found, set(ESTIMATORS)) and all(
-            _is_estimate(found[name], is_fit=name == FIT) for name in ESTIMATORS
-        )
-
     def judged(self, machine: str, records: Sequence[Record]) -> Found:
         """Return what estimators made of the sessions of a machine, and what the fit is worth."""
         return judged(machine, len(self.design(machine).parametrization), records)
@@ -162,19 +153,6 @@ def _kept(estimate: Callable[[], Record]) -> Record:
         return estimate()
     except LegcalError as error:
         return {"failure": failure_of(error)}
-
-
-def _is_estimate(found: Any, *, is_fit: bool) -> bool:
-    """Return whether a document has what an estimator found, or how it failed."""
-    if has_keys(found, {"failure"}):
-        return is_failure(found["failure"])
-    numbers = _PLATFORM | (_NUMBERS if is_fit else set())
-    if not has_keys(found, numbers | ({"of_sigma"} if is_fit else set())):
-        return False
-    listed = found.get("of_sigma", [0.0])
-    return isinstance(listed, list) and bool(
-        listed and all(map(is_number, [*listed, *(found[key] for key in numbers)]))
-    )
 
 
 # Errors of a fit, judged on what is determined

@@ -35,7 +35,6 @@ from rich.console import RenderableType
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import Leg
-from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.study import Record
 
 FAR = 5.0  # standard deviations
@@ -63,17 +62,6 @@ class ConvergenceStudy(OutlineStudy):
             "after": _misses(design, solution.legs),
             "predicted": _predicted(design, solution),
         }
-
-    def is_found(self, found: Any) -> bool:
-        """Return whether a document says where a fit ended, or how it was refused."""
-        if has_keys(found, {"failure"}):
-            return is_failure(found["failure"])
-        return (
-            has_keys(found, {"worst", *_PLACES})
-            and is_number(found["worst"])
-            and all(isinstance(found[key], list) and len(found[key]) == 2 for key in _PLACES)
-            and all(is_number(value) for key in _PLACES for value in found[key])
-        )
 
     def judged(self, machine: str, records: Sequence[Record]) -> Found:
         """Return how many fits are right, refused and wrong, and errors of those that ended."""

@@ -58,7 +58,7 @@ class Command:
     words: str
     input: str = ""  # the words that make the folder "in", or a folder to copy
     kept: tuple[str, ...] = ()  # files of checkpoints and caches, which may be there in part
-    again: str = ""  # more words where a result stands already
+    replaces: bool = True  # takes the place of a result that stands already
     guarded: tuple[str, ...] = ()  # files that are not written over if somebody changed them
 
 
@@ -69,7 +69,7 @@ COMMANDS = (
     Command(
         "simulate outlines",
         "simulate 3-rpr -o out --level outlines --poses 2",
-        again="--force",
+        replaces=False,
     ),
     Command("study", "study paper --runs 2 --workers 1 -o out", kept=("out/runs.jsonl",)),
     Command(
@@ -93,7 +93,7 @@ COMMANDS = (
     Command(
         "simulate photographs, two processes",
         "simulate 3-rpr -o out --poses 1",
-        again="--force",
+        replaces=False,
     ),
     Command(
         "study, two processes",
@@ -129,7 +129,7 @@ def drawn_kills(count: int, seed: int, commands: Sequence[Command] = COMMANDS) -
             SIGNALS[(k // len(commands) + k % len(commands)) % len(SIGNALS)],
             float(chance.uniform(0.0, 1.05)),
             bool(chance.integers(2)),
-            bool(chance.integers(2)),
+            bool(chance.integers(2)) and commands[k % len(commands)].replaces,
         )
         for k in range(count)
     ]
@@ -173,7 +173,8 @@ def faults_of(kill: Kill) -> Iterator[str]:
             yield f"said {_said(folder)}"
         if kill.number is not signal.SIGKILL and answered:
             yield from (f"said {word}" for word in FALSE_WORDS if word in _said(folder))
-        if now == before or code == whole:
+        is_refused = bool(_result(now, command)) and not command.replaces
+        if now == before or code == whole or is_refused:
             return  # nothing to go on from
         if _start(command, folder, mark).wait() != whole:
             yield f"cannot be run again: {_said(folder)}"
@@ -267,9 +268,6 @@ def _lay_older_result(command: Command, finished: Path, folder: Path) -> None:
 
 
 def _start(command: Command, folder: Path, mark: str) -> subprocess.Popen[bytes]:
-    words = command.words.split()
-    if (folder / "out").exists():
-        words += command.again.split()
     environment = dict(
         os.environ,
         OMP_NUM_THREADS="1",
@@ -279,7 +277,7 @@ def _start(command: Command, folder: Path, mark: str) -> subprocess.Popen[bytes]
     )
     with (folder / "said.txt").open("wb") as said:
         return subprocess.Popen(
-            [sys.executable, "-c", WITH_SIGNALS, *words],
+            [sys.executable, "-c", WITH_SIGNALS, *command.words.split()],
             cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,

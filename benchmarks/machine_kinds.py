@@ -64,8 +64,8 @@ from legcal.machine.leg import radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level, Request
-from legcal.simulation.settings import requested
+from legcal.simulation.request import parameter_errors
+from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.study import failure_of
 from legcal.vision.cylinder import EPSILON
 
@@ -182,8 +182,9 @@ def datasets(
         begin = time.perf_counter()
         try:
             if not folder.exists():
-                asked = Request(level=level, seed=seed, hints=hints, error=errors)
-                simulate(model, folder, requested(asked, machine))
+                wrong = parameter_errors(errors or (), machine)
+                settings = SimulationSettings(level=level, seed=seed, hints=hints, errors=wrong)
+                simulate(model, folder, settings)
             begin = time.perf_counter()
             truth = next((folder / "truth/models").glob("*.yaml"))
             priors = list[str]()

@@ -49,7 +49,7 @@ from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.placement import Placement, sensor_extent
 from legcal.progress import no_progress
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.workers import Run, worker_pool
 
 MODELS = ("hexapod", "3-rps", "3-upu", "tricept")

@@ -22,10 +22,7 @@ from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
-    Start,
-    cameras_from_hints,
     platform_poses,
-    start_from,
 )
 from legcal.data.axes import axes_from_outlines
 from legcal.data.measurements import Measurements, View
@@ -54,11 +51,10 @@ from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import NominalMachine
 from legcal.simulation.cameras import cameras_around, mild_lens
-from legcal.simulation.hexapod import RAISED
 from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of
+from legcal.simulation.paper import nominal_start, noncoplanar_hexapod
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.solids import dressed, pose_machine
-from legcal.simulation.truth import write_model_with
 from legcal.simulation.visibility import take_images
 from legcal.vision.camera import Camera
 
@@ -87,7 +83,6 @@ TABLES = Path(__file__).parents[1] / "models" / "tables"
 _MANY_LEGS, _MOST_LEGS = 6, 4  # of six or more that a view is said to see, as in the paper
 _SEED = 2002  # of what is the same in all runs
 _CLOSED = 1e-13  # [m]
-WAY = (0.25, 0.5, 0.75)  # parts of the way from home to readings
 
 
 # True machines before their cameras
@@ -98,18 +93,9 @@ def true_machine(name: str) -> Machine:
     if name in kinds() or name in ROUND_ARMS:
         with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
             return made(name, Path(folder))
-    if name not in (COPLANAR, NONCOPLANAR):
-        return load_mechanism(name)
-    flat = load_mechanism("hexapod")
-    if name == COPLANAR:
-        return flat
-    up = np.array([0.0, 0.0, RAISED])
-    legs = tuple(
-        replace(leg, A=leg.A + up, B=leg.B - up) if j % 2 else leg
-        for j, leg in enumerate(geometries(flat))
-    )
-    with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
-        return load_mechanism(write_model_with(flat, legs, flat.home, Path(folder), {}))
+    if name == NONCOPLANAR:
+        return noncoplanar_hexapod()
+    return load_mechanism("hexapod" if name == COPLANAR else name)
 
 
 @lru_cache(maxsize=1)
@@ -417,26 +403,8 @@ def _direction(rng: np.random.Generator, n: int) -> Array:
 def one_fit(session: OutlineSession, radius_sigma: float) -> Solution:
     """Return what the joint fit finds from the nominal model and rough cameras."""
     settings = RefinementSettings(radius_sigma=radius_sigma)
-    start = nominal_start(session)
+    start = nominal_start(session.legs, session.measurements, RigidTransform.identity())
     return refine(session.legs, session.measurements, session.outlines, start, settings)
-
-
-def nominal_start(session: OutlineSession) -> Start:
-    """Return the nominal model, moved from home to the readings, and the rough cameras."""
-    measurements, legs = session.measurements, session.legs
-    cameras = cameras_from_hints(measurements, RigidTransform.identity())
-    poses: Sequence[RigidTransform] = (session.home,) * measurements.n_poses
-    B = session.home.apply([leg.B for leg in legs.nominal])
-    home = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
-    home -= np.array([leg.q0 for leg in legs.nominal])
-    R, t = session.home.rotation.as_matrix()[None], session.home.translation[None]
-    for j, a in enumerate(actuator_index(legs.nominal)):
-        if a >= 0:
-            home[j] = readings_of_rods(legs.nominal, R, t)[0, a]
-    wanted = legs.sign * measurements.q_of_poses
-    for part in WAY:
-        poses = platform_poses(legs.nominal, home + part * (wanted - home), poses, legs.frame_legs)
-    return start_from(legs.nominal, measurements, legs, cameras, poses, "nominal")
 
 
 def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:

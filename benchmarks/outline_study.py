@@ -33,7 +33,6 @@ from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.processors import processors
 from legcal.report.render import report, table
-from legcal.simulation.checkpoint import has_keys
 from legcal.simulation.study import Record, failure_of, run_study
 
 Found = dict[str, Any]
@@ -68,10 +67,6 @@ class OutlineStudy(ABC):
         """Return what is kept of a session of a machine."""
 
     @abstractmethod
-    def is_found(self, found: Any) -> bool:
-        """Return whether a document is what :meth:`record` returns, or a failure."""
-
-    @abstractmethod
     def judged(self, machine: str, records: Sequence[Record]) -> Found:
         """Return what the records of all sessions of a machine say together."""
 
@@ -104,10 +99,6 @@ class OutlineStudy(ABC):
             except LegcalError as error:
                 record[machine] = {"failure": failure_of(error)}
         return record
-
-    def is_record(self, found: Any) -> bool:
-        """Return whether a document has what is kept of every machine."""
-        return has_keys(found, set(self.machines)) and all(map(self.is_found, found.values()))
 
     def summary(self, records: Iterable[Record]) -> OutlineSummary:
         """Return what all runs showed."""

@@ -45,8 +45,7 @@ from legcal.planning.poses import surely_reached
 from legcal.planning.request import LENGTH_SIGMA
 from legcal.planning.session import write_session
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution, SimulationSettings, Spread
+from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 from legcal.vision.camera import sample_camera
 
 MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")

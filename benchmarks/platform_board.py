@@ -31,9 +31,8 @@ from legcal.data.outlines import no_outlines
 from legcal.errors import LegcalError
 from legcal.geometry.types import Array
 from legcal.machine.parameters import geometries, moved_legs
-from legcal.simulation.request import Level
 from legcal.simulation.session import SimulatedSession, simulate_session, streams
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 
 SIGMA_PX = 0.05
 WRONG_M = 0.002
@@ -139,7 +138,7 @@ def photographs(seeds: Sequence[int], folder: Path) -> None:
             hints=False,
             seed=seed,
         )
-        made = simulate("hexapod", place, settings, force=True)
+        made = simulate("hexapod", place, settings)
         entry = yaml.safe_load((place / "dataset.yaml").read_text())
         for view in entry["views"].values():
             view["legs"] = []

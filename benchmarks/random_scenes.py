@@ -22,8 +22,7 @@ from legcal.machine.model import Machine
 from legcal.simulation.poses import commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.scene import prepare_view
-from legcal.simulation.request import Sampling
-from legcal.simulation.settings import ParameterErrors, Spread
+from legcal.simulation.settings import ParameterErrors, Sampling, Spread
 from legcal.simulation.solids import (
     Box,
     Material,

@@ -121,7 +121,7 @@ SESSIONS: dict[str, dict[str, str]] = {  # by session and step: the words after 
         "import": "import {here}/frames --readings {here}/frames.csv --offset 0 --model hexapod"
         " --camera {here}/small.yaml -o {out}/imported",
         "new": "new --family delta -o {out}/model",
-        "simulate": "simulate 3-rpr -o {out}/simulated --level outlines --poses 2 --views 1",
+        "simulate": "simulate 3-rpr -o {out}/simulated --level outlines --poses 2",
         "export": "export hexapod --to csv -o {out}/hexapod.csv",
         "example": "example -o {out}/example",
         "wrong use": "inspect nothing-of-this-name",

@@ -15,6 +15,7 @@ poses that a model does not reach are left out and counted.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
@@ -23,22 +24,19 @@ from time import perf_counter
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from hexapod_sessions import PaperSession, extreme_poses
+from staged_sessions import noisy_session
+
 from legcal import calibrate, evaluate
 from legcal.errors import DidNotConverge, LegcalError
-from legcal.machine.leg import KinematicParameters
+from legcal.machine.leg import Leg
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.simulation.dataset import SimulatedDataset, simulate
-from legcal.simulation.hexapod import (
-    PaperHexapod,
-    extreme_poses,
-    hexapod_cameras,
-    hexapod_session,
-    paper_hexapod,
-    perturb,
-)
 from legcal.simulation.observe import OutlineNoise, TableNoise
-from legcal.simulation.paper import nominal_of, platform_errors
+from legcal.simulation.paper import platform_errors
 from legcal.simulation.settings import SimulationSettings
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
@@ -105,20 +103,11 @@ def _print_times() -> None:
     """Print how long the default steps take, and the largest memory of the process until then."""
     print(f"{'images':>8} {'median':>10} {'an image':>10} {'memory':>10}")
     for n_images, n_runs in ((45, 7), (450, 3)):
-        rng = np.random.default_rng(0)
-        machine = perturb(paper_hexapod(), rng, 0.002)
-        nominal = perturb(machine, rng, 0.002)
-        session = hexapod_session(
-            machine,
-            hexapod_cameras(machine, rng),
-            rng,
-            noise=OutlineNoise(0.2, 100),
-            n_poses=n_images // 3,
-        )
+        session, nominal = noisy_session(0, OutlineNoise(0.2, 100), n_poses=n_images // 3)
         seconds = []
         for _ in range(n_runs):
             begin = perf_counter()
-            run_steps(nominal_of(nominal), session.axes, session.measurements)
+            run_steps(nominal, session.axes, session.measurements)
             seconds.append(perf_counter() - begin)
         median = float(np.median(seconds))
         memory = getrusage(RUSAGE_SELF).ru_maxrss / 1024.0  # Linux counts kB
@@ -145,28 +134,21 @@ def _errors(
     seed: int, noise: OutlineNoise | TableNoise, coplanar: bool
 ) -> dict[str, tuple[float, float]]:
     """Return the platform errors of the nominal model and of each criterion that ends."""
-    rng = np.random.default_rng(seed)
-    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
-    nominal = perturb(machine, rng, 0.002)
-    views = hexapod_cameras(machine, rng)
-    n_images = 3 if isinstance(noise, TableNoise) else 1
-    session = hexapod_session(machine, views, rng, noise=noise, n_images=n_images)
-    found = {"nominal": _platform_error(machine, nominal.parameters)}
+    session, nominal = noisy_session(seed, noise, coplanar=coplanar)
+    found = {"nominal": _platform_error(session, nominal.legs)}
     for criteria in CRITERIA:
         try:
-            result = run_steps(
-                nominal_of(nominal), session.axes, session.measurements, criteria=criteria
-            )
-            found[criteria] = _platform_error(machine, result.parameters)
+            result = run_steps(nominal, session.axes, session.measurements, criteria=criteria)
+            found[criteria] = _platform_error(session, result.legs)
         except LegcalError:
             continue
     return found
 
 
-def _platform_error(machine: PaperHexapod, parameters: KinematicParameters) -> tuple[float, float]:
+def _platform_error(session: PaperSession, legs: Sequence[Leg]) -> tuple[float, float]:
     """Return the error of eq (20) over ten extreme poses [mm, deg]."""
-    poses = extreme_poses(machine, 10, np.random.default_rng(20020721))
-    errors = platform_errors(machine, parameters, poses)
+    machine = session.machine
+    errors = platform_errors(machine, legs, extreme_poses(machine, 10, 20020721))
     return 1e3 * errors.dX, float(np.rad2deg(errors.angle))
 
 

@@ -35,8 +35,7 @@ from legcal.data.outlines import Outlines, read_observations, write_observations
 from legcal.geometry.types import Array
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines
-from legcal.simulation.request import Level
-from legcal.simulation.settings import ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings, Spread
 from legcal.simulation.truth import write_true_model
 
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"

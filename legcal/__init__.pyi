@@ -30,6 +30,7 @@ from .simulation.rendering.appearance import Appearance as Appearance
 from .simulation.settings import ParameterErrors as ParameterErrors
 from .simulation.settings import SimulationSettings as SimulationSettings
 from .simulation.settings import Spread as Spread
+from .simulation.visibility import Viewpoint as Viewpoint
 from .version import __version__ as __version__
 
 __all__: list[str]

@@ -5,7 +5,6 @@ Nothing but the standard library is imported here, so that help and completion a
 
 from __future__ import annotations
 
-from dataclasses import Field
 from typing import Any
 
 
@@ -22,12 +21,6 @@ def option(
     if shown is not None:
         how["show_default"] = shown
     return {"option": how}
-
-
-def flags_of(field: Field[Any]) -> tuple[str, ...]:
-    """Return how the command line has a field that is an option."""
-    own: tuple[str, ...] = field.metadata["option"]["flags"]
-    return own or (flag(field.name),)
 
 
 def flag(name: str) -> str:

@@ -11,11 +11,19 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from hexapod_sessions import disturbed_hexapod, paper_session
 from outline_sessions import closed_poses, moved_poses, true_machine
+from plain_scenes import plain_scene
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
+from legcal.calibration.joint_fit.variables import (
+    FittedLegs,
+    Start,
+    cameras_from_hints,
+    fitted_legs,
+    start_from,
+)
 from legcal.data.axes import LegAxes, axes_of_table
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
@@ -46,13 +54,6 @@ from legcal.machine.rods import (
     readings_of_rods,
 )
 from legcal.simulation import observe
-from legcal.simulation.hexapod import (
-    PAPER_VIEWS,
-    hexapod_cameras,
-    hexapod_session,
-    paper_hexapod,
-    perturb,
-)
 from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
@@ -60,8 +61,8 @@ from legcal.simulation.observe import (
     axes_in_images,
     moved_outlines,
     outlines_of,
-    plain_scene,
 )
+from legcal.simulation.paper import PAPER_VIEWS
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
@@ -530,6 +531,7 @@ class AxesSession:
     axes: LegAxes
     scene: Scene
     truth: Start
+    T_base_Rb: RigidTransform
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -548,11 +550,7 @@ class AxesSession:
         rng = np.random.default_rng(seed)
         xi = to_vector(self.parameters, self.legs.frame_legs)
         xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
-        cameras = [
-            view.T_base_camera.inv()
-            for view in self.measurements.views
-            if view.T_base_camera is not None
-        ]
+        cameras = cameras_from_hints(self.measurements, self.T_base_Rb)
         return start_from(
             point_like_legs(from_vector(xi, self.legs.n_legs, self.legs.frame_legs)),
             self.measurements,
@@ -577,26 +575,18 @@ def axes_session(
     legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
 ) -> AxesSession:
     """Return a session of a hexapod 2 mm off its drawing, seen with the noise of Table 1."""
-    rng = np.random.default_rng(3)
-    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
-    cameras = hexapod_cameras(machine, rng, legs=legs)
-    session = hexapod_session(
-        machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
+    machine = disturbed_hexapod(3, coplanar=coplanar)
+    session = paper_session(
+        machine, TableNoise(), seed=3, legs=legs, n_poses=n_poses, n_images=n_images
     )
-    # Rough camera poses, about 1 degree and 1 cm wrong.
-    near = hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1)
     legs_true = point_like_legs(machine.parameters)
     return AxesSession(
         FittedLegs(machine.leg_names, legs_true, machine.frame_legs, {}),
-        replace(session.measurements, views=near.measurements.views),
+        session.measurements,
         session.axes,
         session.scene,
-        Start(
-            legs_true,
-            tuple(camera.T_Rb_camera.inv() for camera in cameras),
-            tuple(session.T_Rb_Re),
-            "truth",
-        ),
+        Start(legs_true, session.T_camera_Rb, tuple(session.T_Rb_Re), "truth"),
+        machine.T_base_Rb,
     )
 
 

@@ -14,8 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from command_outcomes import Outcome, run
+from command_outcomes import run
 from scipy.spatial.transform import Rotation
+from simulated import simulated as before_cameras
+
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import SimulationSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINES = [
@@ -32,9 +36,8 @@ MACHINES = [
     "tricept",
 ]
 LEVELS = ("axes", "outlines", "photographs")
-PLACES = Path(__file__).parent / "data/camera_places.json"  # of cameras, by machine and view
-SEED = "3"
-POSES = {"axes": "8", "outlines": "8", "photographs": "6"}
+SEED = 3
+POSES = {"axes": 8, "outlines": 8, "photographs": 6}
 JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
 SIZE = (64, 48)  # of pictures that nobody looks at
 
@@ -68,21 +71,15 @@ def camera_file(path: Path, width: int, height: int) -> Path:
 
 
 @cache
-def simulated(machine: str, level: str) -> tuple[Path, Outcome]:
+def simulated(machine: str, level: str) -> Path:
     """Simulate a small dataset of a machine, whose cameras stand at recorded places."""
-    folder = _top() / f"{machine}-{level}"
-    words = ["simulate", machine, "-o", str(folder), "--level", level, "--seed", SEED]
-    words += ["--poses", POSES[level], "--json"]
+    folder, camera = _top() / f"{machine}-{level}", None
     if level == "photographs":
-        words += ["--camera", str(camera_file(_top() / "camera.yaml", 512, 384))]
-    places = _top() / f"{machine}-places.yaml"
-    if not places.exists():
-        views = json.loads(PLACES.read_text())[machine]
-        places.write_text(yaml.safe_dump({"views": views}))
-    words += ["--cameras", str(places)]
-    outcome = run(words)
-    assert outcome.code == 0, outcome
-    return folder, outcome
+        camera = camera_file(_top() / "camera.yaml", 512, 384)
+    before_cameras(
+        folder, machine, views=3, camera=camera, level=level, seed=SEED, poses=POSES[level]
+    )
+    return folder
 
 
 @cache
@@ -90,7 +87,7 @@ def made_input(name: str) -> Path:
     """Return the folder of an input; nobody may change it: take a copy."""
     machine, _, level = name.rpartition("-")
     if machine in MACHINES and level in LEVELS:
-        return simulated(machine, level)[0]
+        return simulated(machine, level)
     folder = _top() / name
     folder.mkdir()
     MAKERS[name](folder)
@@ -154,9 +151,10 @@ def _repeats(folder: Path) -> None:
     rows = [[low + part * (high - low) for low, high in travel] for part in (0.4, 0.6)]
     (folder / "poses.csv").write_text(header + "".join(_row(row) for row in rows))
     camera = camera_file(folder / "camera.yaml", 512, 384)
-    words = ["simulate", "3-rpr", "-o", str(folder / "set"), "--seed", SEED, "--images", "3"]
-    words += ["--poses", str(folder / "poses.csv"), "--views", "1", "--camera", str(camera)]
-    assert run(words).code == 0
+    settings = SimulationSettings(
+        seed=SEED, images=3, poses=folder / "poses.csv", views=1, camera=camera
+    )
+    simulate("3-rpr", folder / "set", settings)
 
 
 def _travel(machine: str) -> list[tuple[float, float]]:
@@ -173,9 +171,10 @@ def _row(values: list[float]) -> str:
 def _boards(folder: Path) -> None:
     """Photograph a board beside a 3-RPR from five places."""
     camera = camera_file(folder / "camera.yaml", 512, 384)
-    words = ["simulate", "3-rpr", "-o", str(folder / "set"), "--seed", SEED, "--poses", "5"]
-    words += ["--views", "1", "--board", "charuco", "--hand-held", "--camera", str(camera)]
-    assert run(words).code == 0
+    settings = SimulationSettings(
+        seed=SEED, poses=5, views=1, board="charuco", hand_held=True, camera=camera
+    )
+    simulate("3-rpr", folder / "set", settings)
 
 
 def _tool_poses(folder: Path) -> None:

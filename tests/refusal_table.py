@@ -276,9 +276,7 @@ def _use() -> Iterable[Refusal]:
     existing = [text("thesis.tex", "years of work")]
     for name, command in {
         "calibrate": "calibrate {in} -o {in}",
-        "simulate": "simulate 3-rpr -o {in} --level axes --poses 1",
-        "simulate-force": "simulate 3-rpr -o {in} --level axes --poses 1 --force",
-        "study": "study convergence --machine 3-rpr --runs 1 -o {in}",
+        "simulate": "simulate 3-rpr -o {in} --level outlines --poses 1",
         "detect": "detect {in} -o {in}",
     }.items():
         given = "plain" if name in {"calibrate", "detect"} else ""
@@ -316,20 +314,12 @@ def _options() -> Iterable[Refusal]:
     yield from _worded("check", "calibrate {in}/set", checks, "result")
 
     simulate: list[tuple[str, str, tuple[str, ...]]] = [
-        ("images", "--images 0", ("0",)),
         ("poses", "--poses 0", ("0",)),
         ("negative-poses", "--poses -3", ("-3",)),
         ("half-poses", "--poses 1.5", ("1.5",)),
         ("poses-e", "--poses 1e3", ("1e3",)),
         ("poses-file", "--poses none.csv", ("none.csv",)),
-        ("views", "--views 0", ("0",)),
         ("seed", "--seed -1", ("-1",)),
-        ("pixel-noise", "--level outlines --pixel-noise -0.1px", ("--pixel-noise", "-0.1")),
-        ("pixel-unit", "--level outlines --pixel-noise 0.1", ("--pixel-noise", "0.1", "px")),
-        ("pixel-size", "--level outlines --pixel-noise 1e308px", ("1e+308", "100 px")),
-        ("encoder-negative", "--encoder-noise -2um", ("--encoder-noise", "-2")),
-        ("encoder-kind", "--encoder-noise 2um:gauss", ("--encoder-noise", "'gauss'")),
-        ("encoder-size", "--encoder-noise 1m", ("29.6 mm",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
         ("error-unit", "--error joints=0.1deg", ("joints", "mm", "um")),
         ("error-angle", "--error axes=2mm", ("axes", "deg")),
@@ -339,35 +329,15 @@ def _options() -> Iterable[Refusal]:
         ("error-size", "--error joints=2m", ("2m", "1m")),
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
-        ("views-and-cameras", "--views 2 --cameras c.yaml", ("--views", "--cameras")),
-        ("own-poses", "--poses p.csv --own-poses", ("--own-poses",)),
-        ("sampling", "--poses p.csv --sampling extreme", ("--sampling",)),
         ("camera", "--camera none.yaml", ("none.yaml",)),
-        ("cameras", "--cameras none.yaml", ("none.yaml",)),
-        ("appearance", "--appearance none.yaml", ("none.yaml",)),
-        ("photographs-noise", "--pixel-noise 0.2px", ("--pixel-noise", "outlines")),
-        ("axes-blur", "--level axes --blur 1", ("--blur", "axes", "photographs")),
-        ("outlines-table", "--level outlines --table-noise radians", ("--table-noise", "axes")),
-        ("outlines-gamma", "--level outlines --no-gamma", ("--no-gamma could", "photographs")),
-        ("outlines-gamma-given", "--level outlines --gamma", ("--gamma could", "photographs")),
-        ("axes-grey", "--level axes --grey", ("--grey could", "photographs")),
-        ("bits", "--bits 12", ("12", "8", "16")),
-        ("blur", "--blur -1", ("blur", "-1")),
-        ("clutter", "--clutter -2", ("clutter", "-2")),
         ("board", "--board chess", ("chess",)),
-        ("board-pose", "--board-pose", ("--board",)),
         ("hand-held", "--hand-held", ("--board",)),
-        ("too-many", "--level axes --images 100001", ("100000",)),
-        ("level", "--level pictures", ("--level", "pictures", "axes")),
+        ("level", "--level pictures", ("--level", "pictures", "outlines")),
     ]
     yield from _worded("simulate", "simulate hexapod -o {out}", simulate)
 
     study: list[tuple[str, str, tuple[str, ...]]] = [
-        ("runs", "convergence --runs 0", ("0",)),
-        ("seed", "bound --seed -1", ("-1",)),
         ("workers", "paper --workers 0", ("--workers", "found 0")),
-        ("machine", "bound --machine 4-rpr", ("4-rpr", "3-rpr")),
-        ("class", "classes --machine 6-spu-coplanar", ("6-spu-coplanar", "hexapod")),
     ]
     yield from _worded("study", "study", study)
 
@@ -1035,37 +1005,7 @@ def _results() -> Iterable[Refusal]:
 
 
 def _scenes() -> Iterable[Refusal]:
-    away = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
-    inside = "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 1]}"
-    far = "{xyz: [90.0, 0.0, 0.2], quat_xyzw: [-0.5, -0.5, 0.5, 0.5]}"
-    endless = "{xyz: [0.0, 0.0, .inf], quat_xyzw: [0, 0, 0, 1]}"
-    norm = "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 2]}"
     command = "simulate hexapod -o {out} --level outlines --poses 1"
-    for name, pose, said in (
-        ("away", away, ("c1", "leg")),
-        ("inside", inside, ("c1",)),
-        ("far", far, ("c1", "px")),
-        ("endless", endless, ("views.c1",)),
-        ("norm", norm, ("c1", "2")),
-    ):
-        content = f"views: {{c1: {{T_base_camera: {pose}}}}}\n"
-        yield Refusal(
-            f"scene-{name}", f"{command} --cameras {{in}}/c.yaml", said, "",
-            (text("c.yaml", content),),
-        )  # fmt: skip
-    looks: dict[str, tuple[str, tuple[str, ...]]] = {
-        "key": ("blurr: 1\n", ("blurr", "'blur'")),
-        "text": ("blur: many\n", ("blur", "'many'")),
-        "negative": ("blur: -1\n", ("blur", "-1")),
-        "electrons": ("electrons: 1e-300\n", ("electrons", "1e-300")),
-        "light": ("lights: [{strength: 1}]\n", ("lights.0.direction",)),
-        "list": ("[1]\n", ("look.yaml",)),
-    }
-    for name, (content, named) in looks.items():
-        yield Refusal(
-            f"look-{name}", "simulate hexapod -o {out} --appearance {in}/look.yaml", named, "",
-            (text("look.yaml", content),),
-        )  # fmt: skip
     head = ",".join(JOINTS)
     drawn: dict[str, tuple[str, tuple[str, ...]]] = {
         "column": ("leg9_prismatic\n0.1\n", ("leg9_prismatic",)),
@@ -1085,10 +1025,11 @@ def _scenes() -> Iterable[Refusal]:
     yield Refusal(
         "scene-board", f"{command} --board {{in}}/b.yaml", ("board",), "", (text("b.yaml", "a: 1"),)
     )
-    yield Refusal("scene-again", "simulate 3-rpr -o {in} --level axes --poses 1", ("--force",),
-                  "3-rpr-axes")  # fmt: skip
+    yield Refusal("scene-again", "simulate 3-rpr -o {in} --level outlines --poses 1",
+                  ("simulated dataset",), "3-rpr-axes")  # fmt: skip
     invisible = Refusal(
-        "scene-invisible", "simulate {in}/models/hexapod.yaml -o {out} --level axes --poses 1",
+        "scene-invisible",
+        "simulate {in}/models/hexapod.yaml -o {out} --level outlines --poses 1",
         ("cylinder",), "model", (_without_visuals,),
     )  # fmt: skip
     yield invisible

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.files.motions import MotionEntry
+from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import SimulatedDataset, simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 
@@ -29,17 +31,18 @@ def settings(**changes: object) -> SimulationSettings:
     return replace(SMALL, **changes)  # type: ignore[arg-type]
 
 
-def simulated(folder: Path, model: str, *, views: int = 2, **changes: object) -> SimulatedDataset:
+def simulated(
+    folder: Path, model: str, *, views: int = 2, camera: Path | None = None, **changes: object
+) -> SimulatedDataset:
     """Simulate a shipped machine before cameras at known places: a search is half of the time."""
+    lens = mild_lens() if camera is None else read_lens(camera)
     places = json.loads(PLACES.read_text())[model]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    cameras = folder.with_name(f"{folder.name}-cameras.yaml")
-    cameras.write_text(
-        json.dumps({"views": {f"c{v}": places[f"c{v}"] for v in range(1, views + 1)}})
+    names = [f"c{v}" for v in range(1, views + 1)]
+    standing = tuple(
+        Viewpoint(name, lens, MotionEntry(**places[name]["T_base_camera"]).motion())
+        for name in names
     )
-    made = simulate(model, folder, settings(views=cameras, **changes))
-    cameras.unlink()
-    return made
+    return simulate(model, folder, settings(views=standing, **changes))
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

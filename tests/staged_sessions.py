@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from fit_sessions import PINHOLE, MachineSession, machine_session
+from hexapod_sessions import PaperSession, disturbed_hexapod, moved, paper_session
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.identify.predicted_observations import (
@@ -18,9 +19,9 @@ from legcal.data.measurements import Measurements, View
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.leg import KinematicParameters, Leg, LegKind
+from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
-    from_vector,
     moved_legs,
     parametrize,
     to_vector,
@@ -29,17 +30,8 @@ from legcal.machine.parameters import (
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import NominalMachine
-from legcal.simulation.hexapod import (
-    PAPER_VIEWS,
-    HexapodSession,
-    PaperHexapod,
-    hexapod_cameras,
-    hexapod_session,
-    paper_hexapod,
-    perturb,
-)
 from legcal.simulation.observe import OutlineNoise, TableNoise
-from legcal.simulation.paper import nominal_of
+from legcal.simulation.paper import PAPER_VIEWS
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,16 +172,13 @@ def exact_session(
     legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
     n_poses: int = 6,
     share_poses: bool = False,
-) -> HexapodSession:
+) -> PaperSession:
     """Return a session without noise of a hexapod 2 mm off its drawing."""
-    rng = np.random.default_rng(seed)
-    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
-    return hexapod_session(
-        machine,
-        hexapod_cameras(machine, rng, legs=legs),
-        rng,
-        noise=noise or OutlineNoise(),
-        noisy=False,
+    return paper_session(
+        disturbed_hexapod(seed, coplanar=coplanar),
+        noise or OutlineNoise(),
+        seed=seed,
+        legs=legs,
         n_poses=n_poses,
         share_poses=share_poses,
     )
@@ -198,31 +187,21 @@ def exact_session(
 @cache
 def noisy_session(
     seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
-) -> tuple[HexapodSession, PaperHexapod]:
+) -> tuple[PaperSession, NominalMachine]:
     """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
-    rng = np.random.default_rng(seed)
-    machine = perturb(paper_hexapod(), rng, 0.002, coplanar=coplanar)
-    nominal = perturb(machine, rng, 0.002)
-    session = hexapod_session(
+    machine = disturbed_hexapod(seed, coplanar=coplanar)
+    session = paper_session(
         machine,
-        hexapod_cameras(machine, rng),
-        rng,
-        noise=noise,
+        noise,
+        seed=seed,
+        noisy=True,
         n_poses=n_poses,
         n_images=3 if isinstance(noise, TableNoise) else 1,
     )
-    return session, nominal
+    return session, moved(machine, np.random.default_rng(seed).uniform(-0.002, 0.002, 30))
 
 
-def five_millimetres_away(machine: PaperHexapod, seed: int = 0) -> PaperHexapod:
-    """Return the machine with every parameter exactly 5 mm wrong, z and offsets included."""
-    vector = to_vector(machine.parameters, machine.frame_legs)
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(vector))
-    parameters = from_vector(vector + 0.005 * signs, machine.n_legs, machine.frame_legs)
-    return replace(machine, parameters=parameters)
-
-
-def errors(parameters: KinematicParameters, machine: PaperHexapod) -> Array:
+def errors(parameters: KinematicParameters, machine: Machine | NominalMachine) -> Array:
     """Return the absolute error of every parameter [m]."""
     difference = to_vector(parameters, machine.frame_legs) - to_vector(
         machine.parameters, machine.frame_legs
@@ -231,7 +210,7 @@ def errors(parameters: KinematicParameters, machine: PaperHexapod) -> Array:
 
 
 def staged(
-    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria = "default"
+    session: PaperSession, nominal: NominalMachine, criteria: Criteria = "default"
 ) -> StagedResult:
     """Run the four steps on a session."""
-    return run_steps(nominal_of(nominal), session.axes, session.measurements, criteria=criteria)
+    return run_steps(nominal, session.axes, session.measurements, criteria=criteria)

@@ -12,6 +12,8 @@ from thinned import thinned
 from legcal.calibration.pipeline import calibrate
 from legcal.calibration.result_folder import load_result
 from legcal.machine.loader import load_mechanism
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import SimulationSettings
 
 
 @pytest.mark.parametrize(
@@ -30,11 +32,13 @@ def test_commands_know_that_joints_at_A_move(
         return capsys.readouterr().out
 
     session, out, table = (str(tmp_path / part) for part in ("session", "out", "correction.csv"))
-    wants_length = "--length leg1" in said(
-        "simulate", name, "-o", session, "--level", "outlines", "--poses", "5", "-q",
-        *["--length", "leg1.base:leg3.base=0.1mm"] * (name == "hexaglide"),
-    )  # fmt: skip
-    assert wants_length == (name == "delta")
+    if name == "hexaglide":
+        measured = {"leg1.base:leg3.base": 1e-4}
+        settings = SimulationSettings(level="outlines", poses=5, lengths=measured)
+        assert simulate(name, session, settings).to_measure == ""
+    else:
+        words = ("simulate", name, "-o", session, "--level", "outlines", "--poses", "5", "-q")
+        assert "--length leg1.base:leg1.platform=MEASURED" in " ".join(said(*words).split())
     truth = load_mechanism(tmp_path / "session" / "truth" / "models" / f"{name}.yaml")
     stated = yaml.safe_load((tmp_path / "session" / "dataset.yaml").read_text()).get("parameters")
     if name == "hexaglide":

@@ -40,7 +40,7 @@ from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import SimulatedDataset
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.vision.board import Board, FixedBoard
 
 Row = dict[str, str]

@@ -149,7 +149,7 @@ def test_without_a_command_the_help_is_shown(
     ("words", "found"),
     [
         (("doctor", "x", "--nonsense"), "--nonsense"),
-        (("simulate", "x", "--level", "nonsense"), "'nonsense' is not one of 'axes'"),
+        (("simulate", "x", "--level", "nonsense"), "'nonsense' is not one of 'photographs'"),
         (("doctor",), "DATASET"),
         (("study", "nonsense"), "'nonsense'"),
     ],
@@ -200,6 +200,12 @@ def test_options_without_sense_are_refused_by_name(
         (("calibrate", "x", "--significance=0.05"), ["legcal.check"]),
         (("calibrate", "--list", "machines.csv"), ["docs/python.md"]),
         (("calibrate", "x", "--resume"), ["docs/python.md"]),
+        (("simulate", "hexapod", "-o", "x", "--views", "2"), ["SimulationSettings(views=N)"]),
+        (("simulate", "hexapod", "-o", "x", "--level", "axes"), ["--level axes", 'level="axes"']),
+        (("simulate", "hexapod", "-o", "x", "--level=axes"), ["--level axes", 'level="axes"']),
+        (("simulate", "hexapod", "-o", "x", "--force"), ["--force", "empty folder"]),
+        (("study", "bound", "--runs", "3"), ["study bound", "python benchmarks/bound.py"]),
+        (("study", "paper", "--part", "1/3"), ["--part of legcal study", "--cluster"]),
         (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
         (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
     ],
@@ -251,7 +257,7 @@ def test_help_names_the_unit_of_the_tool_position(
 def test_progress_is_shown_unless_somebody_wants_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["simulate", "3-rpr", "--level", "axes", "--poses", "4", "--views", "1"]
+    words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "2"]
     assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
     shown = capsys.readouterr()
     assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0

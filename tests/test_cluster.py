@@ -26,8 +26,7 @@ from toy_studies import Draws
 
 from legcal import workers
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation.checkpoint import CHECKPOINT_NAME
-from legcal.simulation.study import run_study
+from legcal.simulation.study import CHECKPOINT_NAME, run_study
 from legcal.workers import Workers, worker_pool
 
 

@@ -18,7 +18,7 @@ from simulated import simulated
 from legcal import SimulationSettings, doctor, simulate
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.examination import CHECKS, Examination, Finding
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
 

@@ -35,7 +35,7 @@ from legcal.perception.free_poses import find_free_poses, require_standing_joint
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import in_turn

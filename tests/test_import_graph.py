@@ -174,7 +174,7 @@ PUBLIC: dict[str, set[str]] = {
     },
     "viewer": {"address", "source", "window"},
     "cli": set(),
-    "simulation": {"dataset", "observe", "paper", "previews", "request", "settings", "study"},
+    "simulation": {"dataset", "observe", "paper", "previews", "request", "study"},
 }
 OUTSIDE = {
     "__main__",

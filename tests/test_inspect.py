@@ -26,7 +26,7 @@ from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
 from legcal.report.calibration import accuracy_table
 from legcal.report.machine import inspect_table
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 
 
 def _printed(what: object) -> str:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hexapod_sessions import PaperSession, disturbed_hexapod, paper_session
 from staged_sessions import exact_session
 
 from legcal.data.axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
@@ -11,28 +12,19 @@ from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
-from legcal.simulation.hexapod import (
-    HexapodSession,
-    hexapod_cameras,
-    hexapod_session,
-    paper_hexapod,
-    perturb,
-)
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.vision.camera import Camera, sample_camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 
 
-def _session(camera: Camera, n_poses: int = 2) -> HexapodSession:
-    rng = np.random.default_rng(3)
-    machine = perturb(paper_hexapod(), rng, 0.002)
-    views = hexapod_cameras(machine, rng, camera=camera)
-    return hexapod_session(machine, views, rng, noise=OutlineNoise(), noisy=False, n_poses=n_poses)
+def _session(camera: Camera, n_poses: int = 2) -> PaperSession:
+    machine = disturbed_hexapod(3)
+    return paper_session(machine, OutlineNoise(), seed=3, camera=camera, n_poses=n_poses)
 
 
-def _axes(session: HexapodSession, outlines: Outlines) -> LegAxes:
-    return axes_from_outlines(outlines, session.measurements, session.machine.radius_of_part())
+def _axes(session: PaperSession, outlines: Outlines) -> LegAxes:
+    return axes_from_outlines(outlines, session.measurements, session.radii)
 
 
 def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
@@ -47,10 +39,10 @@ def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
 @pytest.mark.parametrize("camera", [sample_camera(), LENS])
 def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> None:
     session = _session(camera)
-    axes = _axes(session, session.outlines or pytest.fail("no outlines"))
+    axes = _axes(session, session.outlines)
     for i in range(len(axes)):
         row = int(axes.row[i])
-        T_camera_Rb = session.cameras[session.measurements.view[row]].T_Rb_camera.inv()
+        T_camera_Rb = session.T_camera_Rb[session.measurements.view[row]]
         pose = session.T_Rb_Re[session.measurements.pose[row]]
         A = T_camera_Rb.apply(session.machine.parameters.base_joints[axes.leg[i]])
         B_Rb = pose.apply(session.machine.parameters.platform_joints[axes.leg[i]])
@@ -64,7 +56,7 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
 
 def test_normals_follow_offsets_as_finite_differences_say() -> None:
     session = _session(LENS)
-    outlines = session.outlines or pytest.fail("no outlines")
+    outlines = session.outlines
     _, derivative = outline_derivative(LENS, outlines.h, outlines.ends)
     step = 1e-3
     for end in range(2):
@@ -77,7 +69,7 @@ def test_normals_follow_offsets_as_finite_differences_say() -> None:
 
 def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     session = _session(LENS)
-    outlines = session.outlines or pytest.fail("no outlines")
+    outlines = session.outlines
     exact = _axes(session, outlines)
     rng = np.random.default_rng(0)
     root = np.linalg.cholesky(exact.covariance)
@@ -120,7 +112,7 @@ def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances()
 
 def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused() -> None:
     session = _session(sample_camera())
-    outlines = session.outlines or pytest.fail("no outlines")
+    outlines = session.outlines
     used = outlines.used.copy()
     used[0] = False
     axes = _axes(session, replace(outlines, used=used))

@@ -29,8 +29,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import ParameterErrors
+from legcal.simulation.settings import Level, ParameterErrors
 from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg

@@ -40,8 +40,7 @@ from legcal.machine.parameters import geometries, moved_legs, parametrization_of
 from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings, Spread
 from legcal.simulation.truth import write_true_model
 
 KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties

@@ -47,8 +47,7 @@ from legcal.planning.request import difference
 from legcal.planning.session import write_session
 from legcal.report.plan import checklist, plan_table
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import ParameterErrors, SimulationSettings
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
 FEW = Setting(draws=3)

@@ -27,7 +27,7 @@ from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
 from legcal.simulation.dataset import SimulatedDataset
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.vision.board_file import parse_boards
 
 PATH = Path("dataset.yaml")

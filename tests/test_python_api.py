@@ -18,7 +18,7 @@ from simulated import simulated
 
 import legcal
 from legcal.errors import OutOfResources, UsageError
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 
 
 def test_everything_that_is_returned_is_short_to_look_at(example_run: Run) -> None:

@@ -22,8 +22,7 @@ from legcal.errors import LegcalError, ModelError, UsageError
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution, SimulationSettings, Spread
+from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
 BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])

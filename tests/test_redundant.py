@@ -46,8 +46,7 @@ from legcal.machine.redundancy import Contradiction, contradictions, reading_res
 from legcal.machine.solved_poses import solve_poses
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 
 
 def _concurrent() -> MachineSpec:

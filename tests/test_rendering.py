@@ -24,7 +24,7 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.pipeline import CAMERAS
 from legcal.simulation.rendering.scene import develop, prepare_view
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.simulation.solids import (
     Box,
     Material,

@@ -22,7 +22,7 @@ from legcal.files.published import schema_names
 from legcal.files.schema import read_yaml
 from legcal.machine.description_table import read_description
 from legcal.machine.schema import read_mechanism_file
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 from legcal.vision.camera_file import read_camera
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema (extra test) is not installed")

@@ -6,36 +6,38 @@ What options of the command give and how wrong ones are refused is in tests/refu
 import io
 import json
 import textwrap
-from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from outline_tables import LEG_NAMES, outlines_of, recorded
 from rich.console import Console
 from simulated import files_of, settings, simulated, small_camera
 
 import legcal
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import View
-from legcal.data.outlines import format_observations, read_observations
-from legcal.errors import DatasetError, NotVisible, OutOfResources, UsageError
-from legcal.machine.leg import LegKind
+from legcal.data.outlines import read_observations
+from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.geometry.motions import look_at
 from legcal.machine.loader import load_mechanism
 from legcal.report.images import simulation_table
+from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import SimulatedDataset, simulate, summary_document
-from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
-from legcal.simulation.observe import TableNoise
-from legcal.simulation.request import Level, Request, Sampling
+from legcal.simulation.folder import TRUTH_NAME
+from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.request import requested
 from legcal.simulation.settings import (
     Distribution,
+    Level,
     ParameterErrors,
+    Sampling,
     SimulationSettings,
     Spread,
-    requested,
 )
+from legcal.simulation.visibility import Viewpoint
 
 FEW = settings(poses=1, views=1)
 
@@ -139,17 +141,24 @@ def test_axes_of_any_seed_can_be_read(tmp_path: Path) -> None:
 
 def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path) -> None:
     nominal, lens = load_mechanism("3-rps"), small_camera(tmp_path)
-    asked = Request(camera=["webcam:60", str(lens)], poses="1", views=1)
-    found = requested(asked, nominal)
+    found = requested(nominal, camera=["webcam:60", str(lens)], poses="1")
     look = found.appearance
     assert (look.camera, look.jpeg, look.colour, found.camera) == ("webcam", 60, True, lens)
-    made = simulate("3-rps", tmp_path / "made", found)
+    made = simulate("3-rps", tmp_path / "made", replace(found, views=1))
     dataset = load_dataset(made.folder)
     (name,) = dataset.measurements.image
     assert name.endswith(".jpg")
     assert dataset.image_reader([0])(0).shape == (150, 200)
-    grey = requested(replace(asked, camera=["phone"], colour=False), nominal).appearance
-    assert (grey.camera, grey.jpeg, grey.colour) == ("phone", None, False)
+
+
+def test_photographs_show_the_machine_whatever_is_said_of_occlusion(tmp_path: Path) -> None:
+    few = replace(FEW, level=Level.PHOTOGRAPHS, camera=small_camera(tmp_path))
+    solid, clear = (
+        simulate("3-rps", tmp_path / str(occlusion), replace(few, occlusion=occlusion)).folder
+        for occlusion in (True, False)
+    )
+    (name,) = load_dataset(solid).measurements.image
+    assert (solid / name).read_bytes() == (clear / name).read_bytes()
 
 
 def _few_photographs(folder: Path, workers: int) -> SimulatedDataset:
@@ -175,36 +184,43 @@ def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: 
     (view,) = load_dataset(one.folder).measurements.views
     assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
     console = Console(width=400, record=True, file=io.StringIO())
-    console.print(simulation_table(summary_document(one)))
+    document = summary_document(one)
+    console.print(simulation_table(document))
     printed = console.export_text()
     assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
     assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
-    document = summary_document(one)
     document["views"]["c1"]["legs"]["leg2"] = 0
     console.print(simulation_table(document))
     assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()
 
 
+def _from_the_side(name: str, camera: Path | None, x: float, *legs: str) -> Viewpoint:
+    """Return a camera that sees the hexapod from a side."""
+    T = motion_from_xyz_quat((x, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
+    return Viewpoint(name, mild_lens() if camera is None else read_lens(camera), T, legs or None)
+
+
 def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
-    place = "T_base_camera: {{xyz: [{}, 0.26, 0.19], quat_xyzw: [0.411, 0.574, -0.552, -0.443]}}"
-    (tmp_path / "cameras.yaml").write_text(
-        f"views:\n  left: {{camera: small.yaml, {place.format(0.93)}}}\n"
-        f"  right: {{{place.format(0.94)}}}\n"
+    views = (
+        _from_the_side("left", small_camera(tmp_path), 0.93),
+        _from_the_side("right", None, 0.94, "leg2", "leg5"),
     )
-    small_camera(tmp_path)
     rows = ["0.06,0.06,0.06,0.06,0.06,0.06", "0.07,0.06,0.05,0.06,0.08,0.06"]
     header = ",".join(f"leg{j}_prismatic" for j in range(1, 7))
     (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
     given = settings(
-        views=tmp_path / "cameras.yaml", poses=str(tmp_path / "poses.csv"), readings=Spread(),
-        level=Level.AXES,
+        views=views, poses=tmp_path / "poses.csv", readings=Spread(), level=Level.AXES,
+        occlusion=False,
     )  # fmt: skip
-    m = load_dataset(simulate("hexapod", tmp_path / "set", given).folder).measurements
+    made = simulate("hexapod", tmp_path / "set", given)
+    m = load_dataset(made.folder).measurements
 
     def lens(view: View) -> tuple[str, int]:
         return view.name, view.camera.width
 
     assert [lens(view) for view in m.views] == [("left", 200), ("right", 1024)]
+    assert m.views[1].legs == ("leg2", "leg5")
+    assert made.seen.tolist() == [[True] * 6] * 2 + [[False, True, False, False, True, False]] * 2
     assert m.pose.tolist() == [0, 1, 0, 1]
     readings = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
@@ -226,81 +242,77 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
+def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:
+    T = look_at(np.array([1.0, 0.2, 0.3]), np.zeros(3)).inv()
+    assert np.allclose(T.apply(np.zeros(3))[:2], 0.0, atol=1e-12)
+    assert T.apply(np.zeros(3))[2] > 0.0
+    assert T.apply([0.0, 0.0, 0.1])[1] < 0.0
+
+
+def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
+    noise = OutlineNoise(sigma_px=0.2, n_points=50)
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 1.0, 50)
+    fits = np.polyfit(t, rng.normal(scale=0.2, size=(50, 20000)), 1)
+    ends = np.stack([fits[1], fits[0] + fits[1]])
+    assert np.allclose(np.cov(ends), noise.covariance(0.0), rtol=0.1, atol=2e-4)
+
+
 # --- settings
 
 
+VIEW = _from_the_side("side", None, 0.93)
+
+
 def test_options_that_are_not_given_are_the_defaults_of_the_settings() -> None:
-    assert requested(Request(), load_mechanism("hexapod")) == SimulationSettings()
+    assert requested(load_mechanism("hexapod")) == SimulationSettings()
 
 
 def test_options_become_settings(tmp_path: Path) -> None:
-    request = Request(
-        level=Level.OUTLINES, seed=4, error=["none", "radii=0.1mm", "joints=1mm:normal"],
-        poses="7", sampling=Sampling.WORKSPACE, shared_poses=True, images=2,
-        cameras=tmp_path / "c.yaml", hints=False, pixel_noise="0px",
-    )  # fmt: skip
+    lens = small_camera(tmp_path)
     joints = Spread(1e-3, Distribution.NORMAL)
     errors = ParameterErrors(base_joints=joints, platform_joints=joints, radii=Spread(1e-4))
-    assert requested(request, load_mechanism("hexapod")) == SimulationSettings(
-        level=Level.OUTLINES, seed=4, errors=errors, poses=7, sampling=Sampling.WORKSPACE,
-        shared_poses=True, images=2, views=tmp_path / "c.yaml", hints=False, sigma_px=0.0,
+    found = requested(
+        load_mechanism("hexapod"), level="outlines", camera=[str(lens)], poses="7",
+        error=["none", "radii=0.1mm", "joints=1mm:normal"], board="charuco", hand_held=True, seed=4,
     )  # fmt: skip
-
-
-GIVEN: dict[str, Any] = {
-    "tell_gamma": True, "pixel_noise": "0.2px", "table_noise": "degrees", "blur": 0.0, "clutter": 0,
-    "appearance": Path("look.yaml"), "bits": 8, "colour": False,
-}  # fmt: skip
-
-
-def test_options_of_another_level_are_refused() -> None:
-    nominal = load_mechanism("hexapod")
-    levels = {f.name: f.metadata["only"] for f in fields(Request) if f.metadata["only"]}
-    assert levels.keys() == GIVEN.keys()
-    for name, level in levels.items():
-        for other in set(Level) - {level}:
-            with pytest.raises(UsageError) as caught:
-                requested(Request(level=other, **{name: GIVEN[name]}), nominal)
-            (problem,) = caught.value.problems
-            assert f"found --level {other}, needed --level {level}" in problem
-    board = Request(level=Level.AXES, board="charuco", pixel_noise="0.2px")  # of its corners
-    assert requested(board, nominal).sigma_px == pytest.approx(0.2)
-
-
-PASSIVE = "hexapod with a passive leg"
+    assert found == SimulationSettings(
+        level=Level.OUTLINES, camera=lens, poses=7, errors=errors, board="charuco", hand_held=True,
+        seed=4,
+    )  # fmt: skip
+    assert requested(load_mechanism("hexapod"), poses=str(lens)).poses == lens
 
 
 @pytest.mark.parametrize(
-    ("machine", "request_", "named"),
+    ("options", "named"),
     [
-        ("hexapod", Request(error=["lengths=1mm"]), "--error lengths .* found none in the"),
-        ("hexapod", Request(error=["axes=1deg"]), "--error axes .* found none in the mechanism"),
-        ("hexapod", Request(error=["none"], coplanar=True), "--coplanar .* no errors of joints"),
-        (PASSIVE, Request(sampling=Sampling.WORKSPACE), "--sampling for a machine whose motors"),
-        (
-            "hexapod",
-            Request(board="charuco", hand_held=True, cameras=Path("c.yaml")),
-            "both --hand-held and --cameras",
-        ),
-        ("hexapod", Request(camera=["webcm"]), "'webcm', neither a kind .* webcam, phone"),
-        ("hexapod", Request(camera=["phone:best"]), "--camera .* found 'phone:best'"),
-        ("hexapod", Request(camera=["phone", "webcam"]), "found 0 files and 2 kinds"),
-        ("hexapod", Request(camera=["phone"], level=Level.AXES), "--camera phone .* --level axes"),
+        ({"error": ["lengths=1mm"]}, "--error lengths .* found none in the mechanism"),
+        ({"error": ["axes=1deg"]}, "--error axes .* found none in the mechanism"),
+        ({"error": ["joint=2mm"]}, "--error .* found 'joint=2mm'.*joints"),
+        ({"error": ["joints"]}, "--error .* found 'joints' without a size"),
+        ({"error": ["joints=2"]}, "--error joints .* needed a number and its unit"),
+        ({"error": ["joints=2mm:gauss"]}, "--error joints .* distribution 'gauss'"),
+        ({"error": ["joints=2m"]}, "--error joints .* found '2m', needed 0 to 1m"),
+        ({"camera": ["webcm"]}, "'webcm', neither a kind .* webcam, phone"),
+        ({"camera": ["phone:best"]}, "--camera .* found 'phone:best'"),
+        ({"camera": ["phone", "webcam"]}, "found 0 files and 2 kinds"),
+        ({"camera": ["phone"], "level": "outlines"}, "--camera phone .* --level outlines"),
+        ({"poses": "-3"}, "--poses .* found '-3'"),
+        ({"poses": "none.csv"}, "--poses .* found 'none.csv'"),
+        ({"poses": "0"}, "found 0 as poses, needed 1 to 100000"),
+        ({"board": "chess"}, "--board .* found 'chess'.*chessboard"),
+        ({"hand_held": True}, "--hand-held .* found no --board"),
+        ({"plan": Path("session"), "poses": "3"}, "found --plan and --poses"),
+        ({"plan": Path("session"), "hand_held": True}, "found --plan and --hand-held"),
     ],
 )
-def test_options_without_effect_on_a_machine_are_refused(
-    machine: str, request_: Request, named: str
-) -> None:
-    nominal = load_mechanism(machine.partition(" ")[0])
-    if machine == PASSIVE:
-        passive = replace(nominal.legs[1], kind=LegKind.PASSIVE)
-        nominal = replace(nominal, legs=(nominal.legs[0], passive, *nominal.legs[2:]))
+def test_options_without_sense_are_refused(options: dict[str, Any], named: str) -> None:
     with pytest.raises(UsageError, match=named):
-        requested(request_, nominal)
+        requested(load_mechanism("hexapod"), **options)
 
 
 def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
-    requested(Request(error=["lengths=0mm", "axes=0deg"]), load_mechanism("hexapod"))
+    requested(load_mechanism("hexapod"), error=["lengths=0mm", "axes=0deg"])
 
 
 @pytest.mark.parametrize(
@@ -321,12 +333,18 @@ def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
         ({"images": True}, "images"),
         ({"level": "pictures"}, "level 'pictures', needed axes or outlines or photographs"),
         ({"sampling": "best"}, "sampling 'best'"),
-        ({"poses": 10**9}, "poses, needed a whole number from 1 to 100000"),
+        ({"poses": 10**9}, "poses, needed 1 to 100000"),
         ({"seed": 1.5}, "seed"),
-        ({"seed": -1}, "seed, needed a whole number of 0 or more"),
+        ({"seed": -1}, "seed, needed 0 or more"),
         ({"poses": 1000, "views": 100, "images": 2}, "200000 images"),
         ({"board": "charuco", "hand_held": True, "images": 2}, "2 images of each pose"),
-        ({"board": "charuco", "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
+        ({"board": "charuco", "hand_held": True, "views": [VIEW]}, "and places of cameras"),
+        ({"board_pose": True}, "the pose of a board without a board"),
+        ({"views": "cameras.yaml"}, "views, needed a whole number or Viewpoints"),
+        ({"views": []}, "0 as views, needed 1 to 100000"),
+        ({"views": [VIEW, "c2"]}, "'c2' as view 1, needed a Viewpoint"),
+        ({"views": [VIEW, VIEW]}, "views named 'side', 'side', needed different names"),
+        ({"views": [replace(VIEW, name="../side")]}, "views named '../side'"),
         ({"board": 3}, "3 as board, needed a Board"),
     ],
 )
@@ -341,217 +359,83 @@ def test_spreads_without_sense_are_refused(size: Any, distribution: Any) -> None
         Spread(size, distribution)
 
 
-def test_numbers_choices_and_paths_of_any_type_count(tmp_path: Path) -> None:
+def test_numbers_of_numpy_and_names_of_choices_count(tmp_path: Path) -> None:
     found = settings(
-        poses=np.int64(2), seed=np.uint8(3), readings=Spread(np.float64(0.0)), level="axes",
-        sampling="workspace", camera="lens.yaml",
+        poses=np.int64(2), seed=np.uint8(3), readings=Spread(np.float64(0.0), "normal"),
+        level="axes", sampling="workspace",
     )  # fmt: skip
-    assert (found.poses, found.seed) == (2, 3)
-    assert type(found.poses) is type(found.seed) is int
-    assert (found.level, found.sampling) == (Level.AXES, Sampling.WORKSPACE)
-    assert found.camera == Path("lens.yaml")
-    with pytest.raises(UsageError, match="found 0 workers, needed a whole number of 1 or more"):
+    named = settings(
+        poses=2, seed=3, readings=Spread(0.0, Distribution.NORMAL), level=Level.AXES,
+        sampling=Sampling.WORKSPACE,
+    )  # fmt: skip
+    assert files_of(simulate("3-rps", tmp_path / "a", found).folder) == files_of(
+        simulate("3-rps", tmp_path / "b", named).folder
+    )
+    with pytest.raises(UsageError, match="found 0 workers, needed 1 or more"):
         simulate("hexapod", tmp_path / "set", found, workers=0)
 
 
-# --- cameras
+@pytest.mark.parametrize(
+    ("model", "changes", "named"),
+    [
+        ("hexapod", {"readings": Spread(1.0)}, "readings .* needed .* 29.6 mm"),
+        ("delta", {"lengths": {"leg1.base:leg2.platform": 5e-5}}, "length 'leg1.base:leg2.platfo"),
+        ("hexapod", {"views": [replace(VIEW, legs=("leg7",))]}, "view side: .* found leg7, which"),
+    ],
+)
+def test_settings_without_sense_for_a_machine_are_refused(
+    model: str, changes: dict[str, object], named: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=named):
+        simulate(model, tmp_path / "set", settings(poses=1, **changes))
+    assert files_of(tmp_path) == {}
 
 
-def test_cameras_of_too_many_pixels_or_images_are_refused(tmp_path: Path) -> None:
+def test_cameras_of_too_many_pixels_are_refused(tmp_path: Path) -> None:
     large = settings(poses=1, views=1, camera=small_camera(tmp_path, 4_000_000_000, 3000))
     with pytest.raises(DatasetError, match="found 4000000000 x 3000 px, needed at most"):
         simulate("hexapod", tmp_path / "set", large)
-    place = "{T_base_camera: {xyz: [1, 0, 0.2], quat_xyzw: [0, 0, 0, 1]}}"
-    path = tmp_path / "cameras.yaml"
-    path.write_text(f"views: {{a: {place}, b: {place}}}\n")
-    with pytest.raises(UsageError, match=r"found 120000 images \(2 views of 1 poses, 60000 of"):
-        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path, images=60_000))
 
 
-# --- the folder: what --force replaces, and what it never touches
-
-
-OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
-DETECTED = format_observations(outlines_of(1), recorded(), LEG_NAMES)
-EDITED = DETECTED.replace("detected", "edited", 1)
-
-
-def write(folder: Path, files: dict[str, str]) -> None:
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(content)
-
-
-def fill(folder: Path, content: str = "new", *more: str) -> None:
-    write(folder, dict.fromkeys((*OWN, *more), content))
-    truth = {"legcal_truth": 1, "files": [*OWN, *more, TRUTH_NAME]}
-    (folder / TRUTH_NAME).write_text(json.dumps(truth))
-
-
-def replace_dataset(out: Path) -> None:
-    with dataset_folder(out, force=True) as folder:
-        fill(folder)
-
-
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    """Return the folder of an earlier simulated dataset."""
-    fill(tmp_path / "out", "old")
-    return tmp_path / "out"
-
-
-def test_force_replaces_a_simulated_dataset_and_keeps_what_is_not_its_own(tmp_path: Path) -> None:
-    simulate("hexapod", tmp_path, FEW)
-    with pytest.raises(UsageError, match=r"found a simulated dataset.*--force"):
-        simulate("hexapod", tmp_path, FEW)
-    write(tmp_path, {"notes.txt": "mine", ".legcal-cache.json": "{}"})
-    simulate("3-rps", tmp_path, replace(FEW, level=Level.AXES), force=True)
-    files = files_of(tmp_path)
-    assert files["notes.txt"] == b"mine"
-    assert "axes.csv" in files
-    gone = {"observations.csv", ".legcal-cache.json", "models/hexapod.yaml", "urdf/hexapod.urdf"}
-    assert not gone & set(files)
-    assert set(json.loads(files[TRUTH_NAME])["files"]) == set(files) - {"notes.txt"}
-    write(tmp_path, {"images/c1_p01.png": "mine"})  # into a set without photographs
-    with pytest.raises(UsageError, match=r"images/c1_p01\.png, which an earlier simulation did"):
-        simulate("hexapod", tmp_path, FEW, force=True)
-
-
-def test_a_failure_leaves_an_earlier_dataset_as_it_was(out: Path, tmp_path: Path) -> None:
-    away = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
-    (tmp_path / "cameras.yaml").write_text(f"views: {{c1: {{T_base_camera: {away}}}}}\n")
-    before = files_of(tmp_path)
-    with pytest.raises(NotVisible):
-        simulate("hexapod", out, settings(poses=1, views=tmp_path / "cameras.yaml"), force=True)
-    assert files_of(tmp_path) == before
-
-    def full() -> None:
-        with dataset_folder(tmp_path / "new", force=False) as folder:
-            raise OutOfResources(f"{folder}: found 'No space left on device'.")
-
-    with pytest.raises(OutOfResources, match=f"^{tmp_path}/new: found 'No space") as refusal:
-        full()
-    assert "legcal-part" not in str(refusal.value)
-    assert files_of(tmp_path) == before
-
-
-def test_files_of_others_beside_a_dataset_are_kept_whatever_its_truth_names(out: Path) -> None:
-    mine = ("notes.txt", "result/a.csv", "images/.hidden")
-    write(out, dict.fromkeys(mine, "mine"))
-    write(out.parent, {"precious.txt": "mine"})
-    others = ["notes.txt", "result/a.csv", "..", "", "images/../notes.txt", "../precious.txt",
-              str(out.parent / "precious.txt"), 7]  # fmt: skip
-    truth = {"legcal_truth": 1, "files": [*OWN, TRUTH_NAME, *others]}
-    (out / TRUTH_NAME).write_text(json.dumps(truth))
-    replace_dataset(out)
-    found = files_of(out)
-    assert {found[name] for name in OWN} == {b"new"}
-    assert {found[name] for name in mine} == {b"mine"}
-    assert (out.parent / "precious.txt").read_text() == "mine"
+# --- the folder
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["images/c2_p01.png", "images/mine/a.png", "axes.csv", "observations.csv",
-     "camera_info_c2.yaml", "measurements.csv", "models/b.yaml", "truth/notes.txt", "urdf"],
-)  # fmt: skip
-def test_a_file_of_the_user_in_the_place_of_a_dataset_is_refused_first(
-    name: str, out: Path
-) -> None:
-    write(out, {name: "mine"})
-    before = files_of(out)
-    with pytest.raises(UsageError, match="nothing was changed") as refusal:
-        check_dataset_destination(out, force=True)
-    assert name.removesuffix("/a.png") in str(refusal.value)
-    assert files_of(out) == before
-
-
-@pytest.mark.parametrize("name", ["images", "truth/models", "dataset.yaml", "images/c1_p01.png"])
-def test_nothing_is_written_through_links(name: str, out: Path, tmp_path: Path) -> None:
-    (out / name).rename(tmp_path / "elsewhere")
-    (out / name).symlink_to(tmp_path / "elsewhere")
-    before = files_of(tmp_path)
-    with pytest.raises(UsageError, match=f"found {name}, which is a link"):
-        replace_dataset(out)
-    assert files_of(tmp_path) == before
-
-
-def test_what_appears_while_a_dataset_is_made_is_not_replaced(out: Path) -> None:
-    def late() -> None:
-        with dataset_folder(out, force=True) as folder:
-            fill(folder, "new", "images/c2_p01.png")
-            write(out, {"images/c2_p01.png": "mine"})
-
-    with pytest.raises(UsageError, match=r"images/c2_p01\.png, which legcal did not write"):
-        late()
-    found = files_of(out)
-    assert found.pop("images/c2_p01.png") == b"mine"
-    assert {found[name] for name in OWN} == {b"old"}
-
-
-@pytest.mark.parametrize(
-    ("table", "cache"),
+    ("there", "name", "named"),
     [
-        (DETECTED, '{"given": []}'),  # as a calibration left them
-        (EDITED, '{"given": []}'),
-        (DETECTED, '{"given": [["c1", "images/c1_p01.png"]]}'),
-        (DETECTED, "{"),
-        (DETECTED, "[]"),
-        ("view\n\0\xe9", '{"given": [1]}'),
+        ("dataset.yaml", "", "found a folder with files, needed a new or empty folder"),
+        (TRUTH_NAME, "", "found a simulated dataset, needed .* remove this one first"),
+        ("file", "file", "found a file of that name"),
+        ("file", "file/sub", "file is a file"),
+        ("file", "n" * 300, "'File name too long'"),
     ],
 )
-def test_outlines_go_where_a_calibration_left_them_and_else_stay(
-    table: str, cache: str, out: Path
-) -> None:
-    write(out, {"observations.csv": table, ".legcal-cache.json": cache})
-    before = files_of(out)
-    if table == DETECTED and cache == '{"given": []}':
-        replace_dataset(out)
-        assert not {"observations.csv", ".legcal-cache.json"} & set(files_of(out))
-        return
-    with pytest.raises(UsageError, match=r"observations\.csv, which an earlier simulation did not"):
-        replace_dataset(out)
-    assert files_of(out) == before
-
-
-def _folder_for_a_file(folder: Path) -> None:
-    fill(folder)
-    (folder / "dataset.yaml").unlink()
-    (folder / "dataset.yaml").mkdir()
-
-
-@pytest.mark.parametrize(
-    ("name", "before", "named"),
-    [
-        ("", lambda folder: write(folder, {"dataset.yaml": "legcal_dataset: 1\n"}), "files"),
-        ("", _folder_for_a_file, r"found (a simulated dataset|dataset\.yaml, which is a folder)"),
-        ("file", lambda folder: write(folder, {"file": "mine"}), "found a file of that name"),
-        ("file/sub", lambda folder: write(folder, {"file": "mine"}), "file is a file"),
-        ("n" * 300, lambda folder: None, "'File name too long'"),
-    ],
-)
-def test_what_is_no_simulated_dataset_is_not_touched_even_with_force(
-    name: str, before: Callable[[Path], None], named: str, tmp_path: Path
-) -> None:
-    before(tmp_path)
+def test_what_is_there_is_never_touched(there: str, name: str, named: str, tmp_path: Path) -> None:
+    (tmp_path / there).parent.mkdir(exist_ok=True)
+    (tmp_path / there).write_text('{"legcal_truth": 1}')
     files = files_of(tmp_path)
-    for force in (False, True):
-        with pytest.raises(UsageError, match=named):
-            simulate("hexapod", tmp_path / name, FEW, force=force)
+    with pytest.raises(UsageError, match=named):
+        simulate("hexapod", tmp_path / name, FEW)
     assert files_of(tmp_path) == files
 
 
-def test_a_name_of_the_greatest_length_is_a_name_and_an_empty_one_is_none(tmp_path: Path) -> None:
-    with dataset_folder(tmp_path / ("ä" * 127), force=False) as folder:
-        fill(folder)
-    assert (tmp_path / ("ä" * 127) / "dataset.yaml").exists()
+@pytest.mark.parametrize(
+    ("xyz", "quat_xyzw", "refused", "named"),
+    [
+        ((1.5, 0.0, 0.2), (0.5, 0.5, 0.5, 0.5), NotVisible, "view c1: .* no image shows a leg"),
+        ((90.0, 0.0, 0.2), (-0.5, -0.5, 0.5, 0.5), NotVisible, "view c1: .* px long in them"),
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0), UsageError, "view c1: .* inside the machine"),
+    ],
+)
+def test_cameras_that_show_nothing_are_refused_and_nothing_is_written(
+    xyz: Any, quat_xyzw: Any, refused: type[Exception], named: str, tmp_path: Path
+) -> None:
+    view = Viewpoint("c1", mild_lens(), motion_from_xyz_quat(xyz, quat_xyzw))
+    with pytest.raises(refused, match=named):
+        simulate("hexapod", tmp_path / "set", settings(views=[view]))
+    assert files_of(tmp_path) == {}
+
+
+def test_an_empty_name_is_no_folder() -> None:
     with pytest.raises(UsageError, match="dataset could not be written: found an empty text"):
         simulate("hexapod", "", FEW)
-
-
-@pytest.mark.parametrize(("model", "unit"), [("hexapod", "mm"), ("delta", "deg")])
-def test_noise_of_readings_without_unit_is_told_the_units_of_the_motors(
-    model: str, unit: str
-) -> None:
-    with pytest.raises(UsageError, match=rf"--encoder-noise .*such as 0.5{unit}"):
-        requested(Request(encoder_noise="0.5"), load_mechanism(model))

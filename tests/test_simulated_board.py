@@ -20,8 +20,7 @@ from legcal.perception.board_corners import find_corners
 from legcal.perception.board_poses import camera_poses_by_board
 from legcal.simulation.board import chosen_board
 from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level
-from legcal.simulation.settings import SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 from legcal.vision.board_file import parse_board
 
 

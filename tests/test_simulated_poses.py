@@ -22,8 +22,7 @@ from legcal.machine.mobility import dimensionless, is_on_same_side, singularity
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.simulation import poses as module
 from legcal.simulation.poses import are_extreme, commanded_poses, draw_poses, given_poses
-from legcal.simulation.request import Sampling
-from legcal.simulation.settings import DEFAULT_ERRORS
+from legcal.simulation.settings import DEFAULT_ERRORS, Sampling
 from legcal.simulation.truth import write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

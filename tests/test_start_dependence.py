@@ -16,7 +16,7 @@ from start_dependence import (
     with_other_model,
 )
 
-from legcal.simulation.request import Level
+from legcal.simulation.settings import Level
 
 OUTLINES = {
     "hexapod": Session("hexapod", Level.OUTLINES, 8, 3, 6),

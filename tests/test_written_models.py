@@ -45,8 +45,13 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.urdf import UrdfPatch
 from legcal.simulation.poses import draw_poses
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution, ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.settings import (
+    Distribution,
+    Level,
+    ParameterErrors,
+    SimulationSettings,
+    Spread,
+)
 from legcal.simulation.truth import draw_errors, write_true_model
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")

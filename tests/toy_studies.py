@@ -52,9 +52,6 @@ class Draws:
             raise DidNotConverge(f"The draw is {x}.")
         return {"x": x}
 
-    def is_record(self, found: Any) -> bool:
-        return isinstance(found, dict) and isinstance(found.get("x"), float)
-
     def summary(self, records: Iterable[Record]) -> Total:
         total, n = 0.0, 0
         for record in records:

@@ -6,14 +6,31 @@ from collections.abc import Mapping, Sequence
 
 from legcal.errors import UsageError
 
+
+def _benchmark(program: str) -> str:
+    """Return where a study is that was a command."""
+    return f"run python benchmarks/{program} of the source tree"
+
+
 COMMANDS = {
     "noise": "calibrate writes the noise of its outlines into its result, and legcal plan --noise "
     "RESULT reads it there",
+    "study bound": _benchmark("bound.py"),
+    "study convergence": _benchmark("convergence.py"),
+    "study classes": _benchmark("classes_study.py"),
 }
 _DRY_RUN = "what was understood is shown before it is written, and files that are there stay"
 _TOPIC = "write the topic of the images behind the bag, BAG:/left/image_raw"
 _ONE_MACHINE = "calibrate one dataset a call, many in a loop (docs/python.md, Many machines)"
 _TABLE = "write it in the table, for which legcal new --template makes one to start from"
+
+
+def _setting(text: str) -> str:
+    """Return how a setting of a simulated dataset is chosen in Python."""
+    return f"call legcal.simulate(MODEL, FOLDER, legcal.SimulationSettings({text})) in Python"
+
+
+_LOOK = _setting("appearance=legcal.Appearance(...)")
 OPTIONS: Mapping[str, Mapping[str, str]] = {
     "calibrate": {
         "--fix": "write --set NAME, or --set NAME=VALUE",
@@ -57,8 +74,36 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--rod-spacing": "write the joints in the table, for which legcal new --template --family "
         "delta makes one to start from",
     },
+    "simulate": {
+        "--level axes": _setting('level="axes"'),
+        "--coplanar": _setting("errors=legcal.ParameterErrors(coplanar=True, ...)"),
+        "--sampling": _setting('sampling="workspace"'),
+        "--shared-poses": _setting("shared_poses=True"),
+        "--own-poses": "each view has its own poses",
+        "--images": _setting("images=N"),
+        "--views": _setting("views=N"),
+        "--cameras": _setting("views=[legcal.Viewpoint(NAME, CAMERA, T_base_camera), ...]"),
+        "--platform-board": _setting("platform_board=..."),
+        "--board-pose": _setting("board_pose=True, ..."),
+        "--hints": "rough camera poses are written",
+        "--no-hints": _setting("hints=False"),
+        "--gamma": "gamma is written",
+        "--no-gamma": _setting("tell_gamma=False"),
+        "--length": _setting('lengths={"leg1.base:leg1.platform": 5e-5}'),
+        "--pixel-noise": _setting('level="outlines", sigma_px=...'),
+        "--table-noise": _setting('level="axes", table=legcal.TableNoise(...)'),
+        "--encoder-noise": _setting('readings=legcal.Spread(2e-6, "normal")'),
+        **dict.fromkeys(
+            ("--appearance", "--blur", "--clutter", "--bits", "--colour", "--grey"), _LOOK
+        ),
+        "--force": "give a new or empty folder, or remove the old one first",
+    },
+    "study": {
+        "--part": "--cluster spreads the runs",
+        "--merge": "the same command goes on from the runs in its folder",
+    },
 }
-"""What stands in place of options, by command: the rest of a sentence."""
+"""What stands in place of options, or of a choice, by command: the rest of a sentence."""
 
 
 def refuse_retired(words: Sequence[str]) -> None:
@@ -70,10 +115,14 @@ def refuse_retired(words: Sequence[str]) -> None:
         The command line without the name of the program.
     """
     command = words[0] if words else ""
-    if command in COMMANDS:
-        raise UsageError(f"legcal {command} is gone: {COMMANDS[command]}.")
+    for name in (command, " ".join(words[:2])):
+        if name in COMMANDS:
+            raise UsageError(f"legcal {name} is gone: {COMMANDS[name]}.")
     instead = OPTIONS.get(command, {})
-    given = dict.fromkeys(word.partition("=")[0] for word in words[1:])
+    given = dict[str, None]()
+    for word, following in zip(words[1:], [*words[2:], ""], strict=False):
+        name, equals, value = word.partition("=")
+        given |= {name: None, f"{name} {value if equals else following}": None}
     problems = [
         f"{option} of legcal {command} is gone: {instead[option]}."
         for option in given

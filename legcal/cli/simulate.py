@@ -1,9 +1,10 @@
-"""``legcal simulate``: its options are the fields of :class:`legcal.simulation.request.Request`."""
+"""``legcal simulate``: a dataset of a machine whose truth is known."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -12,53 +13,117 @@ from legcal.cli.options import (
     JsonOption,
     ModelArgument,
     QuietOption,
-    declare,
-    declared,
+    WorkersOption,
     image_workers,
-    parameters_of,
     show,
 )
-from legcal.simulation.request import Request
 
-OutputOption = Annotated[
-    Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to write.")
-]
-ForceOption = Annotated[
-    bool, typer.Option("--force", help="Replace an earlier simulated dataset in that folder.")
-]
+
+class _Level(StrEnum):
+    """What a dataset gives a calibration to work on."""
+
+    PHOTOGRAPHS = "photographs"
+    OUTLINES = "outlines"
 
 
 def simulate(
     model: ModelArgument,
-    output: OutputOption,
-    force: ForceOption = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to write.")
+    ],
+    level: Annotated[
+        _Level,
+        typer.Option(help="Rendered photographs, or outlines with noise (observations.csv)."),
+    ] = _Level.PHOTOGRAPHS,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE|KIND",
+            help="Camera file (ROS, OpenCV, Kalibr); or what it does to photographs: machine-jpeg, "
+            "webcam, phone, action or industrial, webcam:60 for another JPEG quality. Once for "
+            "each.",
+            show_default="1024 x 768 px, slight distortion; industrial",
+        ),
+    ] = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|CSV",
+            help="Poses for each of the three views, every motor near an end of its travel; or a "
+            "CSV of readings in metres (radians of arms), the motors' joints in its header, for "
+            "all views.",
+            show_default="15",
+        ),
+    ] = None,
+    error: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND=SIZE",
+            help="How far the true machine is from the model: joints, base-joints, "
+            "platform-joints, offsets, lengths (2mm), axes, twists (0.1deg), radii (0mm); uniform "
+            "in +-SIZE, or SIZE:normal; none for no errors. May be repeated.",
+            show_default="joints, offsets, lengths=2mm; axes, twists=0.1deg",
+        ),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND|FILE",
+            help="A calibration board on the base: chessboard, charuco or aprilgrid, of a size "
+            "that fits the machine, or a YAML with the block board of a dataset.",
+            show_default="none",
+        ),
+    ] = None,
+    hand_held: Annotated[
+        bool,
+        typer.Option(
+            "--hand-held", help="Every image from another camera position, with the board in it."
+        ),
+    ] = False,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SESSION",
+            help="Instead of poses and cameras: a session that legcal plan wrote, with tripods as "
+            "far off as it allows for.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(help="The same seed gives the same dataset, to the last bit.")
+    ] = 0,
+    workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
-    **options: Any,
 ) -> None:
     """Simulate a dataset of a machine whose true model is known, and write it with the truth.
 
-    The default is 45 photographs: 3 views of 15 extreme poses each.
+    The default is 45 photographs: 3 views of 15 extreme poses each. Python has more choices
+    (legcal.SimulationSettings).
     """
     from legcal.machine.loader import load_mechanism
     from legcal.report.images import simulation_table
     from legcal.simulation.dataset import simulate as run
     from legcal.simulation.dataset import summary_document
-    from legcal.simulation.settings import requested
+    from legcal.simulation.request import requested
 
     nominal = load_mechanism(model)
-    settings = requested(Request(**options), nominal)
-    workers = image_workers(cluster)
-    made = run(nominal, output, settings, force=force, workers=workers, progress=not quiet)
+    settings = requested(
+        nominal,
+        level=level.value,
+        camera=camera or (),
+        poses=poses,
+        error=error or (),
+        board=board,
+        hand_held=hand_held,
+        plan=plan,
+        seed=seed,
+    )
+    used = image_workers(cluster, workers)
+    made = run(nominal, output, settings, workers=used, progress=not quiet)
     document = summary_document(made)
     show(
         as_json,
         lambda: document,
         lambda: simulation_table(document, to_measure=made.to_measure),
     )
-
-
-_model, _output, _force, *_usual = parameters_of(simulate)
-_level, _seed, *_others = declared(Request)
-declare(simulate, [_model, _output, _level, _seed, _force, *_others, *_usual])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +19,6 @@ from legcal.cli.options import (
     show,
     write_page,
 )
-from legcal.errors import UsageError
 from legcal.processors import processors
 
 OutputFolder = Annotated[
@@ -34,18 +31,6 @@ OutputFolder = Annotated[
         "goes on from what is there.",
     ),
 ]
-
-_BENCHMARKS = {  # that replace studies of earlier versions, and what they measure
-    "bound": ("bound.py", "errors of a calibration, and its sigmas, beside the Cramer-Rao bound"),
-    "convergence": (
-        "convergence.py",
-        "where calibrations end that start 5 mm and 3 deg off in everything",
-    ),
-    "classes": (
-        "classes_study.py",
-        "shipped machines by the four steps and by the fit, beside the bound",
-    ),
-}
 
 study = typer.Typer(
     help="Validate the method on many simulated machines whose truth is known.",
@@ -60,14 +45,6 @@ def paper(
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     output: OutputFolder = None,
-    part: Annotated[
-        str | None,
-        typer.Option(metavar="K/N", help="Only every N-th run, from run K on: a job of an array."),
-    ] = None,
-    merge: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="OUT", help="Take over the runs of a part; may be repeated."),
-    ] = None,
     radians: Annotated[
         bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
     ] = False,
@@ -94,45 +71,9 @@ def paper(
         output=output,
         progress=not quiet,
         beside=page,
-        part=_part(part),
-        merge=merge or (),
     )
     page.say()
     document = result.document()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nRuns, document and figures: {output}")
-
-
-def _part(text: str | None) -> tuple[int, int] | None:
-    """Return which part of how many a text names."""
-    if text is None:
-        return None
-    k, slash, n = text.partition("/")
-    if not (slash and k.isdecimal() and n.isdecimal()):
-        raise UsageError(
-            f"--part could not be used: found '{text}', needed K/N as in 3/100, K from 1 to N; "
-            "correct it."
-        )
-    return int(k), int(n)
-
-
-def _name_benchmark(name: str, program: str) -> Callable[[typer.Context], None]:
-    """Return the command of a study that is a benchmark now: it names the command to run."""
-
-    def command(context: typer.Context) -> None:
-        words = shlex.join(["python", f"benchmarks/{program}", *context.args])
-        raise UsageError(
-            f"The study {name} could not be run: found a command of an earlier version, needed the "
-            f"benchmark of the source tree; run {words}."
-        )
-
-    return command
-
-
-for _name, (_program, _what) in _BENCHMARKS.items():
-    study.command(
-        _name,
-        help=f"Name the benchmark: {_what}.",
-        context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
-    )(_name_benchmark(_name, _program))

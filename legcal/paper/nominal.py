@@ -5,7 +5,6 @@ Every step takes such a machine and returns it with what it has estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +18,6 @@ from legcal.machine.leg import (
     Leg,
     LegKind,
     parameters_of_legs,
-    point_like_legs,
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, is_spatial
@@ -97,10 +95,3 @@ class NominalMachine:
 def nominal_machine(machine: Machine) -> NominalMachine:
     """Return a machine as the steps take it."""
     return NominalMachine(machine.leg_names, geometries(machine), machine.frame_legs)
-
-
-def point_like_machine(
-    leg_names: Sequence[str], parameters: KinematicParameters, frame_legs: tuple[int, ...]
-) -> NominalMachine:
-    """Return a machine with point-like joints."""
-    return NominalMachine(tuple(leg_names), point_like_legs(parameters), frame_legs)

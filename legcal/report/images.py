@@ -134,8 +134,8 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Rende
             "travel.",
             Text(
                 "Readings of motors that turn carry no length, and nothing else in this dataset "
-                f"does: simulate with --length {to_measure}=0.05mm, or calibrate with --length "
-                "or --set.",
+                "does: simulate with --board charuco, or calibrate with --length "
+                f"{to_measure}=MEASURED±SIGMAmm.",
                 style="yellow",
             )
             if to_measure

@@ -1,4 +1,4 @@
-"""Simulated cameras and the board: their files, and where they stand so that images show the legs.
+"""Simulated cameras and the board: where they stand so that images show the legs.
 
 Places around a machine are scored by how long its legs are in the images. A board lies flat near
 the base joints, among the legs or beside them; for cameras with given poses it may also be raised
@@ -11,16 +11,12 @@ import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
-from legcal.files.motions import MotionEntry
-from legcal.files.schema import FileSchema, PlainName, read_yaml, validate
 from legcal.geometry.lines import direction_above, normal_basis
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
@@ -89,19 +85,6 @@ def _any_direction(rng: np.random.Generator) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-class PlaceEntry(FileSchema):
-    """One camera."""
-
-    T_base_camera: MotionEntry
-    camera: str | None = None
-
-
-class CamerasEntry(FileSchema):
-    """The whole file."""
-
-    views: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
-
-
 def read_lens(path: Path) -> Camera:
     """Return the camera of a camera file, of a size that pictures can have."""
     camera = read_camera(path)
@@ -112,19 +95,6 @@ def read_lens(path: Path) -> Camera:
             "correct its image size."
         )
     return camera
-
-
-def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
-    """Return the camera and T_base_camera of every view of a file."""
-    found = read_yaml(path, "cameras file")
-    entry = validate(CamerasEntry, found, path)
-    return {
-        name: (
-            camera if view.camera is None else read_lens(path.parent / view.camera),
-            view.T_base_camera.motion(),
-        )
-        for name, view in entry.views.items()
-    }
 
 
 def cameras_around(

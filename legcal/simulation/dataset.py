@@ -19,7 +19,7 @@ from legcal.data.measurements import Measurements
 from legcal.data.outlines import write_observations
 from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
-from legcal.files.folder import output_path
+from legcal.files.folder import output_path, result_folder
 from legcal.files.reading import MAX_DOCUMENT, read_bytes
 from legcal.files.schema import Document, describe
 from legcal.geometry.types import Array
@@ -33,14 +33,12 @@ from legcal.simulation.folder import (
     TRUTH,
     TRUTH_NAME,
     check_dataset_destination,
-    dataset_folder,
     files_in,
     write_session,
     write_truth,
 )
 from legcal.simulation.observe import corners_in_images
 from legcal.simulation.poses import are_extreme
-from legcal.simulation.request import Level
 from legcal.simulation.session import (
     SimulatedSession,
     Streams,
@@ -49,7 +47,7 @@ from legcal.simulation.session import (
     simulate_session,
     streams,
 )
-from legcal.simulation.settings import SimulationSettings, joint_distance, whole_number
+from legcal.simulation.settings import Level, SimulationSettings, joint_distance
 from legcal.simulation.truth import write_true_model
 from legcal.workers import Workers, is_number
 
@@ -96,7 +94,6 @@ def simulate(
     output: str | Path,
     settings: SimulationSettings | None = None,
     *,
-    force: bool = False,
     workers: Workers = 1,
     progress: Progress = False,
 ) -> SimulatedDataset:
@@ -114,8 +111,6 @@ def simulate(
         The folder of the dataset.
     settings : SimulationSettings, optional
         What to simulate.
-    force : bool
-        Replace an earlier simulated dataset.
     workers : int, str or executor
         Render photographs there, as :func:`legcal.calibrate` searches them.
     progress : bool or callable
@@ -128,7 +123,7 @@ def simulate(
     Raises
     ------
     UsageError
-        If the output holds something else, or a camera is inside the machine.
+        If the output holds anything, or a camera is inside the machine.
     ModelError, DatasetError, OutOfClass
         If a file is malformed or not covered.
     DidNotConverge
@@ -138,13 +133,16 @@ def simulate(
     """
     settings = settings or SimulationSettings()
     destination = output_path(output, SIMULATED)
-    if is_number(workers):
-        whole_number("workers", workers, 1)
-    check_dataset_destination(destination, force=force)
+    if is_number(workers) and workers < 1:
+        raise UsageError(
+            f"The dataset could not be simulated: found {workers} workers, needed 1 or more; "
+            "correct it."
+        )
+    check_dataset_destination(destination)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     _check_readings(nominal, settings)
     rngs = streams(settings.seed)
-    with shown_progress(progress) as report, dataset_folder(destination, force=force) as folder:
+    with shown_progress(progress) as report, result_folder(destination, SIMULATED) as folder:
         yaml_path, _ = write_model(nominal, folder)
         truth = write_true_model(nominal, settings.errors, rngs["errors"], folder / TRUTH)
         session = simulate_session(truth, nominal, settings, rngs, report)
@@ -166,10 +164,11 @@ def simulate(
             write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)
-        if settings.level is Level.PHOTOGRAPHS:
+        if settings.level == Level.PHOTOGRAPHS:
             _write_photographs(folder, session, settings, rngs, workers, report)
         if settings.plan is not None:
-            (folder / PLAN_NAME).write_bytes(read_bytes(settings.plan / PLAN_NAME, MAX_DOCUMENT))
+            plan = read_bytes(Path(settings.plan) / PLAN_NAME, MAX_DOCUMENT)
+            (folder / PLAN_NAME).write_bytes(plan)
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(folder / TRUTH_NAME, session, settings, files)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
@@ -177,7 +176,7 @@ def simulate(
     rod = truth.rod_for_scale(has_length=bool(measured or session.boards))
     return SimulatedDataset(
         folder=destination,
-        level=settings.level,
+        level=Level(settings.level),
         nominal=nominal,
         truth=truth,
         truth_path=destination / TRUTH / "models" / truth.yaml_path.name,

@@ -8,33 +8,24 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from legcal.calibration.closeness import PLAN_NAME
-from legcal.data.dataset import AXES_NAME, CACHE_NAME, CORNERS_NAME, OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import OUTLINE_COLUMNS
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
-    check_destination,
     check_path,
     holds_files,
-    in_the_way,
-    path_problem,
-    result_folder,
 )
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.published import with_schema
-from legcal.files.reading import read_json
-from legcal.files.table import format_table, read_table
+from legcal.files.table import format_table
 from legcal.machine.model import Machine
 from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
@@ -44,9 +35,6 @@ from legcal.vision.camera_file import camera_info
 
 TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"
-_FOLDERS = ("images", "models", "urdf", TRUTH)
-_TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
-_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml", PLAN_NAME)
 SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 
@@ -116,7 +104,7 @@ def write_truth(
         "legcal_truth": 1,
         "legcal": __version__,
         "model": f"models/{truth.yaml_path.name}",
-        "settings": _plain(asdict(settings)),
+        "settings": _plain(asdict(replace(settings, views=settings.n_views))),
         "radii": {leg.name: leg.radius_of_part for leg in truth.legs},
         "views": {
             view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)}
@@ -143,104 +131,24 @@ def _plain(value: Any) -> Any:
         return [_plain(x) for x in value]
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        number = int(value) if isinstance(value, Integral) else float(value)
+        return number if math.isfinite(number) else str(number)
     return value
 
 
-def check_dataset_destination(destination: Path, *, force: bool) -> None:
-    """Refuse an output folder that holds anything; with *force* only if that was not simulated."""
+def check_dataset_destination(destination: Path) -> None:
+    """Refuse an output folder that holds anything."""
     check_path(destination, SIMULATED)
-    if destination.is_dir() and holds_files(destination) and not force:
+    if destination.is_dir() and holds_files(destination):
         there = "a simulated dataset" if SIMULATED.is_in(destination) else "a folder with files"
-        remedy = "give another folder"
-        if SIMULATED.is_in(destination):
-            remedy += ", or replace it with --force (in Python: force=True)"
         raise UsageError(
             f"{destination}: the dataset could not be written: found {there}, needed a new or "
-            f"empty folder; {remedy}."
+            "empty folder; give another folder, or remove this one first."
         )
-    check_destination(destination, SIMULATED)
-    foreign = _foreign(destination)
-    if foreign:
-        raise UsageError(in_the_way(destination, SIMULATED, foreign))
-
-
-@contextmanager
-def dataset_folder(destination: Path, *, force: bool) -> Iterator[Path]:
-    """Give a temporary folder that becomes the dataset when the block ends well.
-
-    With *force* the files of an earlier simulated dataset go, and so do the outlines that a
-    calibration left there; other files beside them are kept. Nothing else is replaced.
-    """
-    check_dataset_destination(destination, force=force)
-    earlier = _earlier(destination)
-    with result_folder(destination, SIMULATED, earlier, replaceable=earlier) as folder:
-        yield folder
 
 
 def files_in(folder: Path) -> list[str]:
     """Return the files of a folder, relative to it, in order; none of hidden folders."""
     found = [path.relative_to(folder) for path in folder.rglob("[!.]*") if path.is_file()]
     return [path.as_posix() for path in sorted(found) if not path.parent.name.startswith(".")]
-
-
-def _earlier(destination: Path) -> list[Path]:
-    """Return the files of the simulated dataset in a folder, and what calibration left there."""
-    if not SIMULATED.is_in(destination):
-        return []
-    named = read_json(destination / TRUTH_NAME).get("files", [])
-    names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
-    if _is_detected(destination):
-        names += [OBSERVATIONS_NAME, CACHE_NAME]
-    own = [Path(name) for name in dict.fromkeys(names) if path_problem(destination, name) is None]
-    return [name for name in own if _is_place(name) or name == Path(CACHE_NAME)]
-
-
-def _is_detected(folder: Path) -> bool:
-    """Say whether a calibration left the table of outlines, and nobody gave or corrected a row."""
-    try:
-        if read_json(folder / CACHE_NAME).get("given"):
-            return False
-        if not os.path.exists(folder / OBSERVATIONS_NAME):
-            return True
-        table = read_table(folder / OBSERVATIONS_NAME, "table", "outline", OUTLINE_COLUMNS)
-        return "edited" not in table.text("source")
-    except (OSError, ValueError, AttributeError, RecursionError, DatasetError):
-        return False
-
-
-def _is_place(name: Path) -> bool:
-    """Say whether a path in a dataset is one where simulation writes."""
-    if ".." in name.parts:
-        return False
-    is_file = len(name.parts) == 1 and any(name.match(file) for file in _FILES)
-    return is_file or name.parts[:1] in {(folder,) for folder in _FOLDERS}
-
-
-def _foreign(destination: Path) -> str:
-    """Return what stands in the places of a dataset and is none of its files, "" for nothing."""
-    if not destination.is_dir():
-        return ""
-    own = set(_earlier(destination))
-    folders = {parent for name in own for parent in name.parents}
-    for above, inside, files in os.walk(destination):
-        here = Path(above).relative_to(destination)
-        for name in sorted([here / name for name in inside + files]):
-            path = destination / name
-            if not _is_place(name) or any(part.startswith(".") for part in name.parts):
-                continue
-            if path.is_symlink():
-                return f"{name}, which is a link"
-            if path.is_dir() and name not in folders and not _is_plain(name):
-                return f"{name}, which is a folder"
-            if not path.is_dir() and name not in own:
-                return f"{name}, which an earlier simulation did not write"
-        if here == Path():
-            inside[:] = [name for name in inside if name in _FOLDERS]
-    return ""
-
-
-def _is_plain(name: Path) -> bool:
-    """Say whether every dataset may have a folder of that name."""
-    return name.as_posix() in (*_FOLDERS, f"{TRUTH}/models", f"{TRUTH}/urdf")

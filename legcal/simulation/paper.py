@@ -1,51 +1,126 @@
-"""Section 4.3: the paper's own evaluation, a hundred simulated calibrations of a 6-SPU."""
+"""Section 4.3: the paper's own evaluation, a hundred simulated calibrations of a 6-SPU.
+
+The session simulator makes the measurements; here are the machine, the cameras and the numbers of
+the paper, and what its estimators find.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import elliprg
 
 from legcal.calibration.joint_fit.factors import average_images
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.variables import FittedLegs, Start, cameras_from_hints, start_from
-from legcal.data.axes import LegAxes
-from legcal.data.outlines import no_outlines
-from legcal.errors import LegcalError
-from legcal.geometry.types import Array
-from legcal.machine.equations import pose_sensitivity
-from legcal.machine.leg import KinematicParameters, point_like_legs
-from legcal.machine.parameters import parametrize, to_vector
-from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import NominalMachine, point_like_machine
-from legcal.simulation.checkpoint import has_keys, is_failure, is_number
-from legcal.simulation.hexapod import (
-    PAPER_VIEWS,
-    RAISED,
-    HexapodSession,
-    PaperHexapod,
-    follow_from_home,
-    hexapod_cameras,
-    hexapod_session,
-    noncoplanar_hexapod,
-    outlines_and_axes,
-    paper_hexapod,
-    perturb,
-    poses_with_lengths,
-    random_hexapod_poses,
-    simulated_leg_vectors,
+from legcal.calibration.joint_fit.variables import (
+    FittedLegs,
+    Start,
+    cameras_from_hints,
+    platform_poses,
+    start_from,
 )
-from legcal.simulation.observe import TableNoise
-from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
+from legcal.data.axes import LegAxes, axes_of_table
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import no_outlines
+from legcal.errors import DidNotConverge, LegcalError
+from legcal.geometry.motions import look_at
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.equations import pose_sensitivity
+from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.leg import Leg, parameters_of_legs
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, parametrize, to_vector
+from legcal.machine.rods import actuator_index, readings_of_rods
+from legcal.machine.solved_poses import solve_poses
+from legcal.paper.criteria import Criteria
+from legcal.paper.four_steps import run_steps
+from legcal.paper.nominal import NominalMachine
+from legcal.simulation.observe import TableNoise, axes_in_images
+from legcal.simulation.paper_report import BOUND, INITIAL, PaperSummary
+from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import SimulatedSession, simulate_session, streams
+from legcal.simulation.settings import (
+    Level,
+    ParameterErrors,
+    Sampling,
+    SimulationSettings,
+    Spread,
+)
 from legcal.simulation.study import Record, failure_of
+from legcal.simulation.truth import draw_errors, write_model_with
+from legcal.simulation.visibility import Viewpoint
+from legcal.vision.camera import Camera, sample_camera
 
-MACHINES = {"coplanar": paper_hexapod, "noncoplanar": noncoplanar_hexapod}
-_N_PARAMETERS = 30  # of a 6-SPU
+MACHINES = ("coplanar", "noncoplanar")
+PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
+RAISED = 0.030  # [m] out of the plane of the others
+TRAVEL = (0.0, 0.140)  # [m] of every motor; the limits of the shipped model leave 4 mm more
+_DISTANCE = 0.9  # [m] of cameras from the middle of the machine, about
+_WAY = (0.25, 0.5, 0.75)  # parts of the way from home to the readings
+_MAX_ERROR = 1e-12  # of leg lengths
+_MAX_ROUNDS = 100  # of draws of poses
+
+
+# The machine and its cameras
+
+
+def noncoplanar_hexapod() -> Machine:
+    """Return the shipped hexapod with joints 2, 4 and 6 out of the planes of 1, 3 and 5.
+
+    They are 30 mm higher at the base and 30 mm lower at the platform.
+    """
+    flat, up = load_mechanism("hexapod"), np.array([0.0, 0.0, RAISED])
+    legs = [
+        replace(leg, A=leg.A + up, B=leg.B - up) if j % 2 else leg
+        for j, leg in enumerate(geometries(flat))
+    ]
+    with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
+        return load_mechanism(write_model_with(flat, legs, flat.home, Path(folder), {}))
+
+
+@cache
+def paper_machine(name: str) -> Machine:
+    """Return the true machine of the study with coplanar or non-coplanar joints."""
+    machine = load_mechanism("hexapod") if name == "coplanar" else noncoplanar_hexapod()
+    return replace(machine, legs=tuple(replace(leg, travel=TRAVEL) for leg in machine.legs))
+
+
+def paper_cameras(
+    machine: Machine,
+    rng: np.random.Generator,
+    legs: Sequence[Sequence[int]] = PAPER_VIEWS,
+    camera: Camera | None = None,
+) -> tuple[Viewpoint, ...]:
+    """Return cameras around a machine, each on the side of the legs that it sees."""
+    camera = camera or sample_camera()
+    middle = 0.5 * (machine.A_base + machine.home.apply(machine.B_platform))
+    centre = middle.mean(axis=0)
+    views = []
+    for v, seen in enumerate(legs):
+        outward = (middle[list(seen)] - centre).mean(axis=0)
+        outward[2] = 0.0
+        if np.linalg.norm(outward) < 1e-3 * _DISTANCE:  # every leg is seen: any side will do
+            outward = np.array([*rng.normal(size=2), 0.0])
+        outward /= np.linalg.norm(outward)
+        lift = rng.uniform(0.0, 0.25)
+        toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
+        place = centre + _DISTANCE * rng.uniform(0.95, 1.05) * toward
+        T = look_at(place, centre, roll=rng.uniform(-0.1, 0.1))
+        names = tuple(machine.leg_names[j] for j in seen)
+        views.append(Viewpoint(f"c{v + 1}", camera, T, names))
+    return tuple(views)
+
+
+# The study
 
 
 @dataclass(frozen=True)
@@ -72,6 +147,7 @@ class PaperStudy:
             "radians": self.noise == TableNoise.in_radians(),
             **asdict(self),
             "raised": RAISED,
+            "travel": list(TRAVEL),
             "views": [[f"leg{leg + 1}" for leg in legs] for legs in PAPER_VIEWS],
             "estimators": [*self.estimators, BOUND],
         }
@@ -80,71 +156,94 @@ class PaperStudy:
         """Return what every estimator finds on one session of either machine."""
         seeds = seed.spawn(len(MACHINES))
         return {
-            name: self._calibrations(truth(), np.random.default_rng(child))
-            for (name, truth), child in zip(MACHINES.items(), seeds, strict=True)
+            name: self._calibrations(paper_machine(name), child)
+            for name, child in zip(MACHINES, seeds, strict=True)
         }
-
-    def is_record(self, found: Any) -> bool:
-        """Return whether a document has the errors of every estimator on either machine."""
-        wanted = {INITIAL, *self.estimators, BOUND}
-        return has_keys(found, set(MACHINES)) and all(
-            has_keys(of_machine, wanted) and all(map(is_errors, of_machine.values()))
-            for of_machine in found.values()
-        )
 
     def summary(self, records: Iterable[Record]) -> PaperSummary:
         """Return the means over all runs."""
-        machines = {name: truth() for name, truth in MACHINES.items()}
+        machines = {name: paper_machine(name) for name in MACHINES}
         in_radians = self.noise == TableNoise.in_radians()
         return PaperSummary.of(records, machines, in_radians=in_radians)
 
-    def _calibrations(self, machine: PaperHexapod, rng: np.random.Generator) -> Record:
-        """Return the errors of all estimators for one session of a machine."""
-        nominal = perturb(machine, rng, self.initial_error)
-        session = hexapod_session(
-            machine,
-            hexapod_cameras(machine, rng),
-            rng,
-            noise=self.noise,
-            sigma_q=self.reading_error / np.sqrt(3.0),
-            uniform_readings=True,
-            n_poses=self.n_poses,
-            n_images=self.n_images,
+    def session(
+        self, truth: Machine, views: Sequence[Viewpoint], seed: np.random.SeedSequence
+    ) -> SimulatedSession:
+        """Return the measurements of one calibration: nothing hides the legs of a view."""
+        settings = SimulationSettings(
+            level=Level.AXES,
+            poses=self.n_poses,
+            images=self.n_images,
+            views=views,
+            occlusion=False,
+            readings=Spread(self.reading_error),
+            table=self.noise,
         )
-        checked = random_hexapod_poses(machine, self.n_checked, rng)
-        exact = outlines_and_axes(machine, session.scene, session.measurements, self.noise, None)[1]
-        covariance = bound_covariance(session, exact)
-        found = {INITIAL: _errors(machine, nominal.parameters, covariance, checked)}
+        return simulate_session(truth, truth, settings, streams(seed))
+
+    def _calibrations(self, truth: Machine, seed: np.random.SeedSequence) -> Record:
+        """Return the errors of all estimators for one session of a machine."""
+        of_session, of_others = seed.spawn(2)
+        rng, error = np.random.default_rng(of_others), Spread(self.initial_error)
+        wrong = ParameterErrors(base_joints=error, platform_joints=error, offsets=error)
+        initial = draw_errors(truth, wrong, rng)
+        session = self.session(truth, paper_cameras(truth, rng), of_session)
+        checked = checked_poses(truth, initial, self.n_checked, rng)
+        covariance = bound_covariance(session, self.noise)
+        found = {INITIAL: _errors(truth, initial, covariance, checked)}
         for name in self.estimators:
             try:
-                parameters = ESTIMATORS[name](session, nominal)
-            except LegcalError as error:
-                found[name] = {"failure": failure_of(error)}
+                legs = ESTIMATORS[name](session, initial)
+            except LegcalError as failure:
+                found[name] = {"failure": failure_of(failure)}
             else:
-                found[name] = _errors(machine, parameters, covariance, checked)
+                found[name] = _errors(truth, legs, covariance, checked)
         sigma = np.sqrt(np.diagonal(covariance))
-        found[BOUND] = errors_record(
-            expected_errors(machine, covariance, checked), 1.0, np.sqrt(2.0 / np.pi) * sigma
-        )
+        expected = expected_errors(truth, covariance, checked)
+        found[BOUND] = errors_record(expected, 1.0, np.sqrt(2.0 / np.pi) * sigma)
         return found
 
 
+def checked_poses(
+    truth: Machine, initial: Sequence[Leg], n_poses: int, rng: np.random.Generator
+) -> RigidTransform:
+    """Return random poses T_Rb_Re of the true machine that the initial model reaches as well."""
+    reached: list[RigidTransform] = []
+    for _ in range(_MAX_ROUNDS):
+        if len(reached) == n_poses:
+            return RigidTransform.concatenate(reached)
+        drawn = draw_poses(truth, n_poses - len(reached), rng, Sampling.WORKSPACE).poses
+        poses = RigidTransform.concatenate(list(platforms_in_base(truth, drawn)))
+        reached += list(poses[poses_by_readings(truth, initial, poses)[1]])
+    raise DidNotConverge(
+        f"Poses to check could not be drawn: found {len(reached)} that the initial model reaches "
+        f"in {_MAX_ROUNDS} rounds, needed {n_poses}; make its errors smaller."
+    )
+
+
 def _errors(
-    machine: PaperHexapod,
-    parameters: KinematicParameters,
-    covariance: Array,
-    checked: RigidTransform,
+    truth: Machine, legs: Sequence[Leg], covariance: Array, checked: RigidTransform
 ) -> Record:
     """Return the errors of eq (20) and those of every parameter, or the failure to compute them."""
-    difference = to_vector(parameters, machine.frame_legs) - to_vector(
-        machine.parameters, machine.frame_legs
+    found, true = (
+        to_vector(parameters_of_legs(each), truth.frame_legs) for each in (legs, geometries(truth))
     )
+    difference = found - true
     squared = float(difference @ np.linalg.solve(covariance, difference)) / len(difference)
     try:
-        errors = platform_errors(machine, parameters, checked)
+        errors = platform_errors(truth, legs, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
     return errors_record(errors, squared, np.abs(difference))
+
+
+def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:
+    """Return errors as a record [m, rad]."""
+    return {
+        **asdict(errors),
+        "of_bound_squared": of_bound_squared,
+        "parameters": parameters.tolist(),
+    }
 
 
 # Errors of the platform, eq (20)
@@ -159,35 +258,39 @@ class PlatformErrors:
     angle: float  # of that rotation [rad]: near the norm of Euler angles while both are small
 
 
-def platform_errors(
-    machine: PaperHexapod, parameters: KinematicParameters, T_Rb_Re: RigidTransform
-) -> PlatformErrors:
-    """Return the errors of eq (20) that parameters cause at poses of the true machine."""
-    found = poses_of_readings(machine, parameters, T_Rb_Re)
-    turn = T_Rb_Re.rotation.inv() * found.rotation
-    displacement = np.linalg.norm(found.translation - T_Rb_Re.translation, axis=-1)
+def platform_errors(truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform) -> PlatformErrors:
+    """Return the errors of eq (20) that legs cause at the readings of true poses."""
+    poses, reached = poses_by_readings(truth, legs, T_Rb_Re)
+    if not np.all(reached):
+        raise DidNotConverge(
+            f"The errors of the platform could not be computed: found {np.sum(~reached)} of "
+            f"{len(reached)} poses whose readings the model does not reach, needed all."
+        )
+    turn = T_Rb_Re.rotation.inv() * poses.rotation
+    displacement = np.linalg.norm(poses.translation - T_Rb_Re.translation, axis=-1)
     euler = np.linalg.norm(turn.as_euler("xyz"), axis=-1)
     return PlatformErrors(
         float(displacement.mean()), float(euler.mean()), float(turn.magnitude().mean())
     )
 
 
-def poses_of_readings(
-    machine: PaperHexapod, parameters: KinematicParameters, T_Rb_Re: RigidTransform
-) -> RigidTransform:
-    """Return the poses that other parameters compute from the readings of true poses."""
-    lengths = np.linalg.norm(simulated_leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
-    changed = lengths - machine.parameters.offsets + parameters.offsets
-    return poses_with_lengths(parameters, changed, T_Rb_Re)
+def poses_by_readings(
+    truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
+) -> tuple[RigidTransform, BoolArray]:
+    """Return the poses that legs compute from the readings of true poses, and which exist."""
+    R, t, true = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation, truth.parameters
+    arms = true.platform_joints @ np.swapaxes(R, -1, -2)
+    lengths = np.linalg.norm(arms + t[:, None] - true.base_joints, axis=-1)
+    solved = solve_poses(legs, truth.frame_legs, R, t, lengths - true.offsets)
+    poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
+    return poses, np.asarray(solved.missed <= _MAX_ERROR * lengths.max(axis=1))
 
 
-def expected_errors(
-    machine: PaperHexapod, covariance: Array, T_Rb_Re: RigidTransform
-) -> PlatformErrors:
+def expected_errors(truth: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
     """Return the expected errors of eq (20) for Gaussian parameters, to first order."""
-    legs, frame_legs = point_like_legs(machine.parameters), machine.frame_legs
+    legs, frame_legs = geometries(truth), truth.frame_legs
+    parametrization = parametrize(truth.leg_names, legs, frame_legs)
     R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
-    parametrization = parametrize(machine.leg_names, legs, frame_legs)
     motion = pose_sensitivity(legs, parametrization, frame_legs, R, t)
     of_pose = motion @ covariance @ np.swapaxes(motion, -1, -2)
     dX = float(expected_norm(of_pose[:, 3:, 3:]).mean())
@@ -206,88 +309,75 @@ def expected_norm(covariance: Array) -> Array:
     return np.asarray(np.sqrt(8.0 / np.pi) * mean)
 
 
-# Estimators
+# Estimators: they look at measurements and axes of a session, and at the initial legs
 
 
-def literal_steps(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
-    """Return what the four steps with the criteria as printed find."""
-    steps = run_steps(nominal_of(nominal), session.axes, session.measurements, criteria="literal")
-    return steps.parameters
+def four_steps(
+    session: SimulatedSession, initial: Sequence[Leg], criteria: Criteria
+) -> tuple[Leg, ...]:
+    """Return the legs that the four steps find."""
+    truth = session.truth
+    machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
+    return run_steps(machine, _axes(session), session.measurements, criteria=criteria).legs
 
 
-def default_steps(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
-    """Return what the four steps with legcal's criteria find."""
-    return run_steps(nominal_of(nominal), session.axes, session.measurements).parameters
-
-
-def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
-    """Return what the joint fit finds, started from the nominal model and rough cameras.
+def one_fit(session: SimulatedSession, initial: Sequence[Leg]) -> tuple[Leg, ...]:
+    """Return the legs that the joint fit finds, started from initial legs and rough cameras.
 
     ``legcal calibrate`` also starts from what the steps find and keeps the better of both; here the
     fit is compared with the steps, and does without them.
     """
-    measurements = session.measurements
-    axes = average_images(session.axes, measurements)
-    legs = _legs(nominal)
-    lengths = measurements.q_of_poses + nominal.parameters.offsets
-    start = start_from(
-        legs.nominal,
-        measurements,
-        legs,
-        cameras_from_hints(measurements, RigidTransform.identity()),
-        tuple(follow_from_home(nominal, lengths)[0]),
-        "nominal",
-    )
-    return refine(legs, measurements, no_outlines(), start, axes=axes).parameters
+    m, legs = session.measurements, _fitted(session.truth, initial)
+    start = nominal_start(legs, m, session.truth.T_base_Rb)
+    return refine(legs, m, no_outlines(), start, axes=average_images(_axes(session), m)).legs
 
 
-# They look at measurements and axes of a session alone, and at the nominal machine.
-ESTIMATORS = {"literal": literal_steps, "default": default_steps, "fit": one_fit}
+Estimator = Callable[[SimulatedSession, Sequence[Leg]], Sequence[Leg]]
+ESTIMATORS: dict[str, Estimator] = {
+    "literal": partial(four_steps, criteria="literal"),
+    "default": partial(four_steps, criteria="default"),
+    "fit": one_fit,
+}
 
 
-def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
+def nominal_start(legs: FittedLegs, m: Measurements, T_base_Rb: RigidTransform) -> Start:
+    """Return nominal legs, moved from home to the readings, and the rough cameras."""
+    assert legs.home is not None
+    R, t = legs.home.rotation.as_matrix(), legs.home.translation
+    B = legs.home.apply([leg.B for leg in legs.nominal])
+    first = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
+    first -= np.array([leg.q0 for leg in legs.nominal])
+    for j, a in enumerate(actuator_index(legs.nominal)):
+        if a >= 0:
+            first[j] = readings_of_rods(legs.nominal, R[None], t[None])[0, a]
+    wanted = legs.sign * m.q_of_poses
+    poses: Sequence[RigidTransform] = (legs.home,) * m.n_poses
+    for part in _WAY:
+        there = first + part * (wanted - first)
+        poses = platform_poses(legs.nominal, there, poses, legs.frame_legs)
+    cameras = cameras_from_hints(m, T_base_Rb)
+    return start_from(legs.nominal, m, legs, cameras, poses, "nominal")
+
+
+def bound_covariance(session: SimulatedSession, noise: TableNoise) -> Array:
     """Return the Cramer-Rao bound of the parameters from all axes and all readings."""
-    axes = average_images(exact, session.measurements)
-    legs = _legs(session.machine)
-    problem = build_fit(legs, session.measurements, no_outlines(), axes=axes)
+    truth = session.truth
+    exact = axes_of_table(*axes_in_images(session.scene, noise))
+    legs = _fitted(truth, geometries(truth))
+    m = session.measurements
+    problem = build_fit(legs, m, no_outlines(), axes=average_images(exact, m))
     problem.require_determined()
-    truth = Start(
-        legs.nominal,
-        tuple(camera.T_Rb_camera.inv() for camera in session.cameras),
-        tuple(session.T_Rb_Re),
-        "truth",
-    )
-    return bound(problem, truth)
+    cameras = [view.T_base_camera.inv() * truth.T_base_Rb for view in session.scene.views]
+    poses = platforms_in_base(truth, session.poses.poses)
+    return bound(problem, Start(legs.nominal, tuple(cameras), poses, "truth"))
 
 
-def nominal_of(machine: PaperHexapod) -> NominalMachine:
-    """Return a simulated machine as the steps take it."""
-    return point_like_machine(machine.leg_names, machine.parameters, machine.frame_legs)
+def _axes(session: SimulatedSession) -> LegAxes:
+    """Return the axes that were measured."""
+    assert session.axes is not None
+    return axes_of_table(*session.axes)
 
 
-def _legs(machine: PaperHexapod) -> FittedLegs:
-    """Return the legs of a machine as the fit sees them."""
-    legs = point_like_legs(machine.parameters)
-    return FittedLegs(machine.leg_names, legs, machine.frame_legs, {})
-
-
-def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:
-    """Return errors as a record [m, rad]."""
-    return {
-        **asdict(errors),
-        "of_bound_squared": of_bound_squared,
-        "parameters": parameters.tolist(),
-    }
-
-
-def is_errors(found: Any) -> bool:
-    """Return whether a document has the errors of one estimator, or how it failed."""
-    if has_keys(found, {"failure"}):
-        return is_failure(found["failure"])
-    return (
-        has_keys(found, {*SCALARS, "parameters"})
-        and all(is_number(found[name]) for name in SCALARS)
-        and isinstance(found["parameters"], list)
-        and len(found["parameters"]) == _N_PARAMETERS
-        and all(map(is_number, found["parameters"]))
-    )
+def _fitted(truth: Machine, legs: Sequence[Leg]) -> FittedLegs:
+    """Return legs as the fit sees them."""
+    return FittedLegs(truth.leg_names, tuple(legs), truth.frame_legs, {}, truth.home_of_frames)

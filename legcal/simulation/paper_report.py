@@ -12,9 +12,8 @@ import numpy as np
 
 from legcal.files.schema import Document, Number
 from legcal.geometry.types import Array
-from legcal.machine.leg import point_like_legs
-from legcal.machine.parameters import parametrize, to_vector
-from legcal.simulation.hexapod import PaperHexapod
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries, parametrize, to_vector
 from legcal.simulation.study import Record
 
 if TYPE_CHECKING:
@@ -52,11 +51,12 @@ READINGS = (
     '"three images are acquired" of each pose: each with its own noise. The fit and the bound use '
     "the mean of a leg's axis in them, weighted by the covariances; it holds all that they tell.",
     '"ten randomly chosen poses" of (20): leg lengths uniform in the travel, drawn anew in every '
-    "run.",
+    "run, of poses that the initial model reaches as well.",
     "(20) as printed: dX is the displacement of B_1 from A_1, dE the norm of the x-y-z Euler "
     "angles of the rotation between both orientations.",
     "The machine: the shipped hexapod, whose joints are coplanar, and the same with joints 2, 4 "
-    "and 6 moved 30 mm out of the planes of 1, 3 and 5; cameras stand 0.9 m from its middle.",
+    "and 6 moved 30 mm out of the planes of 1, 3 and 5, with a travel of 140 mm; cameras stand "
+    "0.9 m from its middle, and nothing hides the four legs that each sees.",
     "joint fit: started from the initial model and from cameras up to 15 mm and 1.5 deg off, not "
     "from what the steps find.",
     "bound: the Cramer-Rao bound of the same data, all used at once; the table has the errors to "
@@ -164,13 +164,11 @@ class PaperSummary:
 
     @classmethod
     def of(
-        cls, records: Iterable[Record], machines: Mapping[str, PaperHexapod], *, in_radians: bool
+        cls, records: Iterable[Record], machines: Mapping[str, Machine], *, in_radians: bool
     ) -> PaperSummary:
         """Return the means over records, which are read once."""
         first = next(iter(machines.values()))
-        names = parametrize(
-            first.leg_names, point_like_legs(first.parameters), first.frame_legs
-        ).names
+        names = parametrize(first.leg_names, geometries(first), first.frame_legs).names
         means: dict[tuple[str, str], Means] = {}
         for record in records:
             for machine, found in record.items():

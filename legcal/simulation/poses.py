@@ -20,7 +20,7 @@ from legcal.machine.mobility import singularities, singularity
 from legcal.machine.model import Machine, platform_pose, slider_columns
 from legcal.machine.redundancy import contradictions
 from legcal.progress import Report, no_progress
-from legcal.simulation.request import Sampling
+from legcal.simulation.settings import Sampling
 
 _REGULAR_NOMINAL = 0.05  # of the nominal model's singularity measure at home
 _MAX_ROUNDS = 20  # of draws for poses that the nominal model does not reach
@@ -106,7 +106,7 @@ def commanded_poses(
     nominal: Machine,
     n_poses: int,
     rng: np.random.Generator,
-    sampling: Sampling,
+    sampling: Sampling | str,
     progress: Report = no_progress,
 ) -> Configurations:
     """Return random poses of a machine that its nominal model reaches at the same readings.

@@ -1,253 +1,176 @@
-"""The options of ``legcal simulate``, declared once: the command line takes them from here.
-
-Nothing but the standard library is imported here, so that help and completion answer at once.
-:func:`legcal.simulation.settings.requested` makes them into settings.
-"""
+"""The options of ``legcal simulate``, as people write them, made into settings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import StrEnum
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from legcal.option_fields import option
+from legcal.errors import UsageError
+from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
+from legcal.files.schema import closest, describe
+from legcal.machine.model import Machine
+from legcal.simulation.board import KINDS as BOARD_KINDS
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.settings import (
+    DEFAULT_ERRORS,
+    MAX_SIZE,
+    Distribution,
+    Level,
+    ParameterErrors,
+    SimulationSettings,
+    Spread,
+    kinds_of,
+)
 
-_MACHINE, _MOTION, _CAMERAS = "The true machine", "Poses and images", "Cameras"
-_NOISE, _LOOK = "Noise", "Photographs"
+_ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
+    "joints": (("base_joints", "platform_joints"), LENGTH),
+    "base-joints": (("base_joints",), LENGTH),
+    "platform-joints": (("platform_joints",), LENGTH),
+    "offsets": (("offsets",), LENGTH),
+    "lengths": (("lengths",), LENGTH),
+    "axes": (("axes",), ANGLE),
+    "twists": (("twists",), ANGLE),
+    "radii": (("radii",), LENGTH),
+}
 
 
-class Level(StrEnum):
-    """What a simulated dataset gives a calibration to work on."""
-
-    AXES = "axes"
-    OUTLINES = "outlines"
-    PHOTOGRAPHS = "photographs"
-
-
-class Sampling(StrEnum):
-    """How poses are drawn: every motor near an end of its travel, or anywhere in it."""
-
-    EXTREME = "extreme"
-    WORKSPACE = "workspace"
-
-
-class Angles(StrEnum):
-    """How the angles of Table 1 are read."""
-
-    DEGREES = "degrees"
-    RADIANS = "radians"
-
-
-def _option(
-    text: str,
-    panel: str | None = None,
+def requested(
+    nominal: Machine,
     *,
-    only: Level | None = None,  # level that it has an effect on, if only on one
-    **how: Any,
-) -> dict[str, Any]:
-    """Return what the command line and :func:`requested` know of a field beside its type."""
-    return option(text, panel, **how) | {"only": only}
+    level: str = Level.PHOTOGRAPHS,
+    camera: Sequence[str] = (),
+    poses: str | None = None,
+    error: Sequence[str] = (),
+    board: str | None = None,
+    hand_held: bool = False,
+    plan: Path | None = None,
+    seed: int = 0,
+) -> SimulationSettings:
+    """Return the settings that options ask for; Python has more (:class:`SimulationSettings`)."""
+    for option, is_given in (("--poses", poses is not None), ("--hand-held", hand_held)):
+        if plan is not None and is_given:
+            raise UsageError(
+                f"The plan could not be shot: found --plan and {option}, needed one of them, a "
+                f"plan says poses and cameras; leave out {option}."
+            )
+    if hand_held and board is None:
+        raise UsageError(
+            "--hand-held could not be used: found no --board, needed a board on the base; add "
+            "--board charuco."
+        )
+    file, appearance = _camera(camera, level)
+    return SimulationSettings(
+        level=level,
+        errors=parameter_errors(error, nominal),
+        poses=15 if poses is None else _poses(poses),
+        camera=file,
+        appearance=appearance,
+        board=_board(board),
+        hand_held=hand_held,
+        plan=plan,
+        seed=seed,
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """The options of ``legcal simulate`` as people write them; None where not given."""
+def _camera(choices: Sequence[str], level: str) -> tuple[Path | None, Appearance]:
+    """Return the camera file, and what the kind of camera does to photographs."""
+    files, looks = list[Path](), list[Appearance]()
+    for choice in choices:
+        kind, colon, quality = choice.partition(":")
+        if kind in CAMERAS and (not colon or quality.isdecimal()):
+            jpeg = int(quality) if colon else None
+            looks.append(Appearance(camera=kind, jpeg=jpeg, colour=CAMERAS[kind].colour))
+        elif kind not in CAMERAS and (Path(choice).exists() or re.search(r"[./\\]", choice)):
+            files.append(Path(choice))
+        else:
+            raise UsageError(
+                f"--camera could not be used: found {describe(choice)}, neither a kind of camera "
+                f"nor a file, needed {', '.join(CAMERAS)}, one of them with the quality of its "
+                f"JPEG files such as webcam:60, or the path of a file; {closest(kind, CAMERAS)}"
+            )
+    if max(len(files), len(looks)) > 1:
+        raise UsageError(
+            f"--camera could not be used: found {len(files)} files and {len(looks)} kinds, needed "
+            "at most one of each; leave out the others."
+        )
+    if looks and level != Level.PHOTOGRAPHS:
+        raise UsageError(
+            f"--camera {looks[0].camera} could not be used: found --level {level}, needed "
+            "photographs, which a kind of camera changes; leave it out."
+        )
+    return files[0] if files else None, looks[0] if looks else Appearance()
 
-    level: Level = field(
-        default=Level.PHOTOGRAPHS,
-        metadata=_option(
-            "Rendered photographs; outlines with noise in pixels (observations.csv); or leg axes "
-            "with the noise of the paper's Table 1 (axes.csv).",
-        ),
-    )
-    seed: int = field(
-        default=0, metadata=_option("The same seed gives the same dataset, to the last bit.")
-    )
-    error: list[str] | None = field(
-        default=None,
-        metadata=_option(
-            "How far the true machine is from the model: joints, base-joints, platform-joints, "
-            "offsets, lengths (2mm), axes, twists (0.1deg), radii (0mm); uniform in +-SIZE, or "
-            "SIZE:normal; none for no errors. May be repeated.",
-            _MACHINE,
-            metavar="KIND=SIZE",
-            shown="joints, offsets, lengths=2mm; axes, twists=0.1deg",
-        ),
-    )
-    coplanar: bool = field(
-        default=False,
-        metadata=_option(
-            "Keep joints in the plane that they are nominally in.",
-            _MACHINE,
-            flags=("--coplanar",),
-        ),
-    )
-    poses: str = field(
-        default="15",
-        metadata=_option(
-            "Poses for each view; or a CSV of readings in metres (radians of arms), the motors' "
-            "joints in its header, for all views.",
-            _MOTION,
-            metavar="N|CSV",
-        ),
-    )
-    plan: Path | None = field(
-        default=None,
-        metadata=_option(
-            "Instead of poses and cameras: a session that legcal plan wrote, with tripods as far "
-            "off as it allows for.",
-            _MOTION,
-            metavar="SESSION",
-        ),
-    )
-    sampling: Sampling | None = field(
-        default=None,
-        metadata=_option(
-            "Every motor near an end of its travel, or anywhere.", _MOTION, shown="extreme"
-        ),
-    )
-    shared_poses: bool | None = field(
-        default=None,
-        metadata=_option(
-            "All views see the same poses (several cameras at once), or each its own (one camera "
-            "that is moved).",
-            _MOTION,
-            flags=("--shared-poses/--own-poses",),
-            shown="own",
-        ),
-    )
-    images: int = field(default=1, metadata=_option("Images of each pose in each view.", _MOTION))
-    views: int | None = field(
-        default=None,
-        metadata=_option(
-            "Cameras around the machine, where its legs are seen well.", _CAMERAS, shown="3"
-        ),
-    )
-    cameras: Path | None = field(
-        default=None,
-        metadata=_option(
-            "Instead: a YAML with views: {NAME: {T_base_camera: {xyz, quat_xyzw}, camera}}.",
-            _CAMERAS,
-            metavar="FILE",
-        ),
-    )
-    camera: list[str] | None = field(
-        default=None,
-        metadata=_option(
-            "Camera file (ROS, OpenCV, Kalibr); or what it does to photographs: machine-jpeg, "
-            "webcam, phone, action or industrial, webcam:60 for another JPEG quality. Once for "
-            "each.",
-            _CAMERAS,
-            metavar="FILE|KIND",
-            shown="1024 x 768 px, slight distortion; industrial",
-        ),
-    )
-    board: str | None = field(
-        default=None,
-        metadata=_option(
-            "A calibration board on the base: chessboard, charuco or aprilgrid, of a size that "
-            "fits the machine, or a YAML with the block board of a dataset.",
-            _CAMERAS,
-            metavar="KIND|FILE",
-            shown="none",
-        ),
-    )
-    platform_board: str | None = field(
-        default=None,
-        metadata=_option("The same on the platform.", _CAMERAS, metavar="KIND|FILE", shown="none"),
-    )
-    board_pose: bool = field(
-        default=False,
-        metadata=_option(
-            "Write the poses of boards in their links into dataset.yaml.",
-            _CAMERAS,
-            flags=("--board-pose",),
-        ),
-    )
-    hand_held: bool = field(
-        default=False,
-        metadata=_option(
-            "Every image from another camera position, with the board in it.",
-            _CAMERAS,
-            flags=("--hand-held",),
-        ),
-    )
-    hints: bool = field(
-        default=True,
-        metadata=_option(
-            "Write rough camera poses (15 mm, 1.5 deg) and each view's legs into dataset.yaml.",
-            _CAMERAS,
-            flags=("--hints/--no-hints",),
-        ),
-    )
-    tell_gamma: bool | None = field(
-        default=None,
-        metadata=_option(
-            "Write the gamma of the cameras into dataset.yaml.",
-            _LOOK,
-            flags=("--gamma/--no-gamma",),
-            shown="gamma",
-            only=Level.PHOTOGRAPHS,
-        ),
-    )
-    length: list[str] | None = field(
-        default=None,
-        metadata=_option(
-            "A distance of two joints measured by hand, with this sigma, written into "
-            "dataset.yaml: leg1.base:leg1.platform=0.05mm. May be repeated.",
-            _NOISE,
-            metavar="JOINT:JOINT=SIGMA",
-            shown="none",
-        ),
-    )
-    pixel_noise: str | None = field(
-        default=None,
-        metadata=_option(
-            "Sigma of each edge point of an outline, and of each corner of a board.",
-            _NOISE,
-            metavar="SIGMA",
-            shown="0.1px",
-            only=Level.OUTLINES,
-        ),
-    )
-    table_noise: Angles | None = field(
-        default=None,
-        metadata=_option(
-            "How the angles of Table 1 are read.", _NOISE, shown="degrees", only=Level.AXES
-        ),
-    )
-    encoder_noise: str = field(
-        default="2um",
-        metadata=_option(
-            "Sigma of readings, 2um or of motors that turn 0.5deg; 3um:uniform for +-3um.",
-            _NOISE,
-            metavar="SIGMA",
-        ),
-    )
-    appearance: Path | None = field(
-        default=None,
-        metadata=_option(
-            "A YAML of lights, background, clutter, sensor and more.",
-            _LOOK,
-            metavar="FILE",
-            only=Level.PHOTOGRAPHS,
-        ),
-    )
-    blur: float | None = field(
-        default=None,
-        metadata=_option("Sigma of the lens's blur.", _LOOK, metavar="PX", only=Level.PHOTOGRAPHS),
-    )
-    clutter: int | None = field(
-        default=None,
-        metadata=_option("Rods, boxes and balls in the background.", _LOOK, only=Level.PHOTOGRAPHS),
-    )
-    bits: int | None = field(
-        default=None, metadata=_option("Bits of a pixel, 8 or 16.", _LOOK, only=Level.PHOTOGRAPHS)
-    )
-    colour: bool | None = field(
-        default=None,
-        metadata=_option(
-            "Colour or grey.", _LOOK, flags=("--colour/--grey",), only=Level.PHOTOGRAPHS
-        ),
-    )
+
+def _poses(text: str) -> int | Path:
+    """Return a number of poses, or the path of a CSV."""
+    if text.isdecimal():
+        return int(text)
+    if re.fullmatch(r"[-+]?[\d.]+", text) or not Path(text).exists():
+        raise UsageError(
+            f"--poses could not be used: found {describe(text)}, neither a whole number nor a "
+            "file, needed the number of poses for each view or the path of a CSV; correct it."
+        )
+    return Path(text)
+
+
+def _board(choice: str | None) -> str | Path | None:
+    """Return a kind of board, or the path of a file."""
+    if choice is None or choice in BOARD_KINDS:
+        return choice
+    if not Path(choice).exists():
+        raise UsageError(
+            f"--board could not be used: found {describe(choice)}, neither a kind of board nor a "
+            f"file, needed {', '.join(BOARD_KINDS)} or the path of a YAML file; "
+            f"{closest(choice, BOARD_KINDS)}"
+        )
+    return Path(choice)
+
+
+def parameter_errors(texts: Sequence[str], nominal: Machine) -> ParameterErrors:
+    """Return the errors of parameters that words such as ``joints=2mm`` ask for."""
+    errors, possible = DEFAULT_ERRORS, kinds_of(nominal)
+    for text in texts:
+        if text == "none":
+            errors = ParameterErrors()
+            continue
+        kind, equals, size = text.partition("=")
+        if kind in _ERROR_KINDS and not size:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)} without a size, needed "
+                f"KIND=SIZE; write {kind}={'2mm' if _ERROR_KINDS[kind][1] is LENGTH else '0.1deg'}."
+            )
+        if not equals or kind not in _ERROR_KINDS:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)}, needed KIND=SIZE or none, "
+                f"such as joints=2mm; {closest(kind, _ERROR_KINDS)}"
+            )
+        kinds, units = _ERROR_KINDS[kind]
+        spread = _spread(size, units, f"--error {kind}")
+        if spread.size > MAX_SIZE:
+            most = f"{MAX_SIZE / units['deg']:.3g}deg" if "deg" in units else f"{MAX_SIZE:g}m"
+            raise UsageError(
+                f"--error {kind} could not be used: found {describe(size)}, needed 0 to {most}; "
+                "correct it and its unit."
+            )
+        if spread.size > 0.0 and not possible & set(kinds):
+            raise UsageError(
+                f"--error {kind} could not be used: found none in the mechanism "
+                f"'{nominal.name}', needed one that has them; leave it out."
+            )
+        errors = replace(errors, **dict.fromkeys(kinds, spread))  # type: ignore[arg-type]
+    return errors
+
+
+def _spread(text: str, units: Mapping[str, float], option: str) -> Spread:
+    """Return a spread such as ``2mm`` or ``2mm:normal``."""
+    size, colon, name = text.partition(":")
+    if colon and name not in list(Distribution):
+        raise UsageError(
+            f"{option} could not be used: found the distribution {describe(name)}, needed uniform "
+            "(the size is half the width) or normal (the size is one standard deviation); "
+            "correct it."
+        )
+    return Spread(parse_quantity(size, units, option), name if colon else Distribution.UNIFORM)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
@@ -29,7 +30,6 @@ from legcal.simulation.cameras import (
     camera_in_hand,
     cameras_around,
     mild_lens,
-    read_cameras,
     read_lens,
     rough_pose,
 )
@@ -46,8 +46,7 @@ from legcal.simulation.planned import PlannedSession, read_plan
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
-from legcal.simulation.request import Level
-from legcal.simulation.settings import Distribution, SimulationSettings
+from legcal.simulation.settings import Distribution, Level, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
 from legcal.vision.board import Board, FixedBoard
@@ -62,9 +61,10 @@ _MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
 _MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
 
 
-def streams(seed: int) -> dict[str, np.random.Generator]:
+def streams(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
     """Return a random generator for each purpose: draws for one do not change the others."""
-    children = np.random.SeedSequence(seed).spawn(len(_PURPOSES))
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    children = root.spawn(len(_PURPOSES))
     return {
         name: np.random.default_rng(child) for name, child in zip(_PURPOSES, children, strict=True)
     }
@@ -125,31 +125,39 @@ class _Simulator:
     @cached_property
     def plan(self) -> PlannedSession | None:
         """The plan that is shot, if one is."""
-        return None if self.settings.plan is None else read_plan(self.settings.plan, self.nominal)
+        plan = self.settings.plan
+        return None if plan is None else read_plan(Path(plan), self.nominal)
 
-    @cached_property
-    def given_views(self) -> tuple[dict[str, Camera], tuple[Viewpoint, ...]]:
-        """The camera of each view, and where all of them stand if settings give that."""
-        settings = self.settings
-        camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
-        if isinstance(settings.views, int):
-            return {f"c{v + 1}": camera for v in range(settings.views)}, ()
-        given = read_cameras(settings.views, camera)
-        cameras = {name: lens for name, (lens, _) in given.items()}
-        return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
+    @property
+    def given_views(self) -> tuple[Viewpoint, ...]:
+        """Where cameras stand, if settings give that."""
+        views = self.settings.views
+        if not isinstance(views, Sequence):
+            return ()
+        for view in views:
+            if others := set(view.legs or ()) - set(self.truth.leg_names):
+                raise UsageError(
+                    f"view {view.name}: its legs could not be simulated: found "
+                    f"{', '.join(sorted(others))}, which '{self.truth.name}' lacks, needed some of "
+                    f"{', '.join(self.truth.leg_names)}; correct the name."
+                )
+        return tuple(views)
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
         """The camera of each view."""
-        plan, (cameras, _) = self.plan, self.given_views
-        if plan is not None:
-            return {view.name: view.camera for view in plan.measurements.views}
-        return cameras
+        settings = self.settings
+        if self.plan is not None:
+            return {view.name: view.camera for view in self.plan.measurements.views}
+        if isinstance(settings.views, Sequence):
+            return {view.name: view.camera for view in settings.views}
+        camera = mild_lens() if settings.camera is None else read_lens(Path(settings.camera))
+        return {f"c{v + 1}": camera for v in range(settings.views)}
 
     @property
     def n_sets(self) -> int:
         """How many sets of poses there are: one for each view unless they share them."""
-        shared = self.settings.shared_poses or not isinstance(self.settings.poses, int)
+        shared = self.settings.shared_poses or isinstance(self.settings.poses, str | Path)
         return 1 if shared else len(self.cameras)
 
     def poses_of(self, view: int, n_poses: int) -> range:
@@ -162,13 +170,13 @@ class _Simulator:
         settings, n_views, n_sets = self.settings, len(self.cameras), self.n_sets
         if self.plan is not None:
             poses = self.plan.poses(self.truth)
-        elif isinstance(settings.poses, int):
+        elif isinstance(settings.poses, str | Path):
+            poses = given_poses(self.truth, Path(settings.poses))
+        else:
             poses = commanded_poses(
                 self.truth, self.nominal, settings.poses * n_sets, self.rngs["poses"],
                 settings.sampling, self.progress,
             )  # fmt: skip
-        else:
-            poses = given_poses(self.truth, settings.poses)
         settings.check_images(n_views, len(poses.poses) // n_sets)
         return poses
 
@@ -176,8 +184,10 @@ class _Simulator:
         """Return boards and cameras around the machine: where plan and settings have them."""
         # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
-        posed = pose_machine(self.truth, dressed(replace(self.truth, urdf=urdf)), poses)
-        on_base, (_, views), groups = None, self.given_views, tuple[str, ...]()
+        is_solid = self.settings.occlusion or self.settings.level == Level.PHOTOGRAPHS
+        solids = dressed(replace(self.truth, urdf=urdf)) if is_solid else ()
+        posed = pose_machine(self.truth, solids, poses)
+        on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:
             on_base = self._board_of_plan(self.plan)
             posed = _beside(on_base, posed)
@@ -203,7 +213,7 @@ class _Simulator:
             boards = (FixedBoard(on_base.board, "base", on_base.T_base_board), *boards)
             if self.settings.hand_held:
                 views, groups = self._in_hand(posed)
-        if self.settings.level is Level.PHOTOGRAPHS:
+        if self.settings.level == Level.PHOTOGRAPHS:
             views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
         return _Setup(poses, posed, boards, views, groups)
 
@@ -284,7 +294,7 @@ class _Simulator:
             self.progress, each=plan is None or not plan.hand,
         )  # fmt: skip
         rows = list(range(len(images)))
-        if self.settings.level is not Level.PHOTOGRAPHS:
+        if self.settings.level != Level.PHOTOGRAPHS:
             rows = [row for row in rows if images.seen(row)]
         kept = images.chosen(rows)
         if setup.groups:
@@ -299,12 +309,12 @@ class _Simulator:
         arms = {j: np.array([m.arms[j] for m in posed]) for j in posed[0].arms}
         scene = Scene(A, B, setup.views, images, arms)
         outlines = axes = corners = None
-        if settings.level is Level.OUTLINES:
+        if settings.level == Level.OUTLINES:
             noise = OutlineNoise(settings.sigma_px, n_points=None)
             outlines = outlines_of(scene, noise, rngs["observations"])
-        elif settings.level is Level.AXES:
+        elif settings.level == Level.AXES:
             axes = axes_in_images(scene, settings.table, rngs["observations"])
-        if setup.boards and settings.level is not Level.PHOTOGRAPHS:
+        if setup.boards and settings.level != Level.PHOTOGRAPHS:
             corners = corners_in_images(scene, posed, settings.sigma_px, rngs["corners"])
         n_poses = len(setup.poses.poses)
         width = max(2, len(str(n_poses)))
@@ -370,7 +380,7 @@ def _recorded(
 ) -> Measurements:
     """Return the rows of the dataset: readings with their errors, and rough poses of cameras."""
     legs, images = truth.leg_names, scene.images
-    photographs = settings.level is Level.PHOTOGRAPHS
+    photographs = settings.level == Level.PHOTOGRAPHS
     # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
     least = _MIN_SEEN if photographs else 0.0
     views = []
@@ -383,8 +393,8 @@ def _recorded(
     spreads = [settings.reading_errors(leg) for leg in truth.legs]
     errors = np.zeros(q.shape)
     for kind in dict.fromkeys(spread.distribution for spread in spreads):
-        size = np.array([spread.size * (spread.distribution is kind) for spread in spreads])
-        if kind is Distribution.UNIFORM:
+        size = np.array([spread.size * (spread.distribution == kind) for spread in spreads])
+        if kind == Distribution.UNIFORM:
             errors += rngs["readings"].uniform(-size, size, q.shape)
         else:
             errors += size * rngs["readings"].normal(size=q.shape)

@@ -288,6 +288,8 @@ def link_poses(machine: Machine, configuration: Array) -> dict[str, RigidTransfo
 
 def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tuple[PlacedSolid, ...]:
     """Return solids where the poses of their links, T_base_link, put them."""
+    if not solids:
+        return ()
     at = [np.eye(4) if s.link is None else poses[s.link].as_matrix() for s in solids]
     found = matrix_product(np.array(at), np.array([s.T_link_solid.as_matrix() for s in solids]))
     return tuple(map(PlacedSolid, solids, motions_of(found[:, :3, :3], found[:, :3, 3])))
@@ -450,6 +452,8 @@ class PosedMachine:
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
         """Return which points something stands before, seen from a centre."""
+        if not len(self.faces):
+            return np.zeros(len(points), dtype=np.bool_)
         ray = points - centre
         distance = np.linalg.norm(ray, axis=-1)
         ray = ray / distance[:, None]
@@ -490,7 +494,7 @@ def pose_machine(
     for mesh in meshes:
         faces.append(mesh.faces + first)
         first += len(mesh.vertices)
-    stacked = np.concatenate(faces)
+    stacked = np.concatenate([np.zeros((0, 3), dtype=np.intp), *faces])
     posed_machines = []
     for configuration, T in zip(poses.configurations, poses.poses, strict=True):
         here = placed(solids, link_poses(machine, configuration))
@@ -499,7 +503,7 @@ def pose_machine(
         q = joint_values(machine, configuration)
         arms = arms_at(machine.legs, q[None, first_rods(machine.legs)])
         of_legs = {j: ends[0] for j, ends in arms.items()}
-        A, triangle = machine.A_at(q), np.concatenate(vertices)
+        A, triangle = machine.A_at(q), np.concatenate([np.zeros((0, 3)), *vertices])
         posed_machines.append(PosedMachine(A, B, here, triangle, stacked, arms=of_legs))
     return tuple(posed_machines)
 

@@ -1,19 +1,17 @@
-"""The one Monte Carlo runner: all cores, resumable, the same results however it is run.
+"""The Monte Carlo runner: the same results however it is run, continued where it was stopped.
 
-Run i has child i of the study's seed, whatever the number of runs and of processes. Every run
-goes to the checkpoint as it comes; the summary reads them back in the order of their numbers, one
-at a time, so that neither the order nor memory depends on how they were computed.
+Run i has child i of the study's seed, whatever the number of runs and of processes. ``runs.jsonl``
+has the study with its settings and its seed in the first line and one run in every other, written
+as runs end; a line that was being written when the process was killed is done again.
 """
 
 from __future__ import annotations
 
 import json
-import tempfile
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,23 +20,20 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files.folder import TEMPORARY_SUFFIX, OutputKind, check_path, result_folder
+from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
 from legcal.files.schema import SparseDocument
 from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
-from legcal.simulation.checkpoint import (
-    CHECKPOINT_NAME,
-    MOST_RUNS,
-    Checkpoint,
-    header,
-    is_begun,
-    open_checkpoint,
-)
+from legcal.signals import raise_if_stopped
+from legcal.version import __version__
 from legcal.workers import Workers, is_number, worker_pool
 
+CHECKPOINT_NAME = "runs.jsonl"
 DOCUMENT_NAME = "study.json"
 _STUDY = OutputKind("result of the study", "", "")  # beside the checkpoint and other files
-_LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
+_KEY, _VERSION = "legcal_study", 1
+_MOST_RUNS = 1_000_000
+_LARGEST_CHUNK = 10  # runs between two writes to the checkpoint
 _PROCESSES = 4  # for each core; more only wait for each other
 _MANY = 64  # workers that a cluster may have
 _CHUNKS = 16  # for each process: the work is shared evenly to the end
@@ -75,9 +70,6 @@ class Study(Protocol):
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         """Return the record of one run; a LegcalError is recorded as a failed run."""
 
-    def is_record(self, found: Any) -> bool:
-        """Return whether what a checkpoint has of a run is what :meth:`one_run` returns."""
-
     def summary(self, records: Iterable[Record]) -> Summary:
         """Summarise the records of all runs that did not fail, read once and in order."""
 
@@ -90,7 +82,6 @@ class StudyHeading(SparseDocument):
     seed: int
     runs: int
     failures: dict[str, int]  # runs that failed as a whole, by kind of error
-    part: list[int] | None = None  # which part of how many; left out where the runs are all
 
 
 @brief
@@ -104,7 +95,6 @@ class StudyResult:
     n_runs: int
     failures: dict[str, int]  # how many runs failed as a whole, by kind of error
     summary: Summary  # what the others found
-    part: tuple[int, int] | None = None  # which part of how many the runs are
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
@@ -114,7 +104,6 @@ class StudyResult:
             seed=self.seed,
             runs=self.n_runs,
             failures=self.failures,
-            part=list(self.part) if self.part else None,
         )
         return self.summary.document() | heading.document()
 
@@ -127,8 +116,6 @@ def run_study(
     workers: Workers = 1,
     output: Path | None = None,
     progress: Progress = False,
-    part: tuple[int, int] | None = None,
-    merge: Sequence[Path] = (),
     beside: Callable[[StudyResult, Path], None] | None = None,
 ) -> StudyResult:
     """Run a study, or what is missing of it.
@@ -149,10 +136,6 @@ def run_study(
         the same study is continued; more runs than before are added to those that are there.
     progress : bool or callable
         True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
-    part : (k, n), optional
-        Only every n-th run, from run k - 1 on: n such parts make the study.
-    merge : sequence of Path
-        Folders of parts of the study, whose runs are taken over.
     beside : callable, optional
         Called as ``beside(result, folder)`` with the figures in the folder: what it writes there
         appears in the output with them.
@@ -171,68 +154,38 @@ def run_study(
         If a file cannot be written or a process is ended from outside.
     """
     _check_numbers(n_runs, seed, workers)
-    runs = _runs_of_part(n_runs, part)
-    stage = f"Study {study.name}"
-    with shown_progress(progress) as report, _folder(output) as folder:
-        path = folder / CHECKPOINT_NAME
-        first = header(study.name, study.settings, seed)
-        kept = output is not None
-        with open_checkpoint(path, first, study.is_record, kept=kept) as checkpoint:
-            for other in merge:
-                checkpoint.merge(other / CHECKPOINT_NAME, runs, study.is_record)
-            missing = array("q", (run for run in runs if run not in checkpoint.offsets))
-            done = len(runs) - len(missing)
-            report(stage, done, len(runs))
-            if missing:
-                slots = _MANY
-                if is_number(workers):
-                    workers = slots = min(workers, len(missing), _PROCESSES * processors())
-                with worker_pool(workers, "The study could not be finished", in_order=False) as run:
-                    chunks = _chunks(missing, slots)
-                    for lines in run(partial(run_chunk, study, seed), chunks):
-                        checkpoint.append(lines)
-                        done += len(lines)
-                        report(stage, done, len(runs))
-            result = replace(_result(study, seed, runs, checkpoint), part=part)
-        if output is not None:
-            _write(result, folder, beside)
+    checkpoint, stage = _Checkpoint(output, _header(study, seed)), f"Study {study.name}"
+    missing = [run for run in range(n_runs) if run not in checkpoint.lines]
+    with shown_progress(progress) as report:
+        done = n_runs - len(missing)
+        report(stage, done, n_runs)
+        if missing:
+            slots = _MANY
+            if is_number(workers):
+                workers = slots = min(workers, len(missing), _PROCESSES * processors())
+            with worker_pool(workers, "The study could not be finished", in_order=False) as run:
+                for lines in run(partial(run_chunk, study, seed), _chunks(missing, slots)):
+                    checkpoint.add(lines)
+                    done += len(lines)
+                    report(stage, done, n_runs)
+    in_order = [checkpoint.lines[run] for run in range(n_runs)]
+    result = _result(study, seed, in_order)
+    if output is not None:
+        _write(result, output, beside)
     return result
 
 
-def _runs_of_part(n_runs: int, part: tuple[int, int] | None) -> range:
-    """Return the numbers of the runs; refuse a part that the study does not have."""
-    if part is None:
-        return range(n_runs)
-    k, n = part
-    if not 1 <= k <= n <= n_runs:
-        raise UsageError(
-            f"The study could not be run: found part {k}/{n}, needed K/N with K from 1 to N and N "
-            f"no more than the {n_runs} runs; correct it."
-        )
-    return range(k - 1, n_runs, n)
-
-
-def _result(study: Study, seed: int, runs: range, checkpoint: Checkpoint) -> StudyResult:
-    """Return what runs found, read one after the other."""
-    failures: Counter[str] = Counter()
-    messages: list[str] = []
-
-    def records() -> Iterator[Record]:
-        for line in checkpoint.lines(runs):
-            if "record" in line:
-                yield line["record"]
-            else:
-                failures[line["failure"]["kind"]] += 1
-                if not messages:
-                    messages.append(line["failure"]["message"])
-
-    summary = study.summary(records())
-    if failures.total() == len(runs):
+def _result(study: Study, seed: int, lines: Sequence[Record]) -> StudyResult:
+    """Return what runs found."""
+    failures = [line["failure"] for line in lines if "failure" in line]
+    if len(failures) == len(lines):
         raise DidNotConverge(
-            f"The study {study.name} found nothing: all of its {len(runs)} runs failed, needed one "
-            f"that does not; the first one says: {messages[0]}"
+            f"The study {study.name} found nothing: all of its {len(lines)} runs failed, needed "
+            f"one that does not; the first one says: {failures[0]['message']}"
         )
-    return StudyResult(study.name, study.settings, seed, len(runs), dict(failures), summary)
+    kinds = dict(Counter(failure["kind"] for failure in failures))
+    summary = study.summary(line["record"] for line in lines if "record" in line)
+    return StudyResult(study.name, study.settings, seed, len(lines), kinds, summary)
 
 
 def _write(
@@ -240,68 +193,159 @@ def _write(
 ) -> None:
     """Write the document and the figures, all of them or nothing."""
     document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
-    try:
-        with result_folder(folder, _STUDY) as new:
-            for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
-                (new / name).write_bytes(content)
-            if beside is not None:
-                beside(result, new)
-    except OutOfResources as error:
-        found = getattr(error.__cause__, "strerror", None) or str(error.__cause__)
-        raise OutOfResources(
-            f"{folder}: the result of the study could not be written: found '{found}', "
-            "needed a folder that takes its files; free some space and start the same command "
-            "again; all runs are kept."
-        ) from error
+    with result_folder(folder, _STUDY) as new:
+        for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+            (new / name).write_bytes(content)
+        if beside is not None:
+            beside(result, new)
 
 
-@contextmanager
-def _folder(output: Path | None) -> Iterator[Path]:
-    """Give the output folder, or one that is removed in the end."""
-    if output is None:
-        with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
-            yield Path(folder)
-        return
-    try:
-        check_path(output, _STUDY)
-        _check_folder(output)
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
+    """Refuse numbers that make no sense."""
+    if n_runs > _MOST_RUNS:
         raise UsageError(
-            f"{output}: the study could not be written: found '{error.strerror}', needed a folder "
-            "that can be created and read; give another output folder."
-        ) from error
-    yield output
+            f"The study could not be run: found runs = {n_runs}, needed {_MOST_RUNS} at most; give "
+            "another number."
+        )
+    processes = workers if is_number(workers) else 1
+    for name, number, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", processes, 1)):
+        if number < least:
+            raise UsageError(
+                f"The study could not be run: found {name} = {number}, needed {least} or more; "
+                "give another number."
+            )
 
 
-def _check_folder(output: Path) -> None:
-    """Refuse a folder that holds something else than a study."""
+# The checkpoint
+
+
+class _Checkpoint:
+    """The lines of the runs that are done, kept in the file of an output folder if there is one."""
+
+    def __init__(self, output: Path | None, first: Record) -> None:
+        self.lines: dict[int, Record] = {}
+        self._path = None
+        if output is not None:
+            _prepare_folder(output)
+            self._path = output / CHECKPOINT_NAME
+            with _writing(self._path):
+                self._read(self._path, first)
+
+    def add(self, lines: Sequence[Record]) -> None:
+        """Add the lines of some runs; nothing once a signal was heard."""
+        raise_if_stopped()
+        if self._path is not None:
+            with _writing(self._path), self._path.open("ab") as file:
+                file.write(b"".join(map(_encoded, lines)))
+        self.lines |= {line["run"]: line for line in lines}
+
+    def _read(self, path: Path, first: Record) -> None:
+        """Read the lines that are there, and drop half of a line at the end; or begin the file."""
+        content = path.read_bytes() if path.exists() else b""
+        heading, end, body = content.partition(b"\n")
+        if not end and _encoded(first).startswith(heading):  # new, or killed while it was begun
+            path.write_bytes(_encoded(first))
+            return
+        _check_header(path, heading, first)
+        *runs, rest = body.split(b"\n")
+        if runs and not rest and not _parsed(runs[-1]):  # zeros, after a power cut
+            rest = runs.pop()
+        for number, line in enumerate(runs, 2):
+            found = _parsed(line)
+            if not _is_run(found):
+                raise UsageError(
+                    f"{path}: the study could not be continued: found line {number} damaged, "
+                    "needed a complete JSON object of a run on every line; remove that line, or "
+                    "give another output folder."
+                )
+            self.lines.setdefault(found["run"], found)
+        if rest:
+            path.write_bytes(b"".join(line + b"\n" for line in (heading, *runs)))
+
+
+def _prepare_folder(output: Path) -> None:
+    """Make the output folder; refuse one that holds something else than a study."""
+    check_path(output, _STUDY)
     checkpoint = output / CHECKPOINT_NAME
-    if not output.is_dir() or is_begun(checkpoint):
-        return
-    others = [path for path in output.iterdir() if not path.name.endswith(TEMPORARY_SUFFIX)]
-    if any(path != checkpoint or path.is_dir() for path in others):
+    is_begun = checkpoint.is_file() and (
+        checkpoint.stat().st_size > 0 or list(output.iterdir()) == [checkpoint]
+    )
+    if output.is_dir() and holds_files(output) and not is_begun:
         raise UsageError(
             f"{output}: the study could not be written: found a folder with other files and no "
             f"{CHECKPOINT_NAME} of a study, needed a new or empty folder or that of the same "
             "study; give another output folder."
         )
+    with _writing(output):
+        output.mkdir(parents=True, exist_ok=True)
 
 
-def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
-    """Refuse numbers that make no sense."""
-    if n_runs > MOST_RUNS:
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Say in one sentence what keeps a checkpoint from being read or written."""
+    try:
+        yield
+    except OSError as error:
+        raise OutOfResources(
+            f"{path}: the runs of the study could not be kept: found '{error.strerror}', needed a "
+            "folder that takes them; free some space and start the same command again, which goes "
+            "on from the runs that are there."
+        ) from error
+
+
+def _header(study: Study, seed: int) -> Record:
+    """Return the first line of the checkpoint of a study."""
+    first = {"study": study.name, "version": __version__, "seed": seed, "settings": study.settings}
+    return _parsed(_encoded({_KEY: _VERSION, **first}))
+
+
+def _check_header(path: Path, line: bytes, expected: Record) -> None:
+    """Refuse a first line that is not the expected one."""
+    found = _parsed(line)
+    if found == expected:
+        return
+    if _KEY not in found:
         raise UsageError(
-            f"The study could not be run: found runs = {n_runs}, needed {MOST_RUNS} at most; give "
-            "another number."
+            f"{path}: the study could not be continued: found a file that is no checkpoint of "
+            "legcal, needed one or none; give another output folder."
         )
-    processes = workers if is_number(workers) else 1
-    for name, found, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", processes, 1)):
-        if found < least:
-            raise UsageError(
-                f"The study could not be run: found {name} = {found}, needed {least} or more; "
-                "give another number."
-            )
+    flat, needed = ({**first, **dict(first.get("settings") or {})} for first in (found, expected))
+    other = [name for name in needed if name != "settings" and flat.get(name) != needed[name]]
+    told = "; ".join(f"{name} {flat.get(name)!r} instead of {needed[name]!r}" for name in other)
+    raise UsageError(
+        f"{path}: the study could not be continued: found the runs of another command ({told}), "
+        "needed those of the same; give another output folder, or this one the command that began "
+        "it."
+    )
+
+
+def _is_run(found: Record) -> bool:
+    """Return whether a line has what a run found, or how it failed."""
+    run, failure = found.get("run"), found.get("failure")
+    if type(run) is not int or not 0 <= run < _MOST_RUNS:
+        return False
+    if found.keys() == {"run", "record"}:
+        return isinstance(found["record"], dict)
+    return (
+        found.keys() == {"run", "failure"}
+        and isinstance(failure, dict)
+        and failure.keys() == {"kind", "message"}
+        and all(isinstance(text, str) for text in failure.values())
+    )
+
+
+def _encoded(document: Record) -> bytes:
+    """Return a document as one line."""
+    return json.dumps(document, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+
+
+def _parsed(line: bytes) -> Record:
+    """Return the object on a line, an empty one if there is none."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 # Runs in processes
@@ -312,9 +356,9 @@ def child_seed(seed: int, run: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(run,))
 
 
-def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, Any]]:
+def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[Record]:
     """Return the line of each run; one that legcal refuses is a failure, and no other error is."""
-    lines: list[dict[str, Any]] = []
+    lines: list[Record] = []
     for run in runs:
         try:
             lines.append({"run": run, "record": study.one_run(child_seed(seed, run))})

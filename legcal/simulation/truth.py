@@ -65,7 +65,7 @@ def draw_errors(
     step = np.zeros(len(found))
     for i, name in enumerate(found.names):
         spread = _spread(errors, name)
-        unit = normal if spread.distribution is Distribution.NORMAL else uniform
+        unit = normal if spread.distribution == Distribution.NORMAL else uniform
         step[i] = spread.size * unit[i]
     moved = moved_legs(legs, found.place, step)
     scale = np.array([_spread(errors, name).size for name in found.names])
@@ -120,7 +120,7 @@ def draw_radii(
                 tubes.setdefault(tube, []).append(place)
     _check_radii(spread, min(radii.values(), default=np.inf))
     uniform, normal = rng.uniform(-1.0, 1.0, len(tubes)), rng.normal(size=len(tubes))
-    unit = normal if spread.distribution is Distribution.NORMAL else uniform
+    unit = normal if spread.distribution == Distribution.NORMAL else uniform
     for step, places in zip((spread.size * unit).tolist(), tubes.values(), strict=True):
         for place in places:
             radii[place] += step
@@ -129,7 +129,7 @@ def draw_radii(
 
 def _check_radii(spread: Spread, thinnest: float) -> None:
     """Refuse errors that may leave nothing of a leg."""
-    most = _MAX_RADIUS_ERROR[spread.distribution] * thinnest
+    most = _MAX_RADIUS_ERROR[Distribution(spread.distribution)] * thinnest
     if not spread.size <= most:
         raise UsageError(
             f"The errors of radii could not be drawn: found a size of {1e3 * spread.size:g} mm, "

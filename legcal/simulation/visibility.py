@@ -288,6 +288,7 @@ class Viewpoint:
     name: str
     camera: Camera  # its intrinsics
     T_base_camera: RigidTransform  # its true pose in the base link
+    legs: tuple[str, ...] | None = None  # measured in its images; None for all that they show
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,6 +341,8 @@ def take_images(
         camera, T = viewpoint.camera, viewpoint.T_base_camera
         _refuse_inside(viewpoint, [posed_machines[p] for p in poses])
         views = [legs_in_image(legs, posed_machines[p], camera, T) for p in poses]
+        if viewpoint.legs is not None:
+            views = [_only(viewpoint.legs, legs, view) for view in views]
         if not any(leg.is_seen for view in views for leg in view):
             problems.append(_sees_nothing(viewpoint.name, legs, views))
         for p, view in zip(poses, views, strict=True):
@@ -350,6 +353,16 @@ def take_images(
         raise NotVisible(problems)
     view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
     return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
+
+
+def _only(
+    names: Sequence[str], legs: Sequence[Leg], shown: Sequence[LegView]
+) -> tuple[LegView, ...]:
+    """Return what an image shows of the named legs."""
+    nothing = LegView(0.0, 0.0, ())
+    return tuple(
+        view if leg.name in names else nothing for leg, view in zip(legs, shown, strict=True)
+    )
 
 
 def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine]) -> None:

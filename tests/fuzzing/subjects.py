@@ -63,14 +63,10 @@ SUBJECTS = (
     Subject("result", "result/result.json", "calibrate {in}/set --check {in}/result", deep=True),
     Subject("result", "result/calibrated.yaml",
             "evaluate {in}/result/calibrated.yaml 3-rpr", deep=True),
-    Subject("settings", "cameras.yaml", "simulate 3-rpr --level axes --poses 4 --cameras "
-            "{in}/cameras.yaml -o {out}", deep=True),
-    Subject("settings", "poses.csv", "simulate 3-rpr --level axes --poses {in}/poses.csv -o {out}",
-            deep=True),
-    Subject("settings", "camera.yaml", "simulate 3-rpr --level axes --poses 4 --camera "
+    Subject("settings", "poses.csv",
+            "simulate 3-rpr --level outlines --poses {in}/poses.csv -o {out}", deep=True),
+    Subject("settings", "camera.yaml", "simulate 3-rpr --level outlines --poses 4 --camera "
             "{in}/camera.yaml -o {out}", deep=True),
-    Subject("settings", "appearance.yaml", "simulate 3-rpr --poses 1 --views 1 --camera "
-            "{in}/camera.yaml --appearance {in}/appearance.yaml -o {out}", deep=True),
     Subject("settings", "board.png", "camera {in}/board.png --board chessboard:5x4:20mm -o {out}"),
 )  # fmt: skip
 
@@ -101,13 +97,8 @@ def _pictures(folder: Path) -> None:
 def _settings(folder: Path) -> None:
     """Write what simulate reads beside a model, and the picture of a board."""
     shutil.copy(made_input("plain") / "camera_info.yaml", folder / "camera.yaml")
-    places = made_input("3-rpr-axes").parent / "3-rpr-places.yaml"
-    shutil.copy(places, folder / "cameras.yaml")
     header = "leg1_prismatic,leg2_prismatic,leg3_prismatic"
     (folder / "poses.csv").write_text(f"{header}\n0.05,0.06,0.07\n0.08,0.06,0.05\n0.07,0.09,0.06\n")
-    (folder / "appearance.yaml").write_text(
-        "lamps:\n- {direction: [0.3, 0.2, 1.0], power: 1.5}\nclutter: 2\n"
-    )
     squares = np.kron(np.indices((7, 8)).sum(axis=0) % 2, np.ones((24, 24)))
     cv2.imwrite(str(folder / "board.png"), (40 + 170 * squares).astype(np.uint8))
 
