@@ -211,9 +211,10 @@ def test_wrong_outlines_hardly_matter() -> None:
     h, ends = shifted_outlines(camera, session.outlines.h, session.outlines.ends, offsets)
     wrong = replace(session.outlines, h=h, ends=ends)
     axes = axes_from_outlines(wrong, session.measurements, session.radii)
-    found = staged(replace(session, axes=axes), nominal).parameters
+    result = staged(replace(session, axes=axes), nominal)
+    assert any("Leg leg1 in image 1 was left out" in text for text in result.diagnostics)
     clean = errors(staged(session, nominal).parameters, session.machine).max()
-    assert errors(found, session.machine).max() < 2.0 * clean
+    assert errors(result.parameters, session.machine).max() < 2.0 * clean + 1e-4
 
 
 # Invariance

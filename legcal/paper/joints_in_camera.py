@@ -51,6 +51,7 @@ from legcal.paper.nominal import NominalMachine
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _WRONG_SCALE = 0.02  # of the motion of a carriage: as wrong as radii may be
 _SURE = 5.0  # standard deviations
+_OUTLIER = 8.0  # standard deviations, or medians where these are too small
 _ROUNDING = 1e-14  # of a variance, in the difference that is left of it
 _JOINT = np.r_[0:3, 6:12]  # A, w and c in the covariance of a joint
 _AXIS = slice(3, 6)  # v in it
@@ -121,7 +122,7 @@ def locate_joints_in_cameras(
         )
     axes = axes.choose(np.flatnonzero(clear[bundles.of_axis]))
     joints = _Bundles.of(machine, axes, measurements).joints(
-        machine, len(measurements.views), weighted=weighted
+        machine, measurements, weighted=weighted
     )
     joints = replace(joints, diagnostics=(*left_out, *joints.diagnostics))
     joints = _with_axes(machine, joints, measurements, weighted=weighted)
@@ -189,9 +190,12 @@ class _Bundles:
             reasons.append(reason)
         return reasons
 
-    def joints(self, machine: NominalMachine, n_views: int, *, weighted: bool) -> JointsInCamera:
+    def joints(
+        self, machine: NominalMachine, measurements: Measurements, *, weighted: bool
+    ) -> JointsInCamera:
         """Return the joints by (6) and (6'), and the axes; with weights, adjusted to them."""
-        solution, axes, said = solve_least_squares(self.problem), self.axes, list[str]()
+        solution, said = solve_least_squares(self.problem), list[str]()
+        axes = observed = self.axes
         C = np.zeros((len(self.leg), 9, 9))
         if weighted:
             problem = replace(self.problem, start=solution.x)
@@ -202,8 +206,10 @@ class _Bundles:
         if weighted:
             said += self._wrong_scales(machine, local, C)
             of_axis = local[self.of_axis], C[self.of_axis]
-            axes = _adjusted(axes, self.problem.terms[0], *of_axis)
-        shape = n_views, machine.n_legs
+            axes, chi = _adjusted(axes, self.problem.terms[0], *of_axis)
+            right, left_out = _without_outliers(machine, axes, chi, measurements)
+            axes, observed, said = axes.choose(right), observed.choose(right), [*said, *left_out]
+        shape = len(measurements.views), machine.n_legs
         A, located = np.zeros((*shape, 3)), np.zeros(shape, dtype=np.bool_)
         covariance, actuators = np.zeros((*shape, 12, 12)), dict[tuple[int, int], Actuator]()
         for i, (v, j) in enumerate(zip(self.view.tolist(), self.leg.tolist(), strict=True)):
@@ -218,7 +224,7 @@ class _Bundles:
                 covariance[v, j][np.ix_(_JOINT, _JOINT)] = slope @ C[i, :n, :n] @ slope.T
         nowhere = np.zeros_like(A)
         return JointsInCamera(
-            A, nowhere, located, actuators, covariance, axes, self.axes, tuple(said)
+            A, nowhere, located, actuators, covariance, axes, observed, tuple(said)
         )
 
     def _blocks(self, jacobian: csc_array[np.float64]) -> list[Array]:
@@ -250,15 +256,15 @@ def _needed(machine: NominalMachine, leg: int) -> str:
     return f"leg at {MIN_IMAGES[actuator.turns]} different readings of {actuator.joint}"
 
 
-def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> LegAxes:
-    """Return axes as they are likeliest to be if they fulfil an equation.
+def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> tuple[LegAxes, Array]:
+    """Return axes as they are likeliest to be if they fulfil an equation, and how far they do not.
 
-    The first errors of the equation are those of the directions; C (k, n, n) are the covariances
-    of its unknowns.
+    That is in standard deviations. The first errors of the equation are those of the directions;
+    C (k, n, n) are the covariances of its unknowns.
     """
     if term.covariance is None:
-        return axes
-    errors, covariance = adjusted(term.function, local, term.observed, term.covariance, C)
+        return axes, np.zeros(len(axes))
+    errors, covariance, chi = adjusted(term.function, local, term.observed, term.covariance, C)
     u = axes.u + np.einsum("kia,ki->ka", axes.basis, errors[:, :2])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=1, keepdims=True)
@@ -269,7 +275,8 @@ def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> LegAxes:
     variances = np.maximum(variances, _ROUNDING * before[:, None])
     of_axes = axes.covariance.copy()
     of_axes[:, :2, :2] = directions * variances[:, None] @ np.swapaxes(directions, 1, 2)
-    return replace(axes, u=u, basis=np.stack([e1, cross(u, e1)], axis=1), covariance=of_axes)
+    basis = np.stack([e1, cross(u, e1)], axis=1)
+    return replace(axes, u=u, basis=basis, covariance=of_axes), chi
 
 
 def adjusted_to_base(
@@ -279,7 +286,10 @@ def adjusted_to_base(
     of_A: Array,  # (n_views, n_legs, 3, 3), its covariances
     measurements: Measurements,
 ) -> JointsInCamera:
-    """Return joints at A, with axes adjusted to it and revolute axes by the adjusted directions."""
+    """Return joints at A, with axes adjusted to it and revolute axes by the adjusted directions.
+
+    Axes that miss A by far are left out.
+    """
     axes = joints.observed
     view, n = measurements.view[axes.row], len(axes)
     local, C = np.zeros((n, 9)), np.zeros((n, 9, 9))
@@ -289,9 +299,33 @@ def adjusted_to_base(
     term = Term(joint_on_axis(), index, (stands, axes.u, axes.M, axes.basis), axes.covariance)
     covariance = joints.covariance.copy()
     covariance[:, :, :3, :3] = of_A
-    axes = _adjusted(axes, term, local, C)
-    joints = replace(joints, A=A, covariance=covariance, axes=axes)
+    better, chi = _adjusted(axes, term, local, C)
+    right, left_out = _without_outliers(machine, axes, chi, measurements)
+    joints = replace(
+        joints,
+        A=A,
+        covariance=covariance,
+        axes=better.choose(right),
+        observed=axes.choose(right),
+        diagnostics=(*joints.diagnostics, *left_out),
+    )
     return oriented(machine, _with_axes(machine, joints, measurements, weighted=True))
+
+
+def _without_outliers(
+    machine: NominalMachine, axes: LegAxes, chi: Array, measurements: Measurements
+) -> tuple[IntArray, tuple[str, ...]]:
+    """Return which axes do not miss their joint by far, chi (n,) in sigmas, and words for others.
+
+    These are wrong outlines, as a rule.
+    """
+    wrong = chi > _OUTLIER * max(1.0, float(np.median(chi)))
+    left_out = tuple(
+        f"Leg {machine.leg_names[j]} in image {measurements.image[row] or row + 1} was left out of "
+        "steps 3 and 4: its axis misses its base joint by far; check its outlines."
+        for j, row in zip(axes.leg[wrong].tolist(), axes.row[wrong].tolist(), strict=True)
+    )
+    return np.flatnonzero(~wrong), left_out
 
 
 # Revolute axes
@@ -355,7 +389,7 @@ def _with_axes(
     across = AcrossAxes(some.u, some.basis, R, covariance, axis)
     start, turns, C = across.solve(weighted=weighted)
     if weighted:
-        better = _adjusted(some, across.term(start), turns[axis], C[axis])
+        better, _ = _adjusted(some, across.term(start), turns[axis], C[axis])
         parts = {name: getattr(axes, name).copy() for name in ("u", "basis", "covariance")}
         for name, part in parts.items():
             part[rows] = getattr(better, name)

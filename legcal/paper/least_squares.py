@@ -222,11 +222,11 @@ def adjusted(
     observed: tuple[Array, ...],
     covariance: Array,  # (n, k, k) of the errors
     local_covariance: Array,  # (n, n_local, n_local)
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Return the likeliest errors (n, k) of observations that fulfil an equation, and covariances.
 
     The covariances (n, k, k) are those of what is left of the errors, larger where the equation
-    contradicts what was observed.
+    contradicts what was observed: last by how many standard deviations it does (n,).
     """
     residual = evaluated(function, local, *observed)[..., None]
     by_local, by_error = (derivatives(function, which, local, *observed) for which in (0, 1))
@@ -235,7 +235,7 @@ def adjusted(
     gain = mixed @ np.linalg.inv(spread)
     left = covariance - gain @ np.swapaxes(mixed, 1, 2)
     chi = np.linalg.norm(whitener(spread) @ residual, axis=(1, 2))
-    return -(gain @ residual)[..., 0], left / (_cauchy(chi) ** 2)[:, None, None]
+    return -(gain @ residual)[..., 0], left / (_cauchy(chi) ** 2)[:, None, None], chi
 
 
 def _nothing(function: ca.Function) -> Array:
