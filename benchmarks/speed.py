@@ -1,6 +1,6 @@
 """How fast photographs are turned into outlines, and whether memory grows with their number.
 
-    OMP_NUM_THREADS=1 python benchmarks/speed.py [--memory N]
+    OMP_NUM_THREADS=1 python benchmarks/speed.py [--memory N] [--ratio N]
 
 The images of the sample dataset (1024 x 768, six legs) are decoded beforehand. Times are those of
 the processor, for one image: what is seen of exposure and blur; legs recognised and cameras placed,
@@ -8,20 +8,30 @@ near rough camera poses or without any; the brief measurement of all outlines ne
 views to them with the search for missing legs, and the measurement with all care where the legs
 truly are, which a joint fit misses by hundredths of a pixel. Of these images/s, "measured once" is
 what a first measurement asks, recognition included, and "calibrate" is all that a calibration does
-with an image. Peak memory is that of processes which measure N and 3 N images that they read one by
-one.
+with an image once. Peak memory is that of processes which measure N and 3 N images that they read
+one by one.
+
+With --ratio the processor time of one whole ``legcal calibrate --fresh`` in a process of its own,
+imports counted, is compared with that of the line segment detector of OpenCV on the same images at
+full size, N times in turn: machines are noisy, and the ratio says more than either.
 """
 
 import argparse
 import json
 import multiprocessing
+import os
 import resource
+import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from sample_outlines import TRUTH, true_scene
 from scipy.spatial.transform import RigidTransform
@@ -170,11 +180,51 @@ def measure_memory(n: int) -> None:
             )
 
 
+def calibration_seconds() -> float:
+    """Return the processor time of a whole calibration in a process of its own [s]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with TemporaryDirectory() as scratch:
+        command = [sys.executable, "-m", "legcal", "calibrate", str(DATASET)]
+        command += ["-o", f"{scratch}/out", "--fresh", "--no-report", "--quiet"]
+        threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        subprocess.run(command, check=True, env=os.environ | threads, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def detector_seconds() -> float:
+    """Return the processor time of the line segment detector on all images, one thread [s]."""
+    files = sorted((DATASET / "images").iterdir())
+    images = [
+        image for f in files if (image := cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)) is not None
+    ]
+    cv2.setNumThreads(1)
+    detector = cv2.createLineSegmentDetector()
+    begin = time.process_time()
+    for image in images:
+        detector.detect(image)
+    return time.process_time() - begin
+
+
+def measure_ratio(n: int) -> None:
+    """Print the time of a calibration over that of the line segment detector, n times."""
+    ratios = []
+    for _ in range(n):
+        ours, theirs = calibration_seconds(), detector_seconds()
+        ratios.append(ours / theirs)
+        print(f"calibrate {ours:6.2f} s, line segments {theirs:6.2f} s, ratio {ratios[-1]:5.2f}")
+    print(f"median ratio {statistics.median(ratios):.2f}")
+
+
 def main() -> None:
     """Measure speed, then memory."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--memory", type=int, default=N_MEMORY, help=f"images; {N_MEMORY}")
+    parser.add_argument("--ratio", type=int, help="compare with line segments, so many times")
     options = parser.parse_args()
+    if options.ratio:
+        measure_ratio(options.ratio)
+        return
     measure_speed()
     measure_memory(options.memory)
 

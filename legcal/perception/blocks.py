@@ -15,7 +15,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
 from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
-from legcal.perception.profiles import Edge, read_profiles
+from legcal.perception.profiles import TAPER, Edge, fading, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 
@@ -39,6 +39,7 @@ DEEP = 1.5  # inside, besides the blur, where the step to the leg is read [px]
 BEND = (0, 1, 4)  # functions of the limb model without an edge
 MAX_STEP = 0.8  # largest step of a block [px]
 
+DOUBTFUL = 0.25  # part of that width in which blocks count less when all are fitted together
 TUKEY = 4.0  # width of the biweight: blocks beyond have no weight [standard deviations]
 N_ROUNDS, CONVERGED_LINE = 10, 1e-3  # of weights: at most, and until no end moves more [px]
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
@@ -61,7 +62,8 @@ class Blocks:
 
     d: Samples  # (n, m) from the lines at which they were read
     light: Samples  # (n, m) less the mean of the edge
-    weight: Samples  # (n, m)
+    weight: Samples  # (n, m) by their noise and window
+    window: Samples  # (n, m) 1 but where the used range ends
     gain: Array  # (n,)
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
@@ -86,6 +88,7 @@ class Blocks:
         half_width: Array,
         gain: Array | None = None,
         clipped: Samples | None = None,
+        window: Samples | None = None,
     ) -> "Blocks":
         """Return blocks of pixels that have not been fitted."""
         n, n_edges = len(d), len(bounds) - 1
@@ -98,6 +101,7 @@ class Blocks:
             d,
             light - level.astype(np.float32)[edge][:, None],
             weight,
+            (weight > 0.0).astype(np.float32) if window is None else window,
             np.ones(n) if gain is None else gain,
             bounds,
             position,
@@ -134,9 +138,17 @@ class Blocks:
         if rows < MIN_ROWS_CLIPPED and np.mean(read.clipped > -np.inf) > MIN_SHARE_CLIPPED:
             # Too few pixels of a sharp step are left in short blocks.
             read = read_profiles(grey, camera, edges, v, depths, MIN_ROWS_CLIPPED, most)
-        light, weight = to_light(read.grey, read.inside, camera.gamma)
+        light, weight = to_light(read.grey, read.window, camera.gamma)
         return cls.of_pixels(
-            read.d, light, weight, read.bounds, read.position, half_width, read.gain, read.clipped
+            read.d,
+            light,
+            weight,
+            read.bounds,
+            read.position,
+            half_width,
+            read.gain,
+            read.clipped,
+            read.window,
         )
 
     @property
@@ -150,7 +162,8 @@ class Blocks:
             of_blur, moved, bins = self.last
             if of_blur == blur and np.array_equal(moved, self.moved):
                 return bins
-        bins = PixelBins.of(self.d - self.moved[:, None].astype(np.float32), self.weight, blur)
+        d = self.d - self.moved[:, None].astype(np.float32)
+        bins = PixelBins.of(d, self.weight, blur, window=self.window)
         self.last = blur, self.moved.copy(), bins
         return bins
 
@@ -159,6 +172,12 @@ class Blocks:
         nothing = [np.zeros(n, dtype=np.bool_) for n in np.diff(self.bounds)]
         lines = zip(self.lines, nothing, strict=True)
         return np.concatenate([none if line is None else line.kept for line, none in lines])
+
+    def shares(self) -> Array:
+        """Return how much blocks count that lie on the lines of their edges, 0 of others, (n,)."""
+        nothing = [np.zeros(n) for n in np.diff(self.bounds)]
+        lines = zip(self.lines, nothing, strict=True)
+        return np.concatenate([none if line is None else line.share for line, none in lines])
 
     def unmove(self) -> None:
         """Put lines back to where they were read; blocks that lay on them stay kept.
@@ -181,7 +200,8 @@ class Blocks:
         depth = np.clip(MILD_DEPTH * self.half_width, least, depth_for_blur(blur))
         depth = np.minimum(depth, MAX_NEAR_DEPTH * self.half_width)
         d = self.d - self.moved[:, None].astype(np.float32)
-        self.weight, self.last = self.weight * (d <= depth[self.edge, None]), None
+        window = fading(depth[self.edge, None].astype(np.float32) + np.float32(0.5 * TAPER) - d)
+        self.weight, self.window, self.last = self.weight * window, self.window * window, None
 
     def fit(self, blur: float, n_rounds: int) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
@@ -195,7 +215,8 @@ class Blocks:
                 sums = self.bins(blur).sums(self.light)
             else:
                 d = self.d[chosen] - self.moved[chosen, None].astype(np.float32)
-                sums = PixelBins.of(d, self.weight[chosen], blur).sums(self.light[chosen])
+                bins = PixelBins.of(d, self.weight[chosen], blur, window=self.window[chosen])
+                sums = bins.sums(self.light[chosen])
             fit = fit_blocks(sums, self.half_width, of_edges, edge[chosen])
             self.contrast[chosen] = fit.contrast
             self.sharp[chosen], self.noise[chosen] = fit.sharpness(), fit.noise
@@ -342,11 +363,16 @@ class BlockLine:
     """A line through the blocks of an outline, with those that lie on it."""
 
     ends: Array  # (2,) shift of the outline at t = 0 and at t = length [px of the band]
-    kept: BoolArray  # (n,) the blocks that lie on it
+    share: Array  # (n,) how much blocks count that lie on it, 0 of others
     inlier_share: float  # share of the blocks that show an edge at all which lie on the line
     position: Array  # (n_kept,) as fractions of the length
     residual: Array  # (n_kept,) distances from the line [px]
     variance: Array  # (n_kept,) of these by noise, scaled to the scatter seen [px^2]
+
+    @property
+    def kept(self) -> BoolArray:
+        """Which blocks lie on the line, (n,)."""
+        return np.asarray(self.share > 0.0)
 
     @property
     def first(self) -> float:
@@ -381,7 +407,8 @@ def fit_lines(
 
     From positions (n,) as fractions of the length, shifts [px], and their variances by noise
     [px^2] of all blocks, one outline after the other; those of variance ``largest`` or more are
-    left out. None where fewer than ``MIN_BLOCKS`` blocks agree.
+    left out, and those of more than half of it count less. None where fewer than ``MIN_BLOCKS``
+    blocks agree.
     """
     counts = np.diff(bounds)
     filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
@@ -392,7 +419,9 @@ def fit_lines(
         return table
 
     along, moved, noise = (padded(values) for values in (position, shift, variance))
-    usable = filled & (noise < largest)
+    part = np.divide(noise, largest, out=np.ones_like(noise), where=filled & (noise < largest))
+    gate = np.clip(2.0 - 2.0 * part, 0.0, 1.0)
+    usable = gate > 0.0
     n_usable = np.count_nonzero(usable, axis=1)
     fits = n_usable >= MIN_BLOCKS
     along, moved = np.where(usable, along, 0.0), np.where(usable, moved, 0.0)
@@ -401,7 +430,7 @@ def fit_lines(
     ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
     factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
     moving = fits.copy()
-    sigma, share = np.sqrt(floored), usable / floored
+    sigma, share = np.sqrt(floored), gate / floored
     products = share * np.stack(
         [(1.0 - along) ** 2, (1.0 - along) * along, along**2, (1.0 - along) * moved, along * moved]
     )
@@ -425,12 +454,14 @@ def fit_lines(
         if not np.any(moving):
             break
     on_line = robust > 0.0
+    within = 1.0 - np.sqrt(1.0 - np.sqrt(robust))  # 1 on the line, 0 where a block has no weight
+    count = gate * np.minimum(within / DOUBTFUL, 1.0)
     residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
     scaled = floored * factor[:, None] ** 2
     return [
         BlockLine(
             ends[i],
-            on_line[i, : counts[i]],
+            count[i, : counts[i]],
             float(np.count_nonzero(on_line[i]) / n_usable[i]),
             along[i, on_line[i]],
             residual[i, on_line[i]],

@@ -37,6 +37,8 @@ STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
 MIN_STEP = 1.15  # part of the step that a saturated background must leave [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 NEAR_TOLERANCE = (0.2, 3.0)  # the same where both are predicted well: [px], standard deviations
+NEAR_DOUBT = (0.6, 1.0)  # of that, from where on such outlines count less, and not at all
+LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
 MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
 MAX_LONE_OFFSET, MAX_LONE_RATIO = 0.5, 0.5  # of a lone outline: of the window, of its partner's
 NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
@@ -287,7 +289,12 @@ def _with_verdict(
             round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4), edge.by_gamma
         )  # fmt: skip
         lines.append(
-            OutlineLine(edge.v, (line.first, line.last), edge.covariance + judged.bias**2, quality)
+            OutlineLine(
+                edge.v,
+                (line.first, line.last),
+                edge.covariance / judged.weight + judged.bias**2,
+                quality,
+            )
         )
     return PartLines(part.leg.leg, part.segment.link, judged.reasons, lines, part.band)
 
@@ -297,6 +304,7 @@ class PartVerdict(NamedTuple):
 
     reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
     bias: float = 0.0  # how far used ones may be off besides their covariance [px]
+    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
 
 
 def verdict(
@@ -357,7 +365,13 @@ def _by_width(
         near = NEAR_TOLERANCE[0] + NEAR_TOLERANCE[1] * math.hypot(sigma_one, sigma_two)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
-    if mismatch.max() <= 1.0:
+    if near_fit:
+        # A width near its limit may be within it by another fit: weights change with it smoothly.
+        begin, end = NEAR_DOUBT
+        share = float((end - mismatch.max()) / (end - begin))
+        if share > LEAST_DOUBTED:
+            return PartVerdict((USED, USED), weight=min(share, 1.0) ** 2)
+    elif mismatch.max() <= 1.0:
         return PartVerdict((USED, USED))
     i = int(np.argmax(mismatch))
     reason = Rejection(Reason.WIDTH, f"{widths[i]:.1f} px for {expected[i]:.1f} px")

@@ -25,7 +25,7 @@ from legcal.perception.light import Samples
 BINS_PER_BLUR = 3.0
 STEP_END = (1.0, 2.5)  # distance from an outline at which the step is over: [px] and in blurs
 N_SMOOTH = 3  # of the polynomial that describes a side of a block: constant to quadratic
-MIN_PIXELS = 8  # pixels on a side of a block
+SIDE_PIXELS = (5.0, 15.0)  # on a side of a block, from where on it says how noisy that is, and all
 MIN_NOISE = 0.3  # of rounded grey levels: their standard deviation
 MAX_NOISE_RATIO = 8.0  # of the noise on both sides
 MIN_BLOCKS = 3  # blocks of an outline that give its noise
@@ -42,7 +42,7 @@ class PixelSums:
     weight: Array  # (n, 3, m) of 1, o, and o^2
     light: Array  # (n, 2, m) of the light, and of the light times o
     power: Array  # (n, m) of its square
-    count: Array  # (n, m) how many pixels, whatever their weights
+    count: Array  # (n, m) how many pixels, by their windows alone
 
     def of_blocks(self, blocks: BoolArray) -> "PixelSums":
         """Return the sums of some blocks (n,)."""
@@ -55,6 +55,12 @@ class PixelSums:
             return self
         of_pixels = self.weight, self.light, self.power, self.count
         return PixelSums(self.grid, *(np.add.reduceat(sums, first, axis=0) for sums in of_pixels))
+
+    def shared(self, share: Array) -> "PixelSums":
+        """Return the sums of blocks that count as so many (n,)."""
+        part, parts = share[:, None], share[:, None, None]
+        of_pixels = self.weight * parts, self.light * parts, self.power * part, self.count * part
+        return PixelSums(self.grid, *of_pixels)
 
     def weighted(self, share: Array) -> "PixelSums":
         """Return the sums with squared weights times shares (n, m) for each bin."""
@@ -110,11 +116,17 @@ class PixelBins:
 
     @classmethod
     def of(
-        cls, d: Samples, weight: Samples, blur: float, block: IntArray | None = None
+        cls,
+        d: Samples,
+        weight: Samples,
+        blur: float,
+        block: IntArray | None = None,
+        window: Samples | None = None,
     ) -> "PixelBins":
         """Return bins that suit a blur [px]; pixels (n_rows, k) of no weight do not count.
 
-        Rows of pixels are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
+        Weights are by the noise of pixels and by a window (n_rows, k), 1 by default. Rows of pixels
+        are blocks, or parts of a ``block`` (n_rows,), rising from 0 without gaps.
         """
         used = weight > 0.0
         per_px = np.float32(BINS_PER_BLUR / blur)
@@ -130,7 +142,7 @@ class PixelBins:
         square = weight * weight
         moment = square * offset
         sums = _binned(entry, n, size, (square, moment, moment * offset))
-        count = _binned(entry, n, size, (used,))[:, 0]
+        count = _binned(entry, n, size, (used if window is None else window * window,))[:, 0]
         grid = np.arange(first, last + 1) / float(per_px)
         return cls(grid, entry, square, moment, sums, count)
 
@@ -155,27 +167,27 @@ def _binned(entry: IntArray, n: int, size: int, values: Sequence[Samples | BoolA
     return sums
 
 
-def noise_ratios(sums: PixelSums, bounds: IntArray, kept: BoolArray, blur: float) -> Array:
+def noise_ratios(sums: PixelSums, bounds: IntArray, share: Array, blur: float) -> Array:
     """Return by how much noisier the inside of each edge is than its background, (n_edges,).
 
-    The variance that the median block shows there about a parabola, of blocks that are ``kept``
-    between successive bounds; one where nothing is known. The blur is in px.
+    The geometric mean of the variances that blocks show there about parabolas, which count by their
+    ``share`` (n,), those of an edge between successive bounds; one where nothing is known. The blur
+    is in px.
     """
     beyond = max(STEP_END[0], STEP_END[1] * blur)
     n_edges = len(bounds) - 1
     edge, sides = np.repeat(np.arange(n_edges), np.diff(bounds)), []
     inside, outside = np.searchsorted(sums.grid, [beyond, -beyond], side="right").tolist()
     for side in (slice(0, outside), slice(inside, None)):
-        variance = _variance(sums, side)
-        known = kept & np.isfinite(variance)
-        own = edge[known]
-        n_known = np.bincount(own, minlength=n_edges)
-        middle = medians(variance[known], own, [0, *np.cumsum(n_known).tolist()])
-        sides.append(np.where(n_known >= MIN_BLOCKS, middle, np.nan))
-    outer, inner = sides
-    least = MIN_NOISE**2
-    ratio = np.maximum(inner, least) / np.maximum(outer, least)
-    ratio = np.where(np.isnan(ratio), 1.0, ratio)
+        variance, count = _variance(sums, side)
+        first, enough = SIDE_PIXELS
+        counts = share * np.clip((count - first) / (enough - first), 0.0, 1.0)
+        level = counts * np.log(np.maximum(variance, MIN_NOISE**2))
+        n_known = np.bincount(edge, counts, n_edges)
+        sides.append((np.bincount(edge, level, n_edges) / np.maximum(n_known, 1e-9), n_known))
+    (outer, n_outer), (inner, n_inner) = sides
+    known = np.minimum(n_outer, n_inner) ** 2  # sides of few blocks are taken to be alike
+    ratio = np.exp((inner - outer) * known / (known + MIN_BLOCKS**2))
     return np.asarray(np.clip(ratio, MAX_NOISE_RATIO**-2, MAX_NOISE_RATIO**2))
 
 
@@ -190,8 +202,11 @@ def even_weights(grid: Array, ratio: Array, blur: float) -> Array:
     return np.asarray(0.5 * (1.0 + ratio) / (1.0 + (ratio - 1.0) * rise))
 
 
-def _variance(sums: PixelSums, side: slice) -> Array:
-    """Return the variance (n,) of pixels in some bins of each block about a parabola, or NaN."""
+def _variance(sums: PixelSums, side: slice) -> tuple[Array, Array]:
+    """Return the variance (n,) of pixels in some bins of each block about a parabola.
+
+    And how many pixels there are.
+    """
     x = sums.grid[side]
     powers = (x - 0.5 * (x[:1] + x[-1:]))[:, None] ** np.arange(2 * N_SMOOTH - 1)
     moments = sums.weight[:, 0, side] @ powers
@@ -204,7 +219,7 @@ def _variance(sums: PixelSums, side: slice) -> Array:
     explained = np.sum(right * np.linalg.solve(normal, right[..., None])[..., 0], axis=1)
     count = sums.count[:, side].sum(axis=1)
     free = np.maximum(count - N_SMOOTH, 1.0)
-    return np.where(count >= MIN_PIXELS, np.maximum(power - explained, 0.0) / free, np.nan)
+    return np.maximum(power - explained, 0.0) / free, count
 
 
 def medians(values: Array, edge: IntArray, bounds: Sequence[int]) -> Array:

@@ -41,14 +41,15 @@ N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
 ROUGHNESS = 0.02  # displacement of single blocks [px]
-START_SIGMA = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
+# Standard deviation of the lines that it starts from: [px] and in blurs.
+START_SIGMA = (0.1, 1.75)
 BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
 MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
 MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
-MAX_MOVE = (0.4, 0.15)  # of a line [blurs] and of the logarithm of the blur, to which equations do
-CONVERGED = (0.02, 0.06)  # steps of lines [px] and log blurs, below which the last round follows
+MAX_MOVE = (0.1, 0.04)  # of a line [blurs] and of the logarithm of the blur, to which equations do
+CONVERGED = (0.005, 0.015)  # steps of lines [px] and log blurs, below which the last round follows
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
 NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
@@ -91,12 +92,13 @@ class _Equations(NamedTuple):
     inverse: Array  # (n_edges, k, k) covariance of N_ALONG * N_UNKNOWNS unknowns of each edge
 
 
-def fit_pooled(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> PooledLines:
-    """Fit the blocks (n,) that lie on the lines of their edges, of each outline together.
+def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> PooledLines:
+    """Fit the blocks that lie on the lines of their edges, of each outline together.
 
-    From a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].
+    Each counts by its share (n,), from a rough blur [px]; ``depth`` is the distance from the
+    outlines at which blocks end [px].
     """
-    pool = _Pool.of(blocks, kept, blur, depth)
+    pool = _Pool.of(blocks, share, blur, depth)
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
@@ -164,6 +166,7 @@ class _Pool:
 
     blocks: Blocks
     usable: BoolArray  # which of the blocks
+    share: Array  # how much each of them counts
     joined: IntArray  # (n_usable,) which of the blocks here each is a part of
     row_edge: IntArray  # (n_usable,) and of which edge
     gain: Array  # (n,)
@@ -188,14 +191,14 @@ class _Pool:
     functions: tuple[Array, Array, Array]  # profile_functions there
 
     @classmethod
-    def of(cls, blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> "_Pool":
-        """Return what is needed of some blocks."""
-        n_edges = len(blocks.half_width)
+    def of(cls, blocks: Blocks, share: Array, blur: float, depth: float) -> "_Pool":
+        """Return what is needed of the blocks that count."""
+        n_edges, kept = len(blocks.half_width), share > 0.0
         usable = kept & (np.count_nonzero(blocks.weight, axis=1) >= MIN_SAMPLES)
         edge = blocks.edge[usable]
         of_usable = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
         noise = np.fmax(medians(blocks.noise[usable], edge, of_usable), MIN_NOISE)
-        joined = _joined(np.bincount(edge, minlength=n_edges))
+        joined = _joined(blocks.bounds, usable)
         first = np.flatnonzero(np.diff(joined, prepend=-1))
         rise = 2.0 * blocks.position[usable] - 1.0
         along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
@@ -205,8 +208,8 @@ class _Pool:
         row_edge, edge = edge, edge[first]
         bounds = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
         of_all = blocks.bins(blur).sums(blocks.light)
-        ratio = noise_ratios(of_all, blocks.bounds, kept, blur)
-        sums = of_all.of_blocks(usable).joined(first)
+        ratio = noise_ratios(of_all, blocks.bounds, share, blur)
+        sums = of_all.of_blocks(usable).shared(share[usable]).joined(first)
         sums = sums.weighted(even_weights(sums.grid, ratio[edge], blur))
 
         def total(values: Array) -> Array:
@@ -223,6 +226,7 @@ class _Pool:
         return cls(
             blocks,
             usable,
+            share,
             joined,
             row_edge,
             means[:, 0],
@@ -301,7 +305,9 @@ class _Pool:
         line, rise = self.at_line[self.row_edge], 2.0 * blocks.position[usable] - 1.0
         moved = blocks.moved[usable] + blocks.gain[usable] * (line[:, 0] + line[:, 1] * rise)
         d = blocks.d[usable] - moved.astype(np.float32)[:, None]
-        return PixelBins.of(d, blocks.weight[usable], self.blur, self.joined)
+        root = np.sqrt(self.share[usable]).astype(np.float32)[:, None]
+        weight, window = blocks.weight[usable] * root, blocks.window[usable] * root
+        return PixelBins.of(d, weight, self.blur, self.joined, window)
 
     def _powers(self) -> tuple[Array, Array]:
         """Return powers of the distance from where the middle of each line is, and slopes by it."""
@@ -439,6 +445,7 @@ class _Pool:
         if self.bins is None:
             first = np.flatnonzero(np.diff(self.joined, prepend=-1))
             own = blocks.bins(self.blur).light(change)[self.usable]
+            own *= self.share[self.usable, None, None]
             changed = np.add.reduceat(own, first, axis=0) if len(first) else own
         else:
             changed = self.bins.light(change[self.usable])
@@ -489,15 +496,17 @@ def _changed_by_gamma(blocks: Blocks) -> Samples:
     return np.asarray(light * np.log(np.maximum(light / of_block, np.float32(MIN_LIGHT))))
 
 
-def _joined(counts: IntArray) -> IntArray:
-    """Return which of successive blocks become one, given how many there are of each edge."""
+def _joined(bounds: IntArray, usable: BoolArray) -> IntArray:
+    """Return which of successive blocks become one, of those that are usable.
+
+    Whether a block is usable does not decide which other ones are joined.
+    """
+    counts = np.diff(bounds)
     number = np.clip(counts // ENOUGH_BLOCKS, 1, MAX_JOINED)
-    n = -(-counts // number)
     edge = np.repeat(np.arange(len(counts)), counts)
-    before = np.cumsum(counts) - counts
-    return np.asarray(
-        (np.cumsum(n) - n)[edge] + (np.arange(len(edge)) - before[edge]) // number[edge]
-    )
+    n = -(-counts // number)
+    group = (np.cumsum(n) - n)[edge] + (np.arange(len(edge)) - bounds[edge]) // number[edge]
+    return np.asarray(np.unique(group[usable], return_inverse=True)[1])
 
 
 def _diagonal(values: Array) -> Array:

@@ -6,9 +6,10 @@ read as they are, and the distance of every pixel centre from the outline is com
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples
@@ -20,7 +21,8 @@ SATURATED = 250.0  # grey level from which a pixel is saturated
 MAX_NOISY = 4  # saturated pixels of a block that may be noise
 MAX_OFFSET = 1.0  # how far an outline may be from where it was found [px]
 MIN_SHARE_CLIPPED = 0.5  # share of saturated pixels with which a background is clipped
-MAX_ROWS = 512  # along one outline
+MAX_ROWS = 4096  # along one outline
+TAPER = 1.0  # over which pixels come to count where the used range begins [px]
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 
 
@@ -44,7 +46,9 @@ class Profiles:
     gain: Array  # (n_blocks,) pixels of distance in the image per unit of v of the band; near 1
     d: Samples  # (n_blocks, n_samples) distances inside the outline [px]
     grey: Samples  # (n_blocks, n_samples) grey levels
-    inside: BoolArray  # (n_blocks, n_samples) False outside the image, out of range, and saturated
+    # (n_blocks, n_samples) how much pixels count: 0 outside the image, out of range and saturated,
+    # falling from 1 within TAPER where the range ends, so that no pixel counts or not by a hair
+    window: Samples
     clipped: Samples  # (n_blocks,) depth up to which the background saturates [px], or -inf
 
 
@@ -82,7 +86,7 @@ def read_profiles(
     centre, tangent = nodes.at(rows, nodes.offset), nodes.at(rows, nodes.slope)
     cosine = 1.0 / np.sqrt(1.0 + tangent**2)
     across = nodes.at(rows, nodes.across)
-    outside, inside_of = depths[0], depths[1][rows.edge]
+    outside, inside_of = depths[0] + 0.5 * TAPER, depths[1][rows.edge] + 0.5 * TAPER
     first = np.ceil(centre - np.where(across > 0.0, outside, inside_of) / cosine)
     n_columns = int(np.max((outside + inside_of) / cosine, initial=0.0)) + 1
     columns = first[:, None] + np.arange(n_columns)
@@ -92,13 +96,14 @@ def read_profiles(
     along = rows.along[:, None]
     n_columns_there, n_rows_there = np.where(flat, height, width), np.where(flat, width, height)
     inside = (columns >= 0) & (columns < n_columns_there) & (along >= 0) & (along < n_rows_there)
-    inside &= (d >= -outside) & (d <= inside_of[:, None])
+    window = fading(np.minimum(d + outside, inside_of[:, None] - d)) * inside
+    inside = window > 0.0
     row = np.clip(along, 0, n_rows_there - 1) * np.where(flat, 1, width)
     column = np.clip(columns, 0, n_columns_there - 1) * np.where(flat, width, 1)
     values = np.asarray(np.ravel(grey).take((row + column).astype(np.intp)), dtype=np.float32)
     shape = (len(edge), n_rows * n_columns)
     distance, values = d.reshape(shape).astype(np.float32), values.reshape(shape)
-    inside = inside.reshape(shape)
+    inside, window = inside.reshape(shape), window.reshape(shape).astype(np.float32)
     clipped, bright = _unsaturated(distance, values, inside)
     # A step dv moves the outline by dv across; its part normal to the tangent is the gain.
     gain = np.abs(nodes.at(rows, nodes.gain)) * cosine
@@ -108,9 +113,14 @@ def read_profiles(
         gain.reshape(-1, n_rows).mean(axis=1),
         distance,
         values,
-        inside & (distance > clipped[:, None]) & (distance < bright[:, None]),
+        window * ((distance > clipped[:, None]) & (distance < bright[:, None])),
         clipped,
     )
+
+
+def fading(within: NDArray[Any]) -> NDArray[Any]:
+    """Return how much pixels count that are so far within the range that is used [px]."""
+    return np.asarray(np.clip(within / TAPER, 0.0, 1.0), dtype=within.dtype)
 
 
 class _Rows(NamedTuple):
@@ -139,6 +149,9 @@ class _Nodes:
         first, last = np.ceil(self.along[:, 0]), np.floor(self.along[:, -1])
         available = np.maximum(0, (last - first).astype(np.intp) + 1)
         stride = np.maximum(1, -(-available // MAX_ROWS))
+        # Blocks stay where they are in the image while bands move by less.
+        first = np.ceil(first / (n_rows * stride)) * (n_rows * stride)
+        available = np.maximum(0, (last - first).astype(np.intp) + 1)
         n = available // (n_rows * stride) * n_rows
         edge = np.repeat(np.arange(len(n)), n)
         number = np.arange(len(edge)) - np.repeat(np.cumsum(n) - n, n)

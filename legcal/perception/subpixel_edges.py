@@ -91,8 +91,7 @@ def measure_edges(
         if near_fit:
             blocks.unmove()
             blocks.narrow(tried)
-        kept = blocks.kept()
-        joint = fit_pooled(blocks, kept, tried, depth_for_blur(tried))
+        joint = fit_pooled(blocks, blocks.shares(), tried, depth_for_blur(tried))
         blur = joint.blur
         if abs(np.log(blur / tried)) < BLUR_CONVERGED:
             break
