@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
@@ -53,16 +53,13 @@ from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
-from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
     MeasuredImages,
     detection_settings,
     given_outlines,
-    nominal_placement,
     place_and_measure,
 )
-from legcal.perception.placement import Placement
 from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
@@ -300,45 +297,6 @@ def _unused_share(estimate: Estimate) -> float:
     """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
-
-
-def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
-    """Return where the nominal model has the legs, with rough cameras, and what shows the board.
-
-    Raises
-    ------
-    NotIdentifiable
-        If readings do not give the poses of images that are to be searched, and a view of these has
-        no rough camera pose or joints at A move; nothing is searched then.
-    NotVisible
-        If they are to be searched for legs none of which is visible.
-    """
-    if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
-        raise NotVisible(
-            f"{data.machine.urdf_path}: the images could not be searched: found no <visual> "
-            "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
-            "that images show; add them with their radii."
-        )
-    hints = [view.T_base_camera for view in data.measurements.views]
-    on_base = data.dataset.board_on("base")
-    by_board = on_base is not None and (
-        on_base.T_link_board is not None or any(T is not None for T in hints)
-    )
-    if not data.machine.is_determined and len(data.photographs.detect):
-        require_standing_joints(data.machine)
-    if not data.machine.is_determined and not by_board:
-        require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
-    placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
-    board = observe_board(data)
-    if board is not None:
-        T_base_board = base_of_board(data.dataset, board, placement.T_base_camera)
-        if T_base_board is not None:
-            cameras = board.cameras(T_base_board, placement.T_base_camera)
-            placement = replace(placement, T_base_camera=cameras)
-        if data.machine.is_determined:
-            cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
-            placement = replace(placement, T_base_camera=cameras)
-    return placement, board
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:

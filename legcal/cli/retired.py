@@ -59,6 +59,21 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "/joint_states; give others as a table with --readings",
         "--dry-run": _DRY_RUN,
     },
+    "plan": {
+        "--criterion": "a plan minimises the mean error of the platform over the workspace, or the "
+        "determinant of the covariance where readings do not give its pose",
+        "--parameter": "a plan minimises the mean error of the platform over the workspace; the "
+        "sigma that is expected of each parameter is in plan.json",
+        "--camera": "a plan takes the camera of --given DATASET, or in Python "
+        "legcal.plan(camera=FILE)",
+        "--places": "say with --bounds where cameras may stand, or in Python "
+        "legcal.plan(places=[...])",
+        "--model-error": "a plan allows for 2 mm, or in Python "
+        "legcal.plan(setting=legcal.planning.places.Setting(length=METRES))",
+        "--encoder-sigma": "a plan takes the encoder_sigma of --given DATASET, or in Python "
+        "legcal.plan(encoder_sigma=SIGMA)",
+        "--force": "remove the earlier session, or give another folder",
+    },
     "new": {
         "--offset": "write offsets in the table (in a CSV the column offset), or give --min-length "
         "and --max-length",
