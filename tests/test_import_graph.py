@@ -122,7 +122,7 @@ PUBLIC: dict[str, set[str]] = {
         "photographs",
         "placement",
     },
-    "paper": {"carriers", "conditions", "criteria", "four_steps", "nominal"},
+    "paper": {"conditions", "criteria", "four_steps", "nominal"},
     "calibration": {
         "camera_calibration.calibration",
         "camera_calibration.document",

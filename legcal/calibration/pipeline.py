@@ -5,8 +5,8 @@
    Measure: the outlines of the legs are measured near where that has them (section 3.1).
 3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. Joint fit of all parameters, started from the nominal model and from the steps.
-5. Measure again: all photographs are searched close to that fit and measured with all care, and 3
-   and 4 are repeated. What outlines are given, the fit of them does not depend on where it began.
+5. Measure again: all photographs are searched close to that fit and measured with all care, and 4
+   is repeated. What outlines are given, the fit of them does not depend on where it began.
    Where outlines show the gamma of a camera that is not given, this is done again with others, up
    to four times.
 6. Judge what the platform gains, and write the result.
@@ -51,7 +51,7 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisi
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
-from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
@@ -74,7 +74,6 @@ def calibrate(
     output: str | Path | None = None,
     progress: Progress = False,
     criteria: Criteria = "default",
-    transformation: Transformation | None = None,
     use_cache: bool = True,
     workers: Workers = 1,
     priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
@@ -95,10 +94,8 @@ def calibrate(
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     criteria : {"default", "literal"}
-        What the four steps minimise: legcal's criteria, or the paper's as printed.
-    transformation : {"points", "cross_product"}, optional
-        How they compute where the platform is, eq (18): by point equality, or as printed. By
-        default as the criteria are.
+        The weights of the four steps: from the covariances of the axes, or all one, as the paper
+        has them.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
     workers : int, str or executor
@@ -156,7 +153,7 @@ def calibrate(
     key = outline_key(dataset, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
-        estimate = estimate_parameters(data, fitted, Options(choices, criteria, transformation))
+        estimate = estimate_parameters(data, fitted, Options(choices, criteria))
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 

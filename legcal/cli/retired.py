@@ -40,6 +40,8 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--list": _ONE_MACHINE,
         "--earlier": _ONE_MACHINE,
         "--resume": _ONE_MACHINE,
+        "--transformation": "the four steps solve (18) as printed, whatever the criteria; leave "
+        "it out",
     },
     "init": {
         "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
