@@ -9,8 +9,8 @@ from simulated import simulated
 from six_photographs import FOLDER
 
 from legcal import calibrate, load_dataset
+from legcal.calibration.board import rough_placement
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.calibration.pipeline import rough_placement
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.perception.outline import measure_in_brief
