@@ -90,7 +90,8 @@ def test_twists_are_found_on_request(criteria: Criteria) -> None:
 
 # Criteria as printed
 
-PRINTED: dict[str, list[tuple[Any, ...]]] = {  # of legs 2 and 3 or 4 of noisy sessions: A, B, q0, and the axis, as first computed
+# Of legs 2 and 3 or 4 of noisy sessions: A, B, q0, and the axis, as first computed
+PRINTED: dict[str, list[tuple[Any, ...]]] = {
     "hexapod": [
         (1, [0.3914152124794648, -0.08339065793461028, -0.001400064363207507],
          [0.057489446087665, -0.062478382594860354, 0.004247123575244857], 0.3431036533368862,
