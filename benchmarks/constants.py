@@ -19,7 +19,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -112,6 +112,8 @@ def small(source: Path, folder: Path, *, half: bool) -> Path:
         if n_of_view[row["view"]] > IMAGES:
             continue
         picture = cv2.imread(str(source / row["image"]), cv2.IMREAD_UNCHANGED)
+        if picture is None:
+            raise OSError(f"{source / row['image']} is no image")
         row["image"] = f"images/{row['view']}_{n_of_view[row['view']]}.png"
         if half:
             picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -170,13 +172,10 @@ def trial(room: str, number: str, factor: float, session: Session, size: float) 
             [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
         )
     if done.returncode:
-        said = {"said": done.stderr.strip().splitlines()[-1][:200]}
-    else:
-        said = json.loads(done.stdout.splitlines()[-1])
-    for length in ("off", "stated"):
-        if length in said:
-            said[length] /= size
-    return Line(room, number, factor, session.name, **said)
+        why = done.stderr.strip().splitlines()[-1][:200]
+        return Line(room, number, factor, session.name, said=why)
+    line = Line(room, number, factor, session.name, **json.loads(done.stdout.splitlines()[-1]))
+    return replace(line, off=line.off / size, stated=line.stated / size)
 
 
 def recorded(path: Path) -> list[Line]:

@@ -9,8 +9,8 @@ from simulated import simulated
 from six_photographs import FOLDER
 
 from legcal import calibrate, load_dataset
+from legcal.calibration.board import rough_placement
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.calibration.pipeline import rough_placement
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.perception.outline import measure_in_brief
@@ -33,7 +33,7 @@ def _recognised(folder: Path) -> tuple[Outlines, Array]:
 
 def test_photographs_show_the_same_legs_of_a_machine_of_any_size(tmp_path: Path) -> None:
     usual, cameras = _recognised(scaled_dataset(FOLDER, tmp_path / "usual", 1.0))
-    assert usual.used.sum() >= 48
+    assert usual.used.mean() > 0.6
     for size in SIZES:
         outlines, there = _recognised(scaled_dataset(FOLDER, tmp_path / f"{size}", size))
         assert outlines.row_keys() == usual.row_keys()

@@ -26,9 +26,9 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
 WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
+NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
+LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
-NEAR_DOUBT = (0.6, 1.0)  # of the tolerance of widths near a fit, from where on outlines count less
-LEAST_DOUBTED = 0.05  # root of the weight that an outline has at least if it is used
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def candidate_poses(
     if len(configurations) < max(_MIN_SHARE * n, 1):
         remedies = [
             "check legcal.home and the limits of the joints",
-            "state a smaller --model-error",
+            "plan with a smaller length in Setting (in Python), if it is known better",
         ]
         if setting.length > USUAL_LENGTH * machine.size:
             remedies.reverse()

@@ -18,7 +18,6 @@ from legcal.machine.kinematics import follow_each
 from legcal.machine.leg import SIGMA_LENGTH, SIGMA_READING
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
 from legcal.planning.noise import read_noise
 from legcal.planning.places import (
@@ -27,7 +26,6 @@ from legcal.planning.places import (
     MAX_LENGTH,
     Place,
     Setting,
-    read_places,
     usual_setting,
 )
 from legcal.planning.planned_session import Plan
@@ -55,13 +53,11 @@ def plan(
     images_per_view: int | None = None,
     cameras: int | None = None,
     target: float | None = None,
-    criterion: Goal | str = Goal.MEAN,
-    parameters: Sequence[str] = (),
     camera: str | Path | Camera | None = None,
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
     encoder_sigma: float | str | None = None,
     bounds: Array | None = None,
-    places: str | Path | None = None,
+    places: Sequence[Place] = (),
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
     hand_held: bool = False,
@@ -84,11 +80,6 @@ def plan(
     target : float, optional
         Expected error of the platform, mean over the workspace [m]: the fewest images that reach
         it, in place of a number of images.
-    criterion : Goal or str
-        Minimised quantity: ``mean`` or ``worst`` error of the platform over the workspace, ``d``
-        (determinant of the covariance of all parameters), or sigma of ``parameters``.
-    parameters : sequence of str
-        Names of parameters, for the last criterion.
     camera : path or Camera, optional
         The camera, or its file; by default the camera of the given dataset, or 1024 x 768 pixels
         and 43 degrees wide.
@@ -100,8 +91,8 @@ def plan(
         0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
     bounds : (3, 2) array, optional
         Lowest and highest x, y, z of cameras in the base link [m].
-    places : path, optional
-        A file of places of tripods, from which cameras are chosen.
+    places : sequence of Place
+        Tripods with their names, to choose from in place of those around the machine.
     given : path or Dataset, optional
         Existing images; the plan adds to them.
     board : str, path or Board, optional
@@ -139,12 +130,10 @@ def plan(
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     setting = usual_setting(machine.size) if setting is None else setting
-    listed = () if places is None else tuple(read_places(Path(places), machine))
+    listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
-    _check(
-        criterion, parameters, target, bounds, listed, board, hand_held, setting, seed, machine.size
-    )
+    _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
     given_dataset = (
         given if isinstance(given, Dataset) or given is None else _load_given(Path(given))
     )
@@ -171,8 +160,6 @@ def plan(
         n_images,
         n_views,
         setting,
-        Goal(criterion),
-        tuple(parameters),
         bounds,
         listed,
         given_views,
@@ -323,8 +310,6 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
 
 
 def _check(
-    criterion: str,
-    parameters: Sequence[str],
     target: float | None,
     bounds: Array | None,
     places: Sequence[Place],
@@ -336,26 +321,12 @@ def _check(
 ) -> None:
     """Refuse contradictory options."""
     start, problems = "The plan could not be made: found", []
-    if criterion not in list(Goal):
-        problems.append(
-            f"{start} the criterion '{criterion}', needed {', '.join(Goal)}; choose one."
-        )
-    if parameters and criterion != Goal.PARAMETERS:
-        problems.append(
-            f"{start} parameters to know well and the criterion '{criterion}', which does not look "
-            "at them, needed --criterion parameters; give it, or leave out --parameter."
-        )
     if seed < 0:
         problems.append(f"{start} {seed} as the seed, needed 0 or more; correct --seed.")
     if target is not None and not 0.0 < target < 1.0:
         problems.append(
             f"{start} a target of {target:g} m, needed more than 0 and less than 1 m; correct "
             "--target."
-        )
-    if target is not None and criterion != Goal.MEAN:
-        problems.append(
-            f"{start} a target and the criterion '{criterion}', needed the mean error of the "
-            "platform, which the target is about; leave out --criterion."
         )
     if bounds is not None and places:
         problems.append(
@@ -366,15 +337,16 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    for quantity, error, most, unit, remedy in (
-        ("a model error of", setting.length, MAX_LENGTH * size, "m", "correct --model-error"),
-        ("axes off by", setting.angle, MAX_ANGLE, "rad", "correct the setting"),
-        ("cameras off by", setting.shift, MAX_LENGTH * size, "m", "correct the setting"),
-        ("cameras turned by", setting.turn, MAX_ANGLE, "rad", "correct the setting"),
+    for quantity, error, most, unit in (
+        ("a model error of", setting.length, MAX_LENGTH * size, "m"),
+        ("axes off by", setting.angle, MAX_ANGLE, "rad"),
+        ("cameras off by", setting.shift, MAX_LENGTH * size, "m"),
+        ("cameras turned by", setting.turn, MAX_ANGLE, "rad"),
     ):
         if not 0.0 <= error <= most:
             problems.append(
-                f"{start} {quantity} {error:g} {unit}, needed 0 to {most:.3g} {unit}; {remedy}."
+                f"{start} {quantity} {error:g} {unit}, needed 0 to {most:.3g} {unit}; correct the "
+                "setting."
             )
     if not 1 <= setting.draws <= MAX_DRAWS:
         problems.append(

@@ -1,8 +1,8 @@
-"""Ranks of a session, step by step and in the joint fit, and its weak directions in words."""
+"""The rank of a session in the joint fit, and its weak directions in words."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,20 +17,7 @@ from legcal.calibration.identify.information import (
     whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import PredictedObservations
-from legcal.calibration.identify.report import Ranks, RmsMotion, StepRank, WeakDirection
-from legcal.calibration.identify.steps import (
-    MAX_SIGMA,
-    Located,
-    StepInformation,
-    consecutive_distances,
-    distance_rows,
-    identify_base,
-    identify_platform,
-    locate_joints,
-    mean_distances,
-    offsets_from_distances,
-    scalar_products,
-)
+from legcal.calibration.identify.report import Ranks, RmsMotion, WeakDirection
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import GaussianPrior
@@ -40,6 +27,7 @@ from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, s
 from legcal.machine.equations import pose_sensitivity
 from legcal.vision.board import Link
 
+_MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
 _HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
 
@@ -50,30 +38,31 @@ class Analysis:
 
     predicted: PredictedObservations
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
+    # From an analysis of the same machine; None: computed here
+    same_motion: PlatformMotion | None = None
+    same_equations: WhitenedEquations | None = None
+    same_images: Array | None = None
 
     def elsewhere(self, predicted: PredictedObservations, poses: IntArray) -> Analysis:
         """Analyse other images of the same machine, at a subset of its poses."""
-        other = Analysis(predicted, self.choices)
-        other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
-        return other
+        return Analysis(predicted, self.choices, self.motion, self.equations.at(poses))
 
     def with_board(self, *, board: bool = True, link: Link = "base") -> Analysis:
         """Analyse the same images with a board on a link in all of them, or in none."""
         predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
-        other.__dict__.update(images=self.images)
-        if link == "platform":  # the steps do without it
-            other.__dict__.update(default_steps=self.default_steps, staged=self.staged)
-        return other
+        return replace(other, same_images=self.images)
 
     @cached_property
     def images(self) -> Array:
         """Whitened derivatives of the measured bodies."""
-        return image_rows(self.predicted)
+        return image_rows(self.predicted) if self.same_images is None else self.same_images
 
     @cached_property
     def equations(self) -> WhitenedEquations:
         """The equations of readings and legs."""
+        if self.same_equations is not None:
+            return self.same_equations
         return whitened_leg_equations(self.predicted)
 
     @cached_property
@@ -85,40 +74,6 @@ class Analysis:
     def arms(self) -> GaussianPrior:
         """Prior of the lines of arms."""
         return prior_of_arms(self.predicted, self.choices)
-
-    @cached_property
-    def located(self) -> Located:
-        """Step 1."""
-        return locate_joints(self.predicted)
-
-    @cached_property
-    def distances(self) -> tuple[Array, Array, IntArray]:
-        """The distances of steps 3 and 4."""
-        return distance_rows(self.predicted, self.located)
-
-    @cached_property
-    def default_steps(self) -> tuple[StepInformation, ...]:
-        """Steps 2, 3 and 4, default criteria."""
-        return (
-            identify_base(self.predicted, self.located),
-            offsets_from_distances(self.predicted, *self.distances),
-            identify_platform(
-                self.predicted,
-                self.located,
-                self.images[:, : self.predicted.n_legs],  # no step uses arms
-                self.equations,
-            ),
-        )
-
-    @cached_property
-    def literal_steps(self) -> tuple[StepInformation, ...]:
-        """Steps 2, 3 and 4 as printed."""
-        rows, weight, key = self.distances
-        return (
-            scalar_products(self.predicted, self.located),
-            consecutive_distances(rows, weight, key, self.default_steps[1].columns),
-            mean_distances(self.predicted, weight, key),
-        )
 
     @cached_property
     def of_cameras(self) -> Array:
@@ -142,23 +97,7 @@ class Analysis:
     @cached_property
     def motion(self) -> PlatformMotion:
         """Sensitivity of the platform to the parameters."""
-        return PlatformMotion(self.predicted)
-
-    @cached_property
-    def staged(self) -> Ranks:
-        """The four default steps together."""
-        weak = tuple(
-            direction
-            for step in self.default_steps
-            for direction in weak_directions(
-                self.predicted,
-                self.motion,
-                undetermined(self.predicted, step.information),
-                step.columns,
-            )
-        )
-        n_p = len(self.predicted.unit) - len(self.predicted.ties)
-        return Ranks(n_p - len(weak), n_p, weak)
+        return PlatformMotion(self.predicted) if self.same_motion is None else self.same_motion
 
     @cached_property
     def full(self) -> Ranks:
@@ -167,20 +106,6 @@ class Analysis:
         weak = weak_directions(self.predicted, self.motion, basis)
         n_p = len(self.predicted.unit) - len(self.predicted.ties)
         return Ranks(n_p - len(weak), n_p, weak)
-
-    @cached_property
-    def step_ranks(self) -> tuple[StepRank, ...]:
-        """The rank of each step, default and as printed."""
-        first = ("joints_in_cameras", self.located.rank, self.located.of)
-        found = [
-            StepRank(first[0], "default", *first[1:]),
-            StepRank(first[0], "literal", *first[1:]),
-        ]
-        for default, printed in zip(self.default_steps, self.literal_steps, strict=True):
-            for criteria, step in (("default", default), ("literal", printed)):
-                rank = determined(self.predicted, step.information)
-                found.append(StepRank(step.name, criteria, rank, len(step.columns)))
-        return tuple(found)
 
 
 class PlatformMotion:
@@ -228,16 +153,10 @@ class PlatformMotion:
         return split_by_motion(self.by_metres, basis, self.predicted.mean_length, _HARMLESS)
 
 
-def determined(predicted: PredictedObservations, information: Array) -> int:
-    """Return the rank of whitened rows: directions with a sigma below a leg's length."""
-    singular = np.linalg.svd(compress(information), compute_uv=False)
-    return int(np.sum(singular > _limit(predicted)))
-
-
 def undetermined(
     predicted: PredictedObservations,
     information: Array,
-    sigma: float = MAX_SIGMA,  # mean leg lengths
+    sigma: float = _MAX_SIGMA,  # mean leg lengths
 ) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
@@ -252,15 +171,10 @@ def missing(predicted: PredictedObservations, rows: Array, motion: PlatformMotio
 def weak_directions(
     predicted: PredictedObservations,  # where names and units come from
     motion: PlatformMotion,
-    basis: Array,  # (w, c): the space, in metres
-    columns: IntArray | None = None,  # (c,): which parameters; all without it
+    basis: Array,  # (w, p): the space, in metres
 ) -> tuple[WeakDirection, ...]:
     """Describe the directions of a space, those that move the platform first."""
-    wide = basis
-    if columns is not None:
-        wide = np.zeros((len(basis), len(predicted.unit)))
-        wide[:, columns] = basis
-    parts = motion.split(wide)
+    parts = motion.split(basis)
     return tuple(
         _direction(predicted, motion, row, harmless)
         for part, harmless in zip(parts, (False, True), strict=True)
@@ -288,6 +202,6 @@ def _direction(
     )
 
 
-def _limit(predicted: PredictedObservations, sigma: float = MAX_SIGMA) -> float:
+def _limit(predicted: PredictedObservations, sigma: float = _MAX_SIGMA) -> float:
     """Least singular value of a determined direction [1/m]."""
     return 1.0 / (sigma * predicted.mean_length)
