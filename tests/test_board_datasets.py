@@ -194,30 +194,3 @@ def test_corners_of_a_board_that_is_gone_are_refused_once(tmp_path: Path) -> Non
     with pytest.raises(DatasetError, match=r"corners up to 29, .*15 on the base") as caught:
         _read(tmp_path, *lines)
     assert len(caught.value.problems) == 1
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("c9,a.png,3,1,2,0.1,used,,detected", ("column view", "'c9'")),
-        ("c2,c.png,3,1,2,0.1,used,,detected", ("column image", "'c.png'")),
-        ("c2,a.png,15,1,2,0.1,used,,detected", ("column corner", "'15'", "0 to 14")),
-        ("c2,a.png,1.0,1,2,0.1,used,,detected", ("column corner", "'1.0'")),
-        ("c2,a.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
-        ("c2,a.png,3,1,,0.1,used,,detected", ("column v", "empty cell")),
-        ("c2,a.png,3,1,nan,0.1,used,,detected", ("column v", "'nan'")),
-        ("c2,a.png,3,470,2,0.1,used,,detected", ("column u", "470 px", "inside the image")),
-        ("c2,a.png,3,1,2,0,used,,detected", ("column sigma", "'0'")),
-        ("c2,a.png,3,1,2,0.1,good,,detected", ("column verdict", "used or rejected")),
-        ("c2,a.png,3,1,2,0.1,used,,me", ("column source", "detected or edited")),
-        ("c2,a.png,3,1,2,0.1,used", ("7 cells", "needed 9")),
-        (FIRST, ("the same image and corner in row 1",)),
-    ],
-)
-def test_a_wrong_cell_is_named(tmp_path: Path, line: str, words: tuple[str, ...]) -> None:
-    with pytest.raises(DatasetError) as caught:
-        _read(tmp_path, FIRST, line)
-    (problem,) = caught.value.problems
-    assert [word for word in ("row 2 (line 3)", *words) if word not in problem] == []
-    with pytest.raises(DatasetError, match="found a header and no row"):
-        _read(tmp_path)
