@@ -13,6 +13,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
@@ -21,11 +22,14 @@ import cv2
 import numpy as np
 import yaml
 from command_outcomes import run, words_of
+from dataset_folder import SERVOS, dataset_of_readings
+from machines import TRIPOD
 from made_inputs import JOINTS, ROOT, copy_of
 from outside_machines import OUTSIDE, serial_arm
 
 Edit = Callable[[Path], None]
 GONE = object()  # of a key: take it out
+CORNER_COLUMNS = "view,image,corner,u,v,sigma,verdict,reason,source"
 
 
 @dataclass(frozen=True)
@@ -499,6 +503,45 @@ def _datasets() -> Iterable[Refusal]:
         )
 
 
+def _in_hand() -> Iterable[Refusal]:
+    """Views of a camera in the hand that no board places."""
+    board = {
+        "kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,
+        "dictionary": "DICT_4X4_50",
+    }  # fmt: skip
+
+    def entry(**values: Any) -> Edit:
+        return keyed("dataset.yaml", **values)
+
+    def corners(*places: tuple[str, int]) -> Edit:
+        lines = [
+            f"{place},{k},{5 + k},6,0.1,used,,detected\n" for place, n in places for k in range(n)
+        ]
+        return text("corners.csv", f"{CORNER_COLUMNS}\n{''.join(lines)}")
+
+    held = entry(board=board, views__c1__hand_held=True, views__c1__T_base_camera=GONE)
+    first, second = "c1-1,images/c1_1.png", "c1-2,images/c1_2.png"
+    rows: Rows = [
+        ("pose", entry(board=board, views__c1__hand_held=True),
+         ("views.c1.T_base_camera", "one pose")),
+        ("name", (held, entry(**{"views__c1-2": {"camera": "camera_info.yaml"}}),
+                  cell("measurements.csv", 3, view="c1-2")), ("views.c1-2", "hand-held")),
+        ("3-corners", (held, corners((first, 6), ("c2,images/c2_1.png", 6), (second, 3))),
+         ("row 2", "found 3 corners")),
+        ("0-corners", (held, corners((first, 6), ("c2,images/c2_1.png", 6))),
+         ("row 2", "found no corners")),
+        ("no-image", (held, cell("measurements.csv", 2, image="")),
+         ("row 2, column image", "neither an image")),
+        ("corners-alone", corners(("c1,images/c1_1.png", 6)), ("corners.csv", "no board")),
+        ("no-legs", entry(views__c1__legs=[], views__c2__legs=[]),
+         ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
+        ("number", entry(board=board, views__c1__hand_held=3),
+         ("views.c1.hand_held", "found 3", "true or false")),
+        ("word", (held, entry(board="charuco")), ("dataset.yaml", "board", "'charuco'", "mapping")),
+    ]  # fmt: skip
+    yield from _spoiled("in-hand", "calibrate {in} -o {out}", "plain", rows)
+
+
 def _measurements() -> Iterable[Refusal]:
     table = "measurements.csv"
     joint = "leg1_prismatic"
@@ -638,6 +681,44 @@ def _cameras() -> Iterable[Refusal]:
     yield from _spoiled("lens", "calibrate {in} -o {out}", "plain", rows)
 
 
+def _units() -> Iterable[Refusal]:
+    """Readings of servos in a unit that is not the stated one."""
+    angles = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
+    both_ways = np.concatenate([angles, -angles])
+    pulses, late = (1500.0 + 11.1 * np.degrees(x) for x in (angles, angles + 0.4))
+    sigma = {"encoder_sigma": dict.fromkeys(SERVOS, 1e-4)}
+    degrees = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
+    servo = {"unit": "us", "centre_us": 1500, "us_per_deg": 11.1}
+    in_us = {"readings": dict.fromkeys(SERVOS, servo)}
+    rows: list[tuple[str, np.ndarray, dict[str, Any], tuple[str, ...]]] = [
+        ("degrees", np.degrees(angles), sigma, ("look like degrees", "pi/180", "readings: deg")),
+        ("radians", both_ways, degrees,
+         ("% of the travel in deg", "in rad", "write readings: rad")),
+        ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),
+        ("pulses-as-deg", pulses, degrees, ("look like pulses", "centre_us: 1500")),
+        ("no-pulses", angles, in_us, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
+        ("deg-as-us", np.degrees(angles), in_us, ("look like degrees: write readings: deg",)),
+        ("out-of-travel", late, in_us, ("us in row",)),
+        ("no-centre", pulses, sigma | {"readings": "us"},
+         ("readings.servo1", "neither centre nor us")),
+        ("mm", angles, sigma | {"readings": "mm"}, ("found mm and no motor that slides",)),
+        ("motor", angles, sigma | {"readings": {"servo9": "deg"}},
+         ("readings.servo9", "servo1, servo2")),
+        ("mm-of-one", angles, sigma | {"readings": {"servo1": "mm"}},
+         ("readings.servo1", "which turns")),
+        ("unknown", angles, sigma | {"readings": "turns"}, ("readings", "'turns'")),
+        ("no-sigma", angles, {"readings": "rad"},
+         ("encoder_sigma is incomplete", "servo1, servo2")),
+        ("large-sigma", angles, {"encoder_sigma": dict.fromkeys(SERVOS, 0.5)},
+         ("28.6 deg", "0.5deg")),
+        ("sigma-unit", angles, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
+        ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
+    ]  # fmt: skip
+    for name, readings, entry, named in rows:
+        edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
+        yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
+
+
 def _two_cameras(folder: Path) -> None:
     path = folder / "camera_info.yaml"
     text = path.read_text()
@@ -734,7 +815,7 @@ def _tables() -> Iterable[Refusal]:
     yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
 
     c = "corners.csv"
-    line = "view,image,corner,u,v,sigma,verdict,reason,source\n"
+    line = f"{CORNER_COLUMNS}\n"
     good = "c1,images/c1_1.png,0,5.0,5.0,0.1,used,,detected\n"
     board = keyed("dataset.yaml", board={
         "kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03,
@@ -1212,6 +1293,11 @@ def _new() -> Iterable[Refusal]:
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
+        ("no-type", f"{head}\n{row}\n,1,2,3,4\n", "--unit mm", ("types.1",)),
+        ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
+        ("nan", f"{head}\nRPS,nan,2,3,4\n{row}\n", "--unit mm", ("line 2", "base_x", "'nan'")),
+        ("tabs", "type\tbase_x\nRPS\t1,5\n", "--unit mm", ("'base_y'",)),
+        ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
         ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
         (
             "semicolons",
@@ -1225,12 +1311,134 @@ def _new() -> Iterable[Refusal]:
             f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
             (text("m.csv", content),),
         )  # fmt: skip
+    families: list[tuple[str, str, tuple[str, ...]]] = [
+        ("6-sps", "6-SPS", ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
+        ("3-upu", "3-UPU", ("--family 3-UPU", "hexapod or delta", "--template")),
+        ("nan", "hexapod --platform-radius nan", ("--platform-radius nan", "positive")),
+        ("arm-length", "hexapod --arm-length 20", ("--arm-length", "--base-radius")),
+        ("rss", "hexapod --type RSS", ("--type RSS", "with a slider")),
+        ("upx", "hexapod --type UPX", ("--type UPX", "with a slider")),
+        ("min-length", "hexapod --min-length 600", ("--family hexapod", "min_length 600")),
+        ("name", "hexapod --name ../up", ("'../up'",)),
+        ("rods", "delta --rod-length 100", ("rods of 100 mm", "--rod-length")),
+        ("height", "delta --height 374", ("--height 374", "negative")),
+        ("thick", "delta --leg-radius 40", ("60 mm apart", "80 mm thick", "--leg-radius")),
+        ("delta-type", "delta --type UPS", ("--type", "--arm-length")),
+    ]
+    for name, words, named in families:
+        command = f"new --family {words} --unit mm -o {{out}}"
+        yield Refusal(f"family-{name}", command, named)
+    for name, words, named in (
+        ("unit", "--unit inch", ("'inch'", "mm or m")),
+        ("no-unit", "--rod-length 400", ("--rod-length", "--unit mm")),
+    ):
+        yield Refusal(f"family-{name}", f"new --family delta {words} -o {{out}}", named)
     for name, words, named in (
         ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
         ("missing", "{in}/none.yaml", ("none.yaml",)),
         ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
     ):
         yield Refusal(f"new-{name}", f"new {words} -o {{out}}", named, "tables")
+
+
+def _described() -> Iterable[Refusal]:
+    """Tables of machines that cannot be."""
+    command = "new {in}/table.yaml -o {out}"
+    sps: dict[str, Any] = {"type": "SPS"}
+    rod: dict[str, Any] = {"type": None, "types": ["SPU", "SPU", "SS"]}
+    planar: dict[str, Any] = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
+    turned = {"xyz": [0, 0, 0], "rpy_deg": [0, 10, 0]}
+    pairs: dict[str, Any] = {
+        "base_joints": [[300, 0, 0], [300, 0, 0], [0, 300, 0]],
+        "platform_joints": [[180, 0, 0], [180, 0, 0], [0, 180, 0]],
+    }
+    changes: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+        ("no-version", {"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
+        ("version-key", {"legcal_table": None, "version": 1},
+         ("version: 1", "write 'legcal_table: 1'")),
+        ("version-true", {"legcal_table": True}, ("legcal_table", "true", "needed 1")),
+        ("type-number", {"type": 3}, ("type", "found 3", "6-UPS")),
+        ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
+        ("long-name", {"name": "x" * 101}, ("name", "at most 100")),
+        ("types-numbers", {"types": [3, 4, 5], "type": None}, ("types.0",)),
+        ("types-one", {"type": None, "types": ["RPS", "S", "RPS"]}, ("types.1", "'S'")),
+        ("one-leg", {"base_joints": [[1, 2, 3]]}, ("found 1 leg", "2 to 32")),
+        ("four-coordinates", {"base_joints": [[1, 2, 3, 4]] * 3},
+         ("base_joints", "row 1", "three")),
+        ("joints-number", {"base_joints": 7}, ("base_joints", "found 7", "row 1")),
+        ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]}, ("base_frame", "twice")),
+        ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
+        ("leg-name", {"legs": ["a", "b b", "c"]}, ("legs.1", "'b b'")),
+        ("travel-number", {"travel": 150}, ("travel", "found 150")),
+        ("travel-two", {"travel": [[0, 1], [0, 1]]}, ("travel", "2", "3")),
+        ("no-xyz", {"home": {"rpy_deg": [0, 0, 0]}}, ("home.xyz",)),
+        ("norm-0", {"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 0]}},
+         ("quaternion", "norm 0")),
+        ("fixed-axis", {"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
+        ("two-points", pairs, ("'leg1' and 'leg2'", "same two points")),
+        ("rod-length", rod | {"lengths": [None, 455, 455]}, ("lengths", "'leg2'")),
+        ("rod-offset", rod | {"offsets": [380, 380, 380]}, ("offsets", "'leg3'")),
+        ("rod-apart", rod | {"lengths": [None, None, 600]}, ("'leg3'", "456.", "600 mm")),
+        # what does not fit together, once the machine is put together
+        ("length-negative", {"offsets": -380}, ("length of -0.38 m", "offset")),
+        ("radius-large", {"radius": {"rod": 1e4}}, ("radius of 1e+04 mm",)),
+        ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "middle")),
+        ("open-at-home", sps | {"offsets": 100}, ("'leg1'", "close at home", "100 to 250 mm")),
+        ("passive-metres", sps | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None},
+         ("base joints",)),
+        ("one-line", sps | {"base_joints": [[300, 0, 0], [0, 0, 0], [-300, 0, 0]]}, ("one line",)),
+        ("length-0", sps | {"home": {"xyz": [120, 0, 0], "rpy_deg": [0, 0, 0]}},
+         ("'leg1'", "length of 0 m")),
+        ("axis-along", {"type": "UPS", "base_axes": [[-120, 0, 440], None, None]},
+         ("'leg1'", "along the leg")),
+        ("plane-turned", planar, ("'leg1'", "instead of 90 deg")),
+        ("plane-home", planar | {"home": turned, "offsets": 50}, ("home",)),
+    ]  # fmt: skip
+    for name, changed, named in changes:
+        edits = (text("table.yaml", yaml.safe_dump(_without_none(TRIPOD | changed))),)
+        yield Refusal(f"tripod-{name}", command, ("{in}/table.yaml", *named), "", edits)
+    arms: dict[str, Any] = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
+    below = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
+
+    def arm1(**changes: Any) -> dict[str, Any]:
+        motors = arms["actuators"]
+        return {"actuators": motors | {"arm1": _without_none(motors["arm1"] | changes)}}
+
+    of_motors: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+        ("no-axis", arm1(axis=None), ("actuators.arm1", "found point", "direction of a carriage")),
+        ("travel-of-carriage", arm1(travel_deg=None, travel=[0, 1]),
+         ("actuators.arm1", "found travel", "travel_deg")),
+        ("travel-reversed", arm1(travel_deg=[70, -30]), ("arm1", "lower reading first")),
+        ("arm-radius-0", arm1(arm_radius=0), ("actuators.arm1", "arm_radius", "0")),
+        ("radius-of-carriage",
+         arm1(axis=None, point=None, travel_deg=None, direction=[1, 0, 0], travel=[0, 1],
+              arm_radius=8),
+         ("actuators.arm1", "arm_radius of a carriage")),
+        ("axis-0", arm1(axis=[0, 0, 0]), ("arm1", "direction of three numbers")),
+        ("slides", {"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
+        ("no-motor-type", {"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
+        ("hangs-on", {"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]},
+         ("'leg6'", "'arm9'", "mean 'arm3'")),
+        ("arm-alone", {"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),
+        ("no-motors", {"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
+        ("no-length", {"lengths": None}, ("'leg1'", "no length")),
+        ("leg-travel", {"travel": [0, 1]}, ("travel", "'leg1'", "with P only")),
+        ("point-on-axis", arm1(point=[320, 0, 0]),
+         ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
+        ("home-below", {"home": below}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
+        ("rods-short", {"lengths": 200}, ("'arm1'", "82.6898 and 118.505 deg", "-30 to 70 deg")),
+        ("rod-long", {"lengths": [400, 420, *[400] * 4]},
+         ("home", "'leg2'", "400 mm long instead of 420 mm")),
+        ("travel-at-home", arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
+        ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
+    ]  # fmt: skip
+    for name, changed, named in of_motors:
+        edits = (text("table.yaml", yaml.safe_dump(_without_none(arms | changed))),)
+        yield Refusal(f"arms-{name}", command, named, "", edits)
+
+
+def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if value is not None}
 
 
 def _poses() -> Iterable[Refusal]:
@@ -1334,7 +1542,9 @@ REFUSALS: tuple[Refusal, ...] = (
     *_use(),
     *_options(),
     *_datasets(),
+    *_in_hand(),
     *_measurements(),
+    *_units(),
     *_cameras(),
     *_tables(),
     *_overrides(),
@@ -1342,6 +1552,7 @@ REFUSALS: tuple[Refusal, ...] = (
     *_outside(),
     *_formats(),
     *_new(),
+    *_described(),
     *_poses(),
     *_results(),
     *_scenes(),
