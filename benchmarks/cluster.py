@@ -26,8 +26,8 @@ import numpy as np
 import psutil
 
 from legcal import load_dataset
+from legcal.calibration.board import rough_placement
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.calibration.pipeline import rough_placement
 from legcal.progress import no_progress
 from legcal.simulation.paper import PaperStudy
 from legcal.simulation.study import run_study

@@ -2,7 +2,7 @@
 
 python benchmarks/identify.py [RUNS]
 
-For the views that are recommended: rank of the steps and of everything at once, and the standard
+For the views that are recommended: rank of the joint fit, and the standard
 deviation of the worst direction that counts as determined and of the best that does not, in
 leg lengths (the limit is 1). Then the time of the analysis alone and of the whole command.
 """
@@ -29,7 +29,7 @@ WEAK = ["leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6"]
 
 def main(runs: int = 5) -> None:
     """Print a line a model, then a line a command."""
-    print(f"{'model':16} {'steps':>9} {'at once':>9} {'worst':>8} {'beyond':>8} {'seconds':>8}")
+    print(f"{'model':16} {'rank':>9} {'worst':>8} {'beyond':>8} {'seconds':>8}")
     for path in sorted((ROOT / "models").glob("*.yaml")):
         machine = legcal.load_mechanism(path)
         begin = time.perf_counter()
@@ -41,9 +41,8 @@ def main(runs: int = 5) -> None:
         sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
         beyond = f"{sigma[sigma >= 1.0].min():8.0f}" if np.any(sigma >= 1.0) else f"{'none':>8}"
         print(
-            f"{path.stem:16} {report.staged.rank:4}/{report.staged.of:<4} "
-            f"{report.full.rank:4}/{report.full.of:<4} {sigma[sigma < 1.0].max():8.4f} {beyond} "
-            f"{seconds:8.2f}"
+            f"{path.stem:16} {report.full.rank:4}/{report.full.of:<4} "
+            f"{sigma[sigma < 1.0].max():8.4f} {beyond} {seconds:8.2f}"
         )
     weak = [word for view in WEAK for word in ("--view", view)]
     for words in (["inspect"], ["identify"], ["identify", *weak]):

@@ -65,7 +65,7 @@ SESSIONS: dict[str, dict[str, str]] = {  # by session and step: the words after 
         "check": "calibrate {in} --check {out}/result",
         "check another": "calibrate {sets}/planar-later --check {out}/result",
         "identify": "identify {in}",
-        "plan": "plan 3-rpr --images 3 --cameras 1 --places {in}/dataset.yaml --noise {out}/result"
+        "plan": "plan 3-rpr --images 3 --cameras 1 --given {in} --noise {out}/result"
         " -o {out}/plan --workers 1",
         "locate": "locate 3-rpr {sets}/tool/3-rpr.csv -o {out}/cell.yaml --tool-position 0,0,5mm",
     },

@@ -1,4 +1,4 @@
-"""Draw the second picture of the README: rendered photographs of four machines.
+"""Draw the picture of docs/simulate.md: rendered photographs of four machines.
 
 python docs/draw_simulated.py docs/simulated.jpg
 """

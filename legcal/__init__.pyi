@@ -1,13 +1,13 @@
 from .calibration.camera_calibration.calibration import calibrate_camera as calibrate_camera
+from .calibration.doctor import detect as detect
+from .calibration.doctor import doctor as doctor
 from .calibration.evaluation import evaluate as evaluate
-from .calibration.examination import doctor as doctor
 from .calibration.identify.identifiability import identifiability as identifiability
 from .calibration.location.document import Location as Location
 from .calibration.location.document import load_location as load_location
 from .calibration.location.document import write_location as write_location
 from .calibration.location.locate import locate as locate
 from .calibration.location.tool_poses import ToolPoses as ToolPoses
-from .calibration.outline_detection import detect as detect
 from .calibration.pipeline import calibrate as calibrate
 from .calibration.result_folder import load_result as load_result
 from .calibration.verification import check as check

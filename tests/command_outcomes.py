@@ -25,7 +25,7 @@ from legcal import cli
 
 ROOT = Path(__file__).parents[1]
 
-_SCHEMAS = {"calibrate": "result", "camera": "camera-calibration"}
+_SCHEMAS = {"calibrate": "result", "camera": "camera-calibration", "detect": "doctor"}
 
 # Typer reads the signatures of all commands anew for every run: as long as a refusal takes.
 _get_command = cache(typer.main.get_command)

@@ -10,7 +10,6 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from legcal.calibration.camera_calibration.document import CameraDocument
-from legcal.calibration.detection import DetectionDocument
 from legcal.calibration.documents import (
     CheckDocument,
     DiagnosisBlock,
@@ -104,7 +103,6 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "result": Result,
     "check": CheckDocument,
     "evaluate": EvaluationDocument,
-    "detect": DetectionDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,
 }

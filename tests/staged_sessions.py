@@ -1,4 +1,4 @@
-"""What the four steps take of shipped machines, hexapods of section 4.3 and made-up bases."""
+"""What the four steps take of shipped machines, and of hexapods of section 4.3."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from fit_sessions import PINHOLE, MachineSession, machine_session
 from hexapod_sessions import PaperSession, disturbed_hexapod, moved, paper_session
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.identify.predicted_observations import (
     PredictedObservations,
@@ -18,7 +18,7 @@ from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.leg import JointType, KinematicParameters, Leg, LegKind
+from legcal.machine.leg import KinematicParameters, Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -28,9 +28,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.paper.criteria import Criteria
-from legcal.paper.four_steps import StagedResult, run_base_steps, run_steps
-from legcal.paper.joints_in_base import JointsInBase
-from legcal.paper.joints_in_camera import JointsInCamera
+from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import NominalMachine
 from legcal.simulation.observe import OutlineNoise, TableNoise
 from legcal.simulation.paper import PAPER_VIEWS
@@ -52,18 +50,6 @@ class Observed:
         return np.array([leg.A for leg in self.true_legs])
 
     @property
-    def v_Rb(self) -> Array:
-        """True revolute axes at the base; z in a plane."""
-        up = np.array([0.0, 0.0, 1.0])
-        nominal = self.nominal.base_axes if self.nominal.spatial else np.tile(up, (99, 1))
-        return np.array(
-            [
-                leg.base_axis if leg.base_joint == "R" and leg.base_axis is not None else v
-                for leg, v in zip(self.true_legs, nominal, strict=False)
-            ]
-        )
-
-    @property
     def is_angle(self) -> BoolArray:
         """Which parameters are angles."""
         return np.array([unit == "rad" for unit in self._parametrization().units])
@@ -72,9 +58,11 @@ class Observed:
         """Run the four steps."""
         return run_steps(self.nominal, self.axes, self.measurements, criteria=criteria, **options)
 
-    def run_base(self, criteria: Criteria = "default") -> JointsInBase:
-        """Run steps 1 and 2."""
-        return run_base_steps(self.nominal, self.axes, self.measurements, criteria=criteria)
+    def known(self, part: float) -> "Observed":
+        """Return the same with standard deviations that are smaller."""
+        covariance, m = part**2 * self.axes.covariance, self.measurements
+        axes = replace(self.axes, covariance=covariance)
+        return replace(self, axes=axes, measurements=replace(m, sigma_q=part * m.sigma_q))
 
     def errors(self, legs: tuple[Leg, ...], *, twists: bool = False) -> Array:
         """Return the error of every parameter of legs [m, rad]."""
@@ -172,51 +160,6 @@ def planned(session: PredictedObservations, *, noise: float = 0.0, seed: int = 0
     )
 
 
-def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMachine:
-    """Return a machine of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
-    up = np.array([0.0, 0.0, 1.0])
-    legs = tuple(
-        Leg(JointType("R"), JointType("S"), LegKind.ACTUATED, A, A + up, 0.5, v)
-        if np.isfinite(v[0])
-        else Leg(JointType("S"), JointType("S"), LegKind.ACTUATED, A, A + up, 0.5)
-        for A, v in zip(A_Rb, v_Rb, strict=True)
-    )
-    names = tuple(f"leg{j + 1}" for j in range(len(legs)))
-    return NominalMachine(names, legs, (0, 1, 2))
-
-
-def seen_from(
-    A_Rb: Array, v_Rb: Array, seen: BoolArray, *, sigma: float = 1e-4, seed: int | None = None
-) -> tuple[JointsInCamera, list[RigidTransform]]:
-    """Return what step 1 finds of a base in views (n_views, n_legs), axes of any sign; T_Rb_camera.
-
-    With a seed, centres [m] and axes [rad] have errors.
-    """
-    rng = np.random.default_rng(1)
-    cameras = [
-        RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng)) for _ in seen
-    ]
-    A = np.array([T.inv().apply(A_Rb) for T in cameras])
-    v = np.array([T.rotation.inv().apply(np.nan_to_num(v_Rb)) for T in cameras])
-    v *= rng.choice([-1.0, 1.0], v.shape[:2])[..., None]
-    if seed is not None:
-        noise = np.random.default_rng(seed)
-        A += sigma * noise.normal(size=A.shape)
-        v += sigma * noise.normal(size=v.shape)
-        v /= np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-9)
-    with_axis = seen & np.isfinite(v_Rb[:, 0])
-    joints = JointsInCamera(
-        np.where(seen[..., None], A, 0.0),
-        seen,
-        np.where(with_axis[..., None], v, 0.0),
-        with_axis,
-        np.where(seen[..., None, None], sigma**2 * np.eye(5), 0.0),
-        (),
-        np.zeros(len(seen), dtype=np.bool_),
-    )
-    return joints, cameras
-
-
 # Hexapods of section 4.3
 
 
@@ -256,11 +199,6 @@ def noisy_session(
         n_images=3 if isinstance(noise, TableNoise) else 1,
     )
     return session, moved(machine, np.random.default_rng(seed).uniform(-0.002, 0.002, 30))
-
-
-def five_millimetres_away(machine: Machine, seed: int = 0) -> NominalMachine:
-    """Return the machine with every parameter exactly 5 mm wrong, z and offsets included."""
-    return moved(machine, 0.005 * np.random.default_rng(seed).choice([-1.0, 1.0], 30))
 
 
 def errors(parameters: KinematicParameters, machine: Machine | NominalMachine) -> Array:

@@ -231,7 +231,7 @@ def test_a_leg_of_a_view_that_was_left_out_speaks_against_a_model(
 def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
     made = simulated(tmp_path / "set", model, poses=8, views=3)
     out = tmp_path / "out"
-    found = calibrate(made.folder, transformation="cross_product", output=out)
+    found = calibrate(made.folder, output=out)
     assert found.verdict.trustworthy
     assert found.steps.failure == ""
     assert found.steps.legs is not None

@@ -208,6 +208,8 @@ def test_options_without_sense_are_refused_by_name(
         (("study", "paper", "--part", "1/3"), ["--part of legcal study", "--cluster"]),
         (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
         (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
+        (("plan", "x", "--camera=c.yaml"), ["--camera of legcal plan", "--given DATASET"]),
+        (("plan", "x", "--force"), ["--force of legcal plan", "remove the earlier session"]),
     ],
 )
 def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(

@@ -18,8 +18,11 @@ from outline_tables import assert_same
 from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
-from legcal import detect, load_dataset
-from legcal.calibration.detection import Detection, _caption, _page
+from legcal import detect, doctor, load_dataset
+from legcal.calibration.detection import Detection
+from legcal.calibration.detection_folder import _caption
+from legcal.calibration.examination import Examination
+from legcal.calibration.examination_page import examination_page
 from legcal.data.corners import found_corners
 from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
@@ -63,8 +66,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(rendered: RepeatedImages, folder: Path) -> Detection:
-    return detect(rendered.path, output=folder)
+def examined(rendered: RepeatedImages, folder: Path) -> Examination:
+    return doctor(rendered.path, output=folder)
+
+
+@pytest.fixture(scope="module")
+def found(examined: Examination) -> Detection:
+    assert examined.detection is not None
+    return examined.detection
 
 
 @pytest.fixture
@@ -93,13 +102,14 @@ def test_folder_json_and_summary_tell_the_same(
     rows = read_rows(out / "observations.csv")
     assert document["outlines"] == len(rows)
     assert document["used"] == sum(row["verdict"] == "used" for row in rows) > 20
-    assert list(document["views"]) == ["c1", "c2"]
-    view = document["views"]["c1"]
+    view, aside = document["views"]
+    assert (view["view"], aside["view"]) == ("c1", "c2")
     assert (view["images"], view["legs_found"]) == (4, view["legs_visible"] - 6)
     contrast = [float(row["contrast"]) for row in rows if row["verdict"] == "used"]
     assert view["contrast"] == pytest.approx(np.median(contrast))
-    assert sum(view["rejected"].values()) == view["outlines"] - view["used"]
-    assert "c2" in document["views"]["c2"]["problem"]
+    assert sum(view["rejected"].values()) == view["outlines"] - view["outlines_used"]
+    assert "c2" in aside["problem"]
+    assert aside["problem"] in [one["what"] for one in document["findings"]]
     in_c1, in_c2 = document["left_out"]
     assert [image["view"] for image in in_c1["images"]] == ["c1"]
     assert in_c2["why"] == "the camera of its view could not be placed"
@@ -149,11 +159,11 @@ def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should
 
 
 def test_pages_of_many_images_show_the_worst_and_leave_out_a_table_that_is_too_long(
-    found: Detection, monkeypatch: pytest.MonkeyPatch
+    examined: Examination, found: Detection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("legcal.calibration.detection.MAX_ROWS", 2)
-    monkeypatch.setattr("legcal.calibration.outline_editor.MAX_BYTES", 1000)
-    page: Any = html.fromstring(_page(found))
+    monkeypatch.setattr("legcal.calibration.examination_page.MAX_ROWS", 2)
+    monkeypatch.setattr("legcal.calibration.examination_page.MAX_BYTES", 1000)
+    page: Any = html.fromstring(examination_page(examined, found))
     captions = page.xpath("//figure//figcaption/text()")
     assert [text.split(":")[0] for text in captions] == [BLANK, ASIDE]
     assert "The 2 of 5 images with the fewest used outlines are shown." in page.xpath("string()")
@@ -202,7 +212,7 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
         wrong = replace(photographs, machine=machine)
         return replace(place_and_measure(photographs, *others), photographs=wrong)
 
-    monkeypatch.setattr("legcal.calibration.outline_detection.place_and_measure", thicker)
+    monkeypatch.setattr("legcal.calibration.detection.place_and_measure", thicker)
     found = detect(one_image.path)
     legs = {leg.leg: leg for leg in found.predicted(0)}
     assert len(legs) == 6
@@ -232,7 +242,7 @@ def test_people_read_a_table_of_views(
     monkeypatch.setenv("COLUMNS", "100")
     assert run(monkeypatch, "detect", one_image.path, "-o", tmp_path / "out") == 0
     printed = capsys.readouterr()
-    assert "outlines used in 2 images" in printed.out
+    assert "outlines can be used" in printed.out
     assert re.search(r"1[12]/12", printed.out)  # of one leg little is seen
     assert f"Look at {tmp_path}/out/index.html" in printed.out.replace("\n", "")
     assert "Drawing overlays: 2/2" in printed.err

@@ -160,7 +160,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
         "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
         0.9, "exchange their headers",
     )  # fmt: skip
-    monkeypatch.setattr("legcal.calibration.examination.diagnose", lambda data: (mistake,))
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: (mistake,))
     session = made(tmp_path)
     session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
     name = session.change("c1", 0, lambda picture: 0 * picture)

@@ -267,7 +267,7 @@ def test_the_commands_that_take_a_cluster_are_those_that_the_page_names() -> Non
         parts = [command, *getattr(command, "commands", {}).values()]
         return any("--cluster" in option.opts for part in parts for option in part.params)
 
-    text = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     (sentence,) = re.findall(
         r"uses a Dask cluster that runs already\.(.*?) take it\.", text, re.DOTALL
     )

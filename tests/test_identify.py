@@ -28,12 +28,10 @@ from legcal.calibration.identify.identifiability import (
 )
 from legcal.calibration.identify.predicted_observations import (
     legs_in_words,
-    planned_observations,
     recorded_observations,
     views_in_words,
 )
 from legcal.calibration.identify.report import Identifiability, WeakDirection
-from legcal.calibration.identify.steps import locate_joints
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
@@ -91,45 +89,38 @@ def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("views", "staged", "needed", "mends"),
+    ("views", "images", "ranks", "needed"),
     [
-        ("weak joint", (26, 28), (), ("x and y of base joint 6", "z of base joint 6")),
-        ("halves", (18, 24), ("eq12",), None),
-        ("paper", (30, 30), (), ()),
+        ("weak joint", 15, (30, 30), ()),
+        ("halves", 15, (30, 30), ("eq12",)),
+        ("paper", 15, (30, 30), ()),
+        ("paper", 1, (25, 30), ("two_directions", "full")),
     ],
 )
 def test_a_board_does_what_the_report_says(
-    views: str, staged: tuple[int, int], needed: tuple[str, ...], mends: tuple[str, ...] | None
+    views: str, images: int, ranks: tuple[int, int], needed: tuple[str, ...]
 ) -> None:
-    without, given = report(views), report(views, board=True)
+    without, given = (report(views, images=images, board=board) for board in (False, True))
     assert (without.board.without, without.board.with_board) == (
         given.board.without, given.board.with_board,
     )  # fmt: skip
     board = without.board
-    assert (board.without.staged_rank, board.with_board.staged_rank) == staged
-    assert (board.without.full_rank, board.with_board.full_rank) == (30, 30)
-    assert (without.staged.rank, given.staged.rank) == staged
+    assert (board.without.full_rank, board.with_board.full_rank) == ranks
+    assert (without.full.rank, given.full.rank) == ranks
     assert (board.present, given.board.present) == (False, True)
     assert board.needed_for == needed
-    assert mends in (None, board.mends)
+    assert len(board.mends) == ranks[1] - ranks[0]
     assert [c.needed for c in (without.conditions[0], given.conditions[0])] == [True, False]
     assert not given.conditions[0].fails
 
 
-def test_only_a_board_lets_the_steps_use_a_camera_in_the_hand() -> None:
+def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     found = report("paper", board=True, hand_held=True)
     assert (len(found.views), set(found.images)) == (45, {1})
-    assert found.staged.rank == found.full.rank == 30
+    assert found.full.rank == 30
     assert found.conditions_hold
-    assert found.board.without.staged_rank == 0
-    assert {"two_directions", "staged"} <= set(found.board.needed_for)
+    assert "two_directions" in found.board.needed_for
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
-    # Step 1 with a board: joints in its frame, one for each leg, from all images together
-    views = [tuple(range(6))] * 8
-    located = locate_joints(planned_observations(loaded("hexapod"), views, 1, board=True))
-    assert located.joint.shape == (1, 6)
-    assert np.all(located.joint)
-    assert not np.any(locate_joints(planned_observations(loaded("hexapod"), views, 1)).joint)
 
 
 def test_smallest_views_with_a_board_suffice_with_it() -> None:
@@ -138,7 +129,6 @@ def test_smallest_views_with_a_board_suffice_with_it() -> None:
     for choice in found.recommendation:
         again = legcal.identifiability(loaded("tricept"), choice.views, board=True)
         assert again.conditions_hold
-        assert again.staged.complete
         assert again.identifiable
 
 
@@ -146,12 +136,10 @@ def test_the_report_in_words_says_what_a_board_is_needed_for() -> None:
     for choices, *texts in (
         (("paper", False), "A calibration board is not needed"),
         (("halves", False), "is needed for base joints and axes (12)",
-         "raises the ranks from 18 to 24 of 30 step by step, and from 30 to 30"),
+         "raises the rank from 30 to 30 of 30"),
         (("halves", True), "fails, not needed with the board"),
         (("weak joint", True), "a calibration board on the base in every view",
-         "and determines: x and y of base joint 6; z of base joint 6."),
-        (("weak joint", False), "add a fourth camera position",
-         "calibration starts from the nominal model"),
+         "Identifiable: the joint fit determines 30 of 30 parameters."),
     ):  # fmt: skip
         shown = said(report(choices[0], board=choices[1]))
         assert [text for text in texts if text not in shown] == []
@@ -177,7 +165,7 @@ def test_the_document_is_that_of_the_report(
     assert "needed" not in document["conditions"][1]
     assert document["paper"] == {"ok": found.conditions_hold}
     assert document["board"]["with"] == {
-        "staged_rank": 24, "full_rank": 30, "identifiable": True,
+        "full_rank": 30, "identifiable": True,
     }  # fmt: skip
     assert document["board"]["present"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
@@ -293,8 +281,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     known, vague = (
         Choices(priors={name: Prior(0.3, sigma) for name in names}) for sigma in (1e-4, 100.0)
     )
-    (note,) = check_identifiable(two_images(), known)
-    assert "The four steps alone" in note
+    assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
         return identifiability_of_dataset(two_images(), choices).full.rank
@@ -348,11 +335,8 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
     images = data.draw(st.integers(1, 6))
     found = legcal.identifiability(machine, views, images=images)
     json.dumps(found.document(), allow_nan=False)
-    for ranks in (found.staged, found.full):
-        assert ranks.rank + len(ranks.weak) == ranks.of
+    assert found.full.rank + len(found.full.weak) == found.full.of
     assert found.identifiable == all(d.harmless for d in found.full.weak)
-    if images > 4 and found.staged.complete:  # a step takes those before it as known: with hardly
-        assert found.full.complete  # any data it determines what all together hardly do
 
 
 # Words

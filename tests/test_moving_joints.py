@@ -9,7 +9,6 @@ import pytest
 from actuated_sessions import MACHINES, frame_legs, machine, session
 from scipy.spatial.transform import RigidTransform, Rotation
 from staged_sessions import Observed, planned
-from thinned import thinned
 
 from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -24,7 +23,7 @@ from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
 from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.paper.conditions import count_conditions, enough_readings
-from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.paper.four_steps import run_base_steps
 from legcal.report.identify import _verdict
 from legcal.report.page.verdicts import identify_verdict
 
@@ -38,55 +37,6 @@ def seen(name: str, *, images: int = 6, noise: float = 0.0, seed: int = 0) -> Ob
 
 
 # The four steps
-
-
-@pytest.mark.parametrize("name", thinned(MACHINES, ["6-rss", "delta", "3-prs"]))
-def test_exact_axes_give_the_machine_from_3_mm_and_1_degree(name: str) -> None:
-    observed = seen(name)
-    assert np.abs(observed.errors(observed.nominal.legs)).min() > 0.002
-    found = observed.run()
-    assert not any("moving" in text for text in found.diagnostics)
-    assert np.abs(observed.errors(found.legs)).max() < 1e-8
-    for T, true in zip(found.base.T_Rb_camera, observed.T_camera_Rb, strict=True):
-        assert T is not None
-        assert np.abs((T * true).as_matrix() - np.eye(4)).max() < 1e-8
-    shared = {leg.actuator.joint: leg.actuator for leg in found.legs if leg.actuator}
-    assert len(shared) == len({id(a) for a in shared.values()})
-    for leg in found.legs:  # rods on one arm keep one axis
-        assert leg.actuator is not None
-        assert np.allclose(leg.actuator.axis, shared[leg.actuator.joint].axis, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["delta", "3-prs"])
-def test_printed_steps_find_the_base_as_well(name: str) -> None:
-    """Scalar products of (9') with axes and arms; (16) is even in z of coplanar joints."""
-    observed = seen(name)
-    found = observed.run_base("literal").machine
-    for leg, true in zip(found.legs, observed.true_legs, strict=True):
-        assert leg.actuator is not None
-        assert true.actuator is not None
-        assert np.abs(leg.A - true.A).max() < 1e-6
-        assert np.abs(leg.actuator.axis - true.actuator.axis).max() < 1e-6
-        if true.actuator.turns:
-            assert np.abs(true.actuator.numbers(leg.actuator)[2:4]).max() < 1e-6
-
-
-@pytest.mark.parametrize("name", ["delta", "3-prs"])
-def test_covariances_of_carried_joints_are_true(name: str) -> None:
-    """Normalised squared errors of A and of the actuator, by view and rod."""
-    normalised: list[float] = []
-    observed = seen(name, images=12, noise=0.1)
-    joints = locate_joints_in_cameras(observed.nominal, observed.axes, observed.measurements)
-    for (view, j), carrier in joints.carriers.items():
-        T, leg = observed.T_camera_Rb[view], observed.true_legs[j]
-        assert leg.actuator is not None
-        of_actuator = leg.actuator.in_frame(T.as_matrix()).numbers(carrier.actuator)[:4]
-        error = np.concatenate([T.apply(leg.A) - carrier.A, np.zeros(2), of_actuator])
-        columns = np.setdiff1d(carrier.columns, [3, 4])
-        C = carrier.covariance[np.ix_(columns, columns)]
-        normalised.append(error[columns] @ np.linalg.solve(C, error[columns]) / len(columns))
-    assert len(normalised) == 3 * len(observed.true_legs)
-    assert 0.6 < np.mean(normalised) < 1.5  # 1 by rights; outlier weights cost a little
 
 
 def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
@@ -110,9 +60,10 @@ def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
     observed = seen("linear-delta", noise=0.01)
     m = observed.measurements
     wrong = replace(observed, measurements=replace(m, q=1.1 * m.q))
-    joints = locate_joints_in_cameras(wrong.nominal, wrong.axes, wrong.measurements)
-    assert len(joints.diagnostics) == 3
-    for k, text in enumerate(joints.diagnostics):
+    base = run_base_steps(wrong.nominal, wrong.axes, wrong.measurements)
+    told = [text for text in base.diagnostics if "moving" in text]
+    assert len(told) == 3
+    for k, text in enumerate(told):
         assert f"'motor{k + 1}' moving 0." in text
         assert "check the unit of the readings" in text
 
@@ -144,7 +95,6 @@ def test_counts_by_analogy_are_those_written_out() -> None:
 def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: str) -> None:
     analysis = Analysis(session(name))
     assert (analysis.full.rank, analysis.full.of) == (RANKS[name], RANKS[name])
-    assert analysis.staged.rank == RANKS[name]
     found = scale_sources(analysis)
     assert [s.source for s in found] == (
         ["length", "base_board", "platform_board", "radii"] if name in TURNING else []
@@ -174,7 +124,6 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
     report: Any = SimpleNamespace(
         identifiable=True,
         full=analysis.full,
-        staged=analysis.staged,
         platform_sigma=RmsMotion(1e-4, 1e-3),
         scale=scale_sources(analysis),
         conditions=(),
@@ -211,14 +160,6 @@ def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None
     assert found["hexaglide"].rank == 42  # its readings tell of it
     (weak,) = found["delta"].weak
     assert all("2" in name.partition(".")[0] for name in weak.parameters)
-
-
-def test_views_of_two_arms_leave_open_to_the_steps_what_readings_tell_the_fit() -> None:
-    """Both turn a platform that only translates about a line in the plane of its joints."""
-    arms = Analysis(session("delta", views=((2, 3, 4, 5), (0, 1, 4, 5), (2, 3, 4, 5))))
-    assert (arms.full.rank, arms.staged.rank) == (42, 41)
-    (weak,) = arms.staged.weak
-    assert weak.direction == "z of platform joints 2, 4 and 6 together"
 
 
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(

@@ -30,6 +30,7 @@ from simulated import settings
 from thinned import thinned
 
 import legcal
+from legcal.calibration.doctor import detect
 from legcal.calibration.joint_fit.factors import known_gammas, observed_outlines
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.gammas import (
@@ -64,7 +65,6 @@ from legcal.calibration.joint_fit.rounds import (
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
-from legcal.calibration.outline_detection import detect
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, no_outlines
 from legcal.data.reasons import USED, Reason, Rejection

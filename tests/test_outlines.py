@@ -393,7 +393,8 @@ def _edge(v: Array, *, sigma: float = 0.1, kept: float = 1.0, is_step: bool = Tr
     on_line = np.arange(N) < kept * N
     position = (np.flatnonzero(on_line) + 0.5) / N
     n = len(position)
-    line = BlockLine(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
+    share = on_line.astype(np.float64)
+    line = BlockLine(np.zeros(2), share, 1.0, position, np.zeros(n), np.full(n, 0.01))
     return MeasuredEdge(v, line, 50.0, is_step, 1.0, sigma**2 * np.eye(2))
 
 

@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +16,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
 from machines import with_round_arms
 from rich.console import Console
+from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Pulses
 from legcal.machine.configurations import random_configurations
@@ -36,8 +38,9 @@ from legcal.machine.model import slider_columns
 from legcal.machine.model_builder import create_model
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
-from legcal.planning import planner
+from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
+from legcal.planning.goals import criterion_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
 from legcal.planning.noise import read_noise
 from legcal.planning.places import Place, Setting, parse_bounds
@@ -133,12 +136,17 @@ def test_the_expected_error_is_that_of_a_calibration_which_says_so(
             simulate(load_mechanism("3-rpr"), shot / "again", settings)
 
 
-def places(folder: Path, **more: Any) -> Path:
-    """Write a list of four places around the 3-RPR that look at it, and others."""
-    around = {f"t{k}": {"xyz": [np.cos(k), np.sin(k), 1.4]} for k in range(0, 8, 2)}
-    text = {"places": {k: {"xyz": [float(x) for x in v["xyz"]]} for k, v in around.items()} | more}
-    (folder / "places.yaml").write_text(yaml.safe_dump(text))
-    return folder / "places.yaml"
+def tripods(**positions: list[float]) -> list[Place]:
+    """Return places that look at the 3-RPR."""
+    machine = load_mechanism("3-rpr")
+    points = camera_places.all_points(machine, [machine.home])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return [Place(look_at(np.array(at), middle), name) for name, at in positions.items()]
+
+
+def around(z: float) -> list[Place]:
+    """Return four places around the 3-RPR."""
+    return tripods(**{f"t{k}": [np.cos(k), np.sin(k), z] for k in range(0, 8, 2)})
 
 
 def test_the_command_writes_what_python_plans(
@@ -148,7 +156,7 @@ def test_the_command_writes_what_python_plans(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
@@ -184,7 +192,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr(planner, "choose", stopped)
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr("legcal.planning.places.USUAL", FEW)
+    monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
@@ -239,11 +247,11 @@ def test_a_stopped_search_says_that_it_missed_its_target() -> None:
 
 
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
-    planned: Plan, shot: Path, tmp_path: Path
+    planned: Plan, shot: Path
 ) -> None:
     assert np.all(np.diff(planned.growth[:, 1]) < 0.0)
     more = legcal.plan(
-        "3-rpr", images=2, cameras=1, places=places(tmp_path), given=shot / "session",
+        "3-rpr", images=2, cameras=1, places=around(1.4), given=shot / "session",
         noise=WHITE, setting=FEW,
     )  # fmt: skip
     assert more.error is not None
@@ -261,11 +269,9 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     small_search: None, tmp_path: Path
 ) -> None:
     """Every image shows the board, also by rays at the solids of the simulation."""
-    high = {f"t{k}": {"xyz": [float(np.cos(k)), float(np.sin(k)), 3.2]} for k in range(0, 8, 2)}
-    (tmp_path / "high.yaml").write_text(yaml.safe_dump({"places": high}))
     held = legcal.plan(
         "3-rpr", images=4, board="chessboard:6x5:40mm", hand_held=True, noise=WHITE,
-        setting=FEW, places=tmp_path / "high.yaml",
+        setting=FEW, places=around(3.2),
     )  # fmt: skip
     held = replace(held, views=(*held.views[:3], replace(held.views[3], via=("2",))))
     assert held.board is not None
@@ -427,6 +433,16 @@ def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -
     assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 
 
+def test_without_poses_a_plan_makes_the_volume_of_the_covariance_small() -> None:
+    legs = Predictor(load_mechanism("3-rpr"), sample_camera(), WHITE, 1e-6).legs
+    p = len(legs.parametrization.names)
+    criterion = criterion_of(None, legs, np.eye(p))
+    narrow = np.diag(np.r_[1e-12, np.full(p - 1, 1e-8)])
+    one, twice, smaller = criterion(np.stack([1e-8 * np.eye(p), 4e-8 * np.eye(p), narrow]))
+    assert twice == pytest.approx(2.0 * one)
+    assert smaller == pytest.approx(one * 1e-4 ** (1.0 / (2 * p)))
+
+
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 0}, UsageError, "--images 0"),
     ({"images": 401}, UsageError, "1 to 400"),
@@ -434,11 +450,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
     ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
-    ({"criterion": "best"}, UsageError, "mean, worst, d, parameters"),
-    ({"criterion": "d", "target": 1e-4}, UsageError, "leave out --criterion"),
     ({"target": 0.0}, UsageError, "more than 0"),
     ({"seed": -1}, UsageError, "--seed"),
-    ({"parameters": ["leg2.base.x"]}, UsageError, "--criterion parameters"),
     ({"hand_held": True, "cameras": None}, UsageError, "--board"),
     ({"hand_held": True, "board": "chessboard:9x6:25mm", "cameras": 2}, UsageError, "--cameras"),
     ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
@@ -446,13 +459,12 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
     ({"noise": __file__}, UsageError, "found no JSON document"),
-    ({"places": "nowhere.yaml"}, DatasetError, "nowhere.yaml"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
     ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
     ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
-    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; say with --model-error"),
+    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; plan with a smaller length"),
     ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
     ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]
@@ -596,40 +608,32 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
     np.testing.assert_allclose(searched.machine, left.machine, rtol=0.01, atol=1e-5)
 
 
-def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path, tmp_path: Path) -> None:
+def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     def refused(error: type[legcal.LegcalError], named: str, **asked: Any) -> None:
         of: dict[str, Any] = {"model": "3-rpr", "images": 4, "cameras": 1, "setting": FEW}
         with pytest.raises(error, match=named):
             legcal.plan(**(of | asked))
 
-    away = {"xyz": [0.0, 0.0, 3.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
-    for place, remedy in (
-        ({"xyz": [0.0, 90.0, 90.0]}, "move a nearer"),
-        ({"xyz": [0.0, 0.0, 0.2]}, "move a further away"),
+    away = [Place(RigidTransform.from_translation([0.0, 0.0, 3.0]), "a")]
+    for listed, remedy in (
+        (tripods(a=[0.0, 90.0, 90.0]), "move a nearer"),
+        (tripods(a=[0.0, 0.0, 0.2]), "move a further away"),
         (away, "0 of 1 camera places .* turn a to the machine"),
     ):
-        (tmp_path / "away.yaml").write_text(yaml.safe_dump({"places": {"a": place}}))
-        refused(NotVisible, remedy, places=tmp_path / "away.yaml")
+        refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
     refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
-    refused(UsageError, "found 1 place for 2", places=tmp_path / "away.yaml", cameras=2)
+    refused(UsageError, "found 1 place for 2", places=away, cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
-            places=places(tmp_path))  # fmt: skip
+            places=around(1.4))  # fmt: skip
     refused(NotVisible, "; use a board of larger squares", board="chessboard:9x6:5mm")
-    for name in ("dataset.yaml", "plan.json"):  # their views are places too
-        refused(UsageError, "found 2 places for 3", places=shot / "session" / name, cameras=3)
-    refused(UsageError, "leg9.base.x", criterion="parameters", parameters=["leg9.base.x"],
-            places=places(tmp_path))  # fmt: skip
-    refused(NotIdentifiable, "plan .* --images or more", images=1, places=places(tmp_path))
+    refused(NotIdentifiable, "plan .* --images or more", images=1, places=around(1.4))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))
     assert difference(upright, tilted) == "axes of joints up to 15 deg from those of the model"
     assert not difference(tilted, tilted)
-    with pytest.raises(UsageError, match="--force"):
+    with pytest.raises(UsageError, match="found an earlier session"):
         write_session(planned, shot / "session")
     for text in ("1m", "0m:1m,0m:1m,1m:0m", "0m:1m,0m:1m,0m:1kg"):
         with pytest.raises(UsageError, match="--bounds"):
             parse_bounds(text)
-    (shot / "session" / "images").mkdir()
-    with pytest.raises(UsageError, match="photographs"):
-        write_session(planned, shot / "session", force=True)

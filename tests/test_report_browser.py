@@ -18,7 +18,10 @@ from browser import errors as _errors
 from hexapod_example import HEXAPOD, Run
 
 import legcal
-from legcal.calibration.detection import Detection, _page, write_detection
+from legcal.calibration.detection import Detection
+from legcal.calibration.detection_folder import write_detection
+from legcal.calibration.examination import Examination
+from legcal.calibration.examination_page import examination_page
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.vision.camera import Camera
 from legcal.vision.distortion import DistortionModel
@@ -220,12 +223,21 @@ END_SCALE = 12.0  # pixels of the screen for one of the image, where an end is e
 
 
 @pytest.fixture(scope="module")
-def detection(example_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Detection]:
+def examined(
+    example_run: Run, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Examination]:
     """The outlines of the example as given ones, some images of each view, and their pages."""
     folder = tmp_path_factory.mktemp("corrected") / "hexapod"
     shutil.copytree(HEXAPOD, folder)
     shutil.copy(example_run.output / "observations.csv", folder)
-    return folder, legcal.detect(folder, output=folder.parent / "found")
+    return folder, legcal.doctor(folder, output=folder.parent / "found")
+
+
+@pytest.fixture(scope="module")
+def detection(examined: tuple[Path, Examination]) -> tuple[Path, Detection]:
+    folder, found = examined
+    assert found.detection is not None
+    return folder, found.detection
 
 
 class Editor:
@@ -390,9 +402,11 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
 
 
 def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
-    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
 ) -> None:
-    folder, found = detection
+    folder, examination = examined
+    found = examination.detection
+    assert found is not None
     measured = found.dataset.measurements
     lenses: dict[DistortionModel, list[float]] = {
         "plumb_bob": [-0.21, 0.08, 1e-3, -7e-4, -0.02],
@@ -415,7 +429,7 @@ def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
     dataset = replace(found.dataset, measurements=replace(measured, views=views))
     changed = replace(found, dataset=dataset, outlines=outlines)
     page = folder.parent / "found" / "lenses.html"  # beside the same photographs
-    page.write_text(_page(changed), "utf-8")
+    page.write_text(examination_page(examination, changed), "utf-8")
     editor = Editor(browser, page, tmp_path)
     for v in range(3):
         row = int(outlines.row[of_view[v]])
@@ -449,9 +463,11 @@ def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
 
 
 def test_the_page_of_a_detection_is_ready_in_time_and_hostile_names_do_nothing(
-    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
 ) -> None:
-    _, found = detection
+    _, examination = examined
+    found = examination.detection
+    assert found is not None
     machine, measured = found.dataset.machine, found.dataset.measurements
     legs = tuple(replace(leg, name=f'{leg.name}, "{HOSTILE}') for leg in machine.legs)
     views = tuple(replace(view, name=f"{view.name}{HOSTILE}") for view in measured.views)
@@ -461,7 +477,15 @@ def test_the_page_of_a_detection_is_ready_in_time_and_hostile_names_do_nothing(
         measurements=replace(measured, views=views),
     )
     changed = replace(found, dataset=dataset, rows=found.rows[:2])
-    write_detection(changed, tmp_path / "out", map, lambda *_: None)
+    hostile = replace(
+        examination,
+        mechanism=HOSTILE,
+        views=tuple(
+            view.model_copy(update={"view": f"{view.view}{HOSTILE}"}) for view in examination.views
+        ),
+        detection=changed,
+    )
+    write_detection(hostile, changed, tmp_path / "out", map, lambda *_: None)
     editor = Editor(browser, tmp_path / "out" / "index.html", tmp_path)
     assert (
         browser.execute_script(

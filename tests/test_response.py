@@ -57,12 +57,12 @@ def test_weights_make_the_noise_of_light_that_of_grey_levels(
     rng = np.random.default_rng(seed)
     grey = np.concatenate([np.full(4000, level), np.full(4000, 0.5 * level + 15.0)])
     noisy = (grey + 0.3 * rng.standard_normal(grey.shape)).astype(np.float32)[None]
-    inside = np.ones(noisy.shape, dtype=np.bool_)
-    light, weight = to_light(noisy, inside, gamma)
+    window = np.ones(noisy.shape, dtype=np.float32)
+    light, weight = to_light(noisy, window, gamma)
     for half in (np.s_[:4000], np.s_[4000:]):
         scatter = np.std(light[0, half]) * np.mean(weight[0, half])
         assert scatter == pytest.approx(0.3, rel=0.1)
-    assert not np.any(to_light(noisy, ~inside, gamma)[1])
+    assert not np.any(to_light(noisy, np.zeros_like(window), gamma)[1])
 
 
 def test_light_of_a_linear_camera_is_its_grey_levels() -> None:

@@ -98,7 +98,7 @@ def test_printed_documents_fit_their_schemas(
 
 
 def test_every_command_that_prints_a_document_has_a_schema() -> None:
-    own = {"calibrate": "result", "camera": "camera-calibration"}
+    own = {"calibrate": "result", "camera": "camera-calibration", "detect": "doctor"}
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     parameters = {name: {p.name for p in found.params} for name, found in commands.items()}
     printing = {name for name, found in parameters.items() if "as_json" in found} | {"study"}

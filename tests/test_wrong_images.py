@@ -19,11 +19,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 from legcal import calibrate, detect, load_dataset
+from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
-from legcal.calibration.pipeline import rough_placement
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection

@@ -5,9 +5,8 @@ identified (``identify``), puts it into canonical order (``ordered_dataset``), r
 measures the legs, runs the four steps (``four_steps``) and the joint fit (``joint_fit``) and
 measures again (sections 3.1 to 3.5), judges what the platform gains (``verdict``) and writes the
 result (``result_folder``): out comes a :class:`Calibration`, and its document :class:`Result`,
-which ``check`` (``verification``, ``change_detection``) reads back. ``detect``
-(``outline_detection``), ``doctor`` (``examination``) and ``check`` enter through the same phases.
-Beside them stand
-``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``.
-What ``--json`` prints is a model for each job.
+which ``check`` (``verification``, ``change_detection``) reads back. ``doctor`` and ``detect``
+(``doctor``, ``examination``) and ``check`` enter through the same phases. Beside them stand
+``evaluate`` (eq 20), ``calibrate_camera`` and ``locate``. What ``--json`` prints is a model for
+each job.
 """

@@ -29,6 +29,9 @@ from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
 from legcal.perception.board_corners import detect_corners, require_board
 from legcal.perception.board_poses import board_poses_in_images, camera_poses_by_board
+from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
+from legcal.perception.photographs import nominal_placement
+from legcal.perception.placement import Placement
 from legcal.vision.board import FixedBoard
 
 Poses = Sequence[RigidTransform | None]  # one a view
@@ -342,3 +345,42 @@ def _agree(one: RigidTransform, other: RigidTransform, size: float, reach: float
     """Say whether two places of the board are as near as hints are good."""
     far, turned = pose_distance(one, other)
     return far <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE
+
+
+def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
+    """Return where the nominal model has the legs, with rough cameras, and what shows the board.
+
+    Raises
+    ------
+    NotIdentifiable
+        If readings do not give the poses of images that are to be searched, and a view of these has
+        no rough camera pose or joints at A move; nothing is searched then.
+    NotVisible
+        If they are to be searched for legs none of which is visible.
+    """
+    if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
+        raise NotVisible(
+            f"{data.machine.urdf_path}: the images could not be searched: found no <visual> "
+            "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
+            "that images show; add them with their radii."
+        )
+    hints = [view.T_base_camera for view in data.measurements.views]
+    on_base = data.dataset.board_on("base")
+    by_board = on_base is not None and (
+        on_base.T_link_board is not None or any(T is not None for T in hints)
+    )
+    if not data.machine.is_determined and len(data.photographs.detect):
+        require_standing_joints(data.machine)
+    if not data.machine.is_determined and not by_board:
+        require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
+    placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
+    board = observe_board(data)
+    if board is not None:
+        T_base_board = base_of_board(data.dataset, board, placement.T_base_camera)
+        if T_base_board is not None:
+            cameras = board.cameras(T_base_board, placement.T_base_camera)
+            placement = replace(placement, T_base_camera=cameras)
+        if data.machine.is_determined:
+            cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
+            placement = replace(placement, T_base_camera=cameras)
+    return placement, board

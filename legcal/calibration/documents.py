@@ -1,7 +1,7 @@
 """The documents of the jobs: ``result.json``, and what ``check`` and ``evaluate`` print.
 
 :class:`Result` is ``result.json``: its fields are the keys, in their order, and the schema by which
-an earlier result is read (docs/results.md).
+an earlier result is read (docs/formats.md).
 """
 
 from __future__ import annotations

@@ -73,8 +73,12 @@ def fit_outlines(
     board: BoardViews | None,
     options: Options,
     settings: RefinementSettings = DEFAULT_SETTINGS,
+    *,
+    steps: Steps | None = None,
 ) -> Estimate:
     """Run the four steps, then the joint fit, with the outlines of all images.
+
+    ``steps`` are what the four steps gave from an earlier measurement; they are not run again.
 
     Raises
     ------
@@ -87,7 +91,8 @@ def fit_outlines(
     seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
     if options.every_leg:
         _refuse_unseen_legs(fitted, seen)
-    steps = four_steps(fitted, seen, board, options)
+    if steps is None:
+        steps = four_steps(fitted, seen, board, options)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in seen.source:

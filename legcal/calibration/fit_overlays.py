@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.detection import OVERLAYS, Detection, draw_images, is_overlay
+from legcal.calibration.detection import OVERLAYS, Detection
+from legcal.calibration.detection_folder import draw_images, is_overlay
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.result import Calibration
 from legcal.data.dataset import Dataset

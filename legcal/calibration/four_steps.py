@@ -74,10 +74,8 @@ def four_steps(
         try:
             found = run_platform_steps(
                 base,
-                axes,
                 measurements,
                 criteria=options.criteria,
-                transformation=options.transformation,
                 free_twists=any(name.endswith(".twist") for name in options.choices.free),
             )
         except (NotIdentifiable, DidNotConverge) as failure:

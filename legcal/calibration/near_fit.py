@@ -126,7 +126,7 @@ class _SearchNearFit:
         if like is not None:
             outlines = used_as_before(outlines, like)
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        return fit_outlines(here, outlines, placement, self.board, self.options)
+        return fit_outlines(here, outlines, placement, self.board, self.options, steps=near.steps)
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:

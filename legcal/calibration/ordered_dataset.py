@@ -37,7 +37,7 @@ from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import Contradiction, contradictions
 from legcal.machine.solved_poses import solve_poses
-from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.criteria import Criteria
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
 from legcal.progress import Report
@@ -52,7 +52,6 @@ class Options:
 
     choices: Choices  # of the parameters
     criteria: Criteria | None = None  # of the four steps; None leaves them out
-    transformation: Transformation | None = None  # how they solve (18); None for as the criteria
     every_leg: bool = True  # whether every leg must be seen that views say they show
 
 

@@ -5,8 +5,8 @@
    Measure: the outlines of the legs are measured near where that has them (section 3.1).
 3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. Joint fit of all parameters, started from the nominal model and from the steps.
-5. Measure again: all photographs are searched close to that fit and measured with all care, and 3
-   and 4 are repeated. What outlines are given, the fit of them does not depend on where it began.
+5. Measure again: all photographs are searched close to that fit and measured with all care, and 4
+   is repeated. What outlines are given, the fit of them does not depend on where it began.
    Where outlines show the gamma of a camera that is not given, this is done again with others, up
    to four times.
 6. Judge what the platform gains, and write the result.
@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
@@ -51,18 +51,15 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisi
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
-from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
-from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
     MeasuredImages,
     detection_settings,
     given_outlines,
-    nominal_placement,
     place_and_measure,
 )
-from legcal.perception.placement import Placement
 from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
@@ -77,7 +74,6 @@ def calibrate(
     output: str | Path | None = None,
     progress: Progress = False,
     criteria: Criteria = "default",
-    transformation: Transformation | None = None,
     use_cache: bool = True,
     workers: Workers = 1,
     priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
@@ -98,10 +94,8 @@ def calibrate(
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     criteria : {"default", "literal"}
-        What the four steps minimise: legcal's criteria, or the paper's as printed.
-    transformation : {"points", "cross_product"}, optional
-        How they compute where the platform is, eq (18): by point equality, or as printed. By
-        default as the criteria are.
+        The weights of the four steps: from the covariances of the axes, or all one, as the paper
+        has them.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
     workers : int, str or executor
@@ -159,7 +153,7 @@ def calibrate(
     key = outline_key(dataset, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
-        estimate = estimate_parameters(data, fitted, Options(choices, criteria, transformation))
+        estimate = estimate_parameters(data, fitted, Options(choices, criteria))
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 
@@ -303,45 +297,6 @@ def _unused_share(estimate: Estimate) -> float:
     """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
-
-
-def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
-    """Return where the nominal model has the legs, with rough cameras, and what shows the board.
-
-    Raises
-    ------
-    NotIdentifiable
-        If readings do not give the poses of images that are to be searched, and a view of these has
-        no rough camera pose or joints at A move; nothing is searched then.
-    NotVisible
-        If they are to be searched for legs none of which is visible.
-    """
-    if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
-        raise NotVisible(
-            f"{data.machine.urdf_path}: the images could not be searched: found no <visual> "
-            "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
-            "that images show; add them with their radii."
-        )
-    hints = [view.T_base_camera for view in data.measurements.views]
-    on_base = data.dataset.board_on("base")
-    by_board = on_base is not None and (
-        on_base.T_link_board is not None or any(T is not None for T in hints)
-    )
-    if not data.machine.is_determined and len(data.photographs.detect):
-        require_standing_joints(data.machine)
-    if not data.machine.is_determined and not by_board:
-        require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
-    placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
-    board = observe_board(data)
-    if board is not None:
-        T_base_board = base_of_board(data.dataset, board, placement.T_base_camera)
-        if T_base_board is not None:
-            cameras = board.cameras(T_base_board, placement.T_base_camera)
-            placement = replace(placement, T_base_camera=cameras)
-        if data.machine.is_determined:
-            cameras = tuple(board.cameras_by_platform(data, placement.T_base_camera))
-            placement = replace(placement, T_base_camera=cameras)
-    return placement, board
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from legcal.cli.options import (
     write_page,
 )
 from legcal.errors import UsageError
-from legcal.paper.criteria import Criteria, Transformation
+from legcal.paper.criteria import Criteria
 
 if TYPE_CHECKING:
     from legcal.data.dataset import Dataset
@@ -47,15 +47,11 @@ def calibrate(
     ] = False,
     criteria: Annotated[
         Criteria,
-        typer.Option(help="What the four steps minimise: legcal's criteria, or the paper's."),
-    ] = "default",
-    transformation: Annotated[
-        Transformation | None,
         typer.Option(
-            help="How they solve eq (18) for the platform: point equality, or as printed. By "
-            "default it follows the criteria."
+            help="The weights of the four steps: from the covariances of the axes, or one as the "
+            "paper has them."
         ),
-    ] = None,
+    ] = "default",
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
@@ -135,7 +131,6 @@ def calibrate(
             "--holdout": holdout,
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
-            "--transformation": transformation,
             "--overlays": overlays or None,
             "--truth": truth,
         }
@@ -168,7 +163,6 @@ def calibrate(
 
     arguments: dict[str, Any] = {
         "criteria": criteria,
-        "transformation": transformation,
         "use_cache": not fresh,
         "holdout": holdout,
         "overlays": overlays,

@@ -90,15 +90,18 @@ def detect(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the outlines of the legs and show them over the images, to see what went wrong."""
-    from legcal.calibration import outline_detection
-    from legcal.report.images import detection_table
+    """Do what doctor does, and show the outlines of the legs over the images, to be corrected.
 
-    found = outline_detection.detect(
+    Exit 1 if a camera could not be placed or no outline can be used.
+    """
+    from legcal.calibration import doctor as job
+    from legcal.report.doctor import examination_table
+
+    found = job.doctor(
         dataset, output=output, progress=not quiet, workers=image_workers(cluster, workers)
     )
-    show(as_json, lambda: found.document, lambda: detection_table(found, output))
-    if found.unplaced or not found.outlines.used.any():
+    show(as_json, found.document, lambda: examination_table(found, output))
+    if any(view.problem for view in found.views) or not found.n_used:
         raise typer.Exit(1)
 
 
@@ -113,10 +116,10 @@ def doctor(
 
     Exit 0 if nothing stands against it, 1 if something does, 2 if files cannot be used.
     """
-    from legcal.calibration import examination
+    from legcal.calibration import doctor as job
     from legcal.report.doctor import examination_table
 
-    found = examination.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
+    found = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
     show(as_json, found.document, lambda: examination_table(found))
     if not found.is_ready:
         raise typer.Exit(1 if found.is_usable else 2)

@@ -40,6 +40,8 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--list": _ONE_MACHINE,
         "--earlier": _ONE_MACHINE,
         "--resume": _ONE_MACHINE,
+        "--transformation": "the four steps solve (18) as printed, whatever the criteria; leave "
+        "it out",
     },
     "init": {
         "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
@@ -56,6 +58,21 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--joint-topic": "joint states are read from the only topic that has them or from "
         "/joint_states; give others as a table with --readings",
         "--dry-run": _DRY_RUN,
+    },
+    "plan": {
+        "--criterion": "a plan minimises the mean error of the platform over the workspace, or the "
+        "determinant of the covariance where readings do not give its pose",
+        "--parameter": "a plan minimises the mean error of the platform over the workspace; the "
+        "sigma that is expected of each parameter is in plan.json",
+        "--camera": "a plan takes the camera of --given DATASET, or in Python "
+        "legcal.plan(camera=FILE)",
+        "--places": "say with --bounds where cameras may stand, or in Python "
+        "legcal.plan(places=[...])",
+        "--model-error": "a plan allows for 2 mm, or in Python "
+        "legcal.plan(setting=legcal.planning.places.Setting(length=METRES))",
+        "--encoder-sigma": "a plan takes the encoder_sigma of --given DATASET, or in Python "
+        "legcal.plan(encoder_sigma=SIGMA)",
+        "--force": "remove the earlier session, or give another folder",
     },
     "new": {
         "--offset": "write offsets in the table (in a CSV the column offset), or give --min-length "

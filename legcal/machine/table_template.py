@@ -17,7 +17,7 @@ from legcal.machine.family import family_table
 
 _HEAD = """\
 # A table of legs for: legcal new {name}.yaml -o .
-# Replace the numbers by those of your machine. What the words mean: docs/models.md.
+# Replace the numbers by those of your machine. Keys are explained in docs/formats.md.
 legcal_table: 1
 name: {name}
 unit: {unit:<24}# of every length here; mm or m

@@ -5,15 +5,15 @@ In go a :class:`NominalMachine` (where the steps start), the leg axes that the i
 
 =====================  =======  ==================================================================
 ``conditions``         3.2-3.5  counts of equations and unknowns as printed, (10)-(12), (15), (17)
+``equations``          3.2-3.5  (6) to (19), each as one CasADi expression
 ``joints_in_camera``   3.2      step 1: base joints and revolute axes in each camera, (6), (7)
-``carriers``           ours     joints at A that move: (6') in place of (6)
 ``joints_in_base``     3.3      step 2: the same in R_b, and where the cameras stood, (8), (9)
 ``offsets``            3.4      step 3: offsets of the legs, (13), (14)
 ``platform``           3.5      step 4: joints and axes on the platform, passive legs, (16)-(19)
 ``four_steps``         3        the steps in a row
+``least_squares``      -        the sum of squares of some of them, minimised by IPOPT
 =====================  =======  ==================================================================
 
-Each step has the criterion as printed (``literal``) and a weighted one. Step 1 is linear, and
-reweighted by default; the others are problems of ``least_squares``, built with CasADi and solved
-with IPOPT. Errors of the platform (20) are those of the machine room's ``pose_differences``.
+Criteria choose the weights: all one (``literal``, as printed), or those of the covariances of the
+axes. Errors of the platform (20) are those of the machine room's ``pose_differences``.
 """

@@ -21,8 +21,8 @@ import numpy as np
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.parameters import n_frame_legs
-from legcal.paper.carriers import MIN_IMAGES
 
+MIN_IMAGES = {False: 3, True: 5}  # of one view, for (6'), by whether the actuator turns
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
 

@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.axes import turned_axis
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.motions import motion_of
 from legcal.geometry.rotations import turned
 from legcal.geometry.types import Array
 
@@ -38,13 +36,6 @@ def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
 def stepped_poses(R: Array, t: Array, steps: Array) -> tuple[Array, Array]:
     """Return the poses (n, 3, 3), (n, 3) of :func:`moved_points` for numbers, steps (n, 6)."""
     return turned(R, 2.0 * steps[:, 3:]), t + steps[:, :3]
-
-
-def motion_after(step: Array, start: RigidTransform) -> RigidTransform:
-    """Return one pose of :func:`stepped_poses` as a motion."""
-    matrix = start.as_matrix()[None]
-    R, t = stepped_poses(matrix[:, :3, :3], matrix[:, :3, 3], step[None])
-    return motion_of(R[0], t[0])
 
 
 # Unknown axes

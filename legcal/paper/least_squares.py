@@ -1,31 +1,36 @@
 """The nonlinear least-squares problem of all steps: built with CasADi, solved with IPOPT.
 
-A problem is a sum of terms; a term is one CasADi function of a few unknowns, mapped over its
-observations. What the observations saw are parameters of the compiled solver, so that problems
-of one structure (other numbers, other weights) are compiled once.
+A problem is a sum of terms. A term is one equation of the paper: a CasADi function of a few
+unknowns, mapped over its observations. The function is also one of the errors of what was observed:
+its derivative by these carries covariances of axes to covariances of residuals, which are the
+weights. What the observations saw are parameters of the compiled solver, so that problems of one
+structure (other numbers, other weights) are compiled once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array
 
 from legcal.errors import DidNotConverge
+from legcal.geometry.covariances import whitener
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.signals import held_back_signals, is_waiting
 
 _RANK = 1e-7  # singular values of the scaled Jacobian below this are undetermined directions
-_REWEIGHTINGS = 4
+_REWEIGHTINGS = 10
 _OUTLIER = 4.0  # an observation this many times the median has half its weight
-_CONVERGED = 0.01  # change of a weight that no longer matters
+_CONVERGED = 0.01  # relative change of a weight that no longer matters
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
-_CACHE_SIZE = 8  # compiled structures: those of one run of the steps, with either criteria
+_LEAST = 1e-13  # of the largest information: what is known worse is not known
+_NONE = np.zeros(0, dtype=np.intp)
+_CACHE_SIZE = 20  # compiled structures: those of one run of the steps, with either criteria
 _INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")  # return statuses
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
@@ -44,20 +49,31 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One kind of residual, and the observations that have it."""
+    """One equation, and the observations that have it."""
 
-    # (local, *observed) -> residuals of one observation, in standard deviations or as printed
+    # (local, error, *observed) -> residuals of one observation, as printed; error (k,) of what was
+    # observed, zero where the residuals are evaluated
     function: ca.Function
     # (n, n_local): places of the local unknowns among all, none twice in a row; -1 is zero
     index: IntArray
     # (n,), (n, a) or (n, a, b) each: the other arguments of the function
     observed: tuple[Array, ...]
-    robust: bool = False  # an outlier loses weight, all residuals of an observation together
+    covariance: Array | None = None  # (n, k, k) of the errors; None: the weight is one
+    n_printed: int | None = None  # the first residuals, which the paper has; others weigh nothing
 
     @property
     def n_rows(self) -> int:
         """Number of residuals of one observation."""
         return int(self.function.size1_out(0))
+
+    @property
+    def unit_weights(self) -> Array:
+        """Weights of one, (n, r, r); as numbers (n, r) where there are no others."""
+        n, r = len(self.index), self.n_rows
+        if self.covariance is None:
+            return np.ones((n, r))
+        printed = np.arange(r) < (r if self.n_printed is None else self.n_printed)
+        return np.tile(np.diag(printed.astype(np.float64)), (n, 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +83,9 @@ class LeastSquares:
     name: str  # what is looked for, for messages: "The base joints (eq 9)"
     terms: tuple[Term, ...]
     start: Array  # (n,)
-    # The first unknowns belong to many observations; the others come in groups, such as the pose
-    # of one image, that no residual ties to each other. None: all are shared.
-    n_shared: int | None = None
     # Second derivatives instead of J'J: for criteria that do not decide some unknown, as (9) and
-    # (16) with z; J'J vanishes in that direction.
+    # (16) with z, where J'J vanishes; and for (18) of poses that few legs fix, of which one is
+    # wrong.
     exact_hessian: bool = False
 
     @property
@@ -87,41 +101,55 @@ class LeastSquares:
         """Return the derivative (m, n) of the unweighted residuals."""
         return _sparse(_compiled(self._structure()).jacobian(x, self._observed()))
 
+    def derivative_at_start(self, *, weighted: bool) -> csc_array[np.float64]:
+        """Return the derivative (m, n) of the residuals at the start; in sigmas with weights."""
+        J = self.jacobian(self.start)
+        return csc_array(_matrix(self._weights(self.start, None)) @ J) if weighted else J
+
+    def _weights(self, x: Array, residuals: Array | None) -> list[Array]:
+        """Return the matrices (n, r, r) by which residuals of each term have unit variance at x.
+
+        They are one, (n, r), without a covariance. With the residuals there, outliers lose weight
+        by Cauchy's function.
+        """
+        found, first = list[Array](), 0
+        for term in self.terms:
+            n, r = len(term.index), term.n_rows
+            W = term.unit_weights
+            if term.covariance is not None:
+                local = np.append(x, 0.0)[term.index]
+                slope = derivatives(term.function, 1, local, *term.observed)
+                spread = slope @ term.covariance @ np.swapaxes(slope, 1, 2)
+                W = whitener(spread)
+                if residuals is not None:
+                    own = W @ residuals[first : first + n * r].reshape(n, r, 1)
+                    W *= _cauchy(np.linalg.norm(own, axis=(1, 2)))[:, None, None]
+            found.append(W)
+            first += n * r
+        return found
+
     def _structure(self) -> _Structure:
         """Return what problems share that differ only in what was observed and in the start."""
         terms = [term for term in self.terms if len(term.index)]
         keys = tuple(
             (
                 term.function,
+                term.covariance is None,
                 term.index.shape,
                 np.ascontiguousarray(term.index, dtype=np.int64).tobytes(),
                 tuple((*values.shape[1:], 1, 1)[:2] for values in term.observed),
             )
             for term in terms
         )
-        robust = any(term.robust for term in terms)
-        return len(self.start), keys, self.exact_hessian, robust
+        return len(self.start), keys, self.exact_hessian
 
     def _observed(self) -> ca.DM:
         """Return what all observations saw as one vector, observations side by side."""
         parts = [np.zeros(0)]
         for term in self.terms:
             for values in term.observed if len(term.index) else ():
-                if values.ndim < 3:
-                    columns = np.atleast_2d(values.T)
-                else:
-                    columns = np.swapaxes(values, 0, 1).reshape(values.shape[1], -1)
-                parts.append(columns.ravel(order="F"))
+                parts.append(_side_by_side(values).ravel(order="F"))
         return ca.DM(np.concatenate(parts))
-
-    def _robust_blocks(self) -> IntArray:
-        """Return the observation that each residual belongs to, (m,); -1 where not robust."""
-        blocks, n_blocks = [], 0
-        for term in self.terms:
-            number = np.arange(n_blocks, n_blocks + len(term.index))
-            blocks.append(np.repeat(number if term.robust else -1 + 0 * number, term.n_rows))
-            n_blocks += len(term.index)
-        return np.concatenate(blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,72 +157,116 @@ class IpoptSolution:
     """A converged least-squares problem."""
 
     x: Array  # (n,)
-    residuals: Array  # (m,), times the square roots of their weights
+    residuals: Array  # (m,), weighted
     jacobian: csc_array[np.float64]  # (m, n), the same
-    n_shared: int  # the first unknowns are shared by many observations
-    status: str  # of IPOPT at the end
 
-    @property
-    def cost(self) -> float:
-        """Half the sum of squared residuals."""
-        return 0.5 * float(self.residuals @ self.residuals)
+    def covariances(self, columns: IntArray) -> Array:
+        """Return covariances (n, k, k) of groups of unknowns (n, k) that no residual ties together.
 
-    def without_last(self, n_rows: int) -> IpoptSolution:
-        """Return what is left without the last residuals, at the same place."""
-        n_kept = len(self.residuals) - n_rows
-        return replace(self, residuals=self.residuals[:n_kept], jacobian=self.jacobian[:n_kept])
-
-    def covariance(self) -> Array:
-        """Return the covariance of the shared unknowns for residuals of unit variance.
-
-        Directions that no residual shows have none: see :meth:`undetermined`.
+        They are those for residuals of unit variance.
         """
-        triangle, scale = _shared_triangle(self.jacobian, self.n_shared)
-        scaled = np.linalg.pinv(triangle, rcond=_RANK) * scale[:, None]
-        return np.asarray(scaled @ scaled.T)
-
-    def information(self) -> Array:
-        """Return whitened rows (n_shared, n_shared) of the shared unknowns, the others free."""
-        triangle, scale = _shared_triangle(self.jacobian, self.n_shared)
-        return np.asarray(triangle / scale)
-
-    def undetermined(self, n_first: int) -> BoolArray:
-        """Return which of the first (shared) unknowns can move without changing any residual."""
-        triangle, _ = _shared_triangle(self.jacobian, self.n_shared)
-        rows = _eliminated(triangle[None, :, n_first:], triangle[None, :, :n_first])
-        _, singular, directions = np.linalg.svd(rows)
-        null = directions[np.count_nonzero(singular >= _RANK) :]
-        return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
+        information = (self.jacobian.T @ self.jacobian).tocsr()
+        return np.array([inverse_of(information[c][:, c].toarray()) for c in columns])
 
 
-def solve_least_squares(problem: LeastSquares) -> IpoptSolution:
+def solve_least_squares(problem: LeastSquares, *, weighted: bool = False) -> IpoptSolution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
-    Unknowns are counted from the start in units of what one residual unit shows: tolerances do
-    not depend on units of length or on the noise. With robust terms the problem is solved again
-    with Cauchy weights until these have converged. Raises DidNotConverge.
+    All weights are one, or those of covariances: these depend on the unknowns, and outliers lose
+    weight, so that the problem is solved again until the weights have converged. Unknowns are
+    counted from the start in units of what one residual unit shows: tolerances do not depend on
+    units of length or on the noise. Raises DidNotConverge.
     """
     with held_back_signals():  # CasADi swallows what is raised in its conversions
-        return _solved(problem)
+        return _solved(problem, weighted=weighted)
 
 
-def _solved(problem: LeastSquares) -> IpoptSolution:
+def undetermined(jacobian: csc_array[np.float64]) -> BoolArray:
+    """Return which unknowns can move without changing any residual."""
+    scaled = jacobian.toarray() * _column_scale(jacobian)
+    n = scaled.shape[1]
+    rows = np.vstack([scaled, np.zeros((n, n))])
+    _, singular, directions = np.linalg.svd(rows, full_matrices=False)
+    null = directions[singular < _RANK]
+    return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
+
+
+def inverse_of(information: Array) -> Array:
+    """Return the inverse of an information matrix, large where nothing is known."""
+    size = np.sqrt(np.diag(information))
+    size = np.maximum(size, _LEAST * float(size.max()))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    inverse = (vectors / np.maximum(values, _LEAST * values[-1])) @ vectors.T
+    return np.asarray(inverse / np.outer(size, size))
+
+
+def evaluated(function: ca.Function, local: Array, *observed: Array) -> Array:
+    """Return the residuals (n, r) of a function of a term, of local unknowns (n, n_local)."""
+    n, none = len(local), np.zeros((len(local), function.size1_in(1)))
+    arguments = [_side_by_side(values) for values in (local, none, *observed)]
+    return np.asarray(function.map(n)(*arguments).full()).T if n else _nothing(function)
+
+
+def derivatives(function: ca.Function, which: int, local: Array, *observed: Array) -> Array:
+    """Return the derivatives (n, r, k) by the local unknowns (0) or the errors (1)."""
+    n, none = len(local), np.zeros((len(local), function.size1_in(1)))
+    r, k = function.size1_out(0), function.size1_in(which)
+    arguments = [_side_by_side(values) for values in (local, none, *observed)]
+    found = _derivative(function, which).map(n)(*arguments).full()
+    return np.asarray(found.reshape(r, n, k).swapaxes(0, 1))
+
+
+def adjusted(
+    function: ca.Function,
+    local: Array,  # (n, n_local)
+    observed: tuple[Array, ...],
+    covariance: Array,  # (n, k, k) of the errors
+    local_covariance: Array,  # (n, n_local, n_local)
+) -> tuple[Array, Array, Array]:
+    """Return the likeliest errors (n, k) of observations that fulfil an equation, and covariances.
+
+    The covariances (n, k, k) are those of what is left of the errors, larger where the equation
+    contradicts what was observed: last by how many standard deviations it does (n,).
+    """
+    residual = evaluated(function, local, *observed)[..., None]
+    by_local, by_error = (derivatives(function, which, local, *observed) for which in (0, 1))
+    mixed = covariance @ np.swapaxes(by_error, 1, 2)
+    spread = by_error @ mixed + by_local @ local_covariance @ np.swapaxes(by_local, 1, 2)
+    gain = mixed @ np.linalg.inv(spread)
+    left = covariance - gain @ np.swapaxes(mixed, 1, 2)
+    chi = np.linalg.norm(whitener(spread) @ residual, axis=(1, 2))
+    return -(gain @ residual)[..., 0], left / (_cauchy(chi) ** 2)[:, None, None], chi
+
+
+def _nothing(function: ca.Function) -> Array:
+    return np.zeros((0, function.size1_out(0)))
+
+
+def _side_by_side(values: Array) -> Array:
+    """Return what observations (n,), (n, a) or (n, a, b) saw as columns, observation by one."""
+    if values.ndim < 3:
+        return np.atleast_2d(values.T)
+    return np.swapaxes(values, 0, 1).reshape(values.shape[1], -1)
+
+
+def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
     """Return :func:`solve_least_squares`; it ends early if a signal waits."""
     compiled, observed = _compiled(problem._structure()), problem._observed()
-    scale = _column_scale(_sparse(compiled.jacobian(problem.start, observed)))
-    if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
-        scale = np.full_like(scale, scale.min())
-    block = problem._robust_blocks()
-    root_weight, z, status = np.ones(len(block)), 0.0 * scale, ""
-    for k in range(1 + (_REWEIGHTINGS if np.any(block >= 0) else 0)):
-        if k > 0:
-            residuals = _dense(compiled.residuals(problem.start + scale * z, observed))
-            new = _cauchy_root_weights(residuals, block)
-            if np.max(np.abs(new - root_weight)) < _CONVERGED:
+    x = problem.start
+    weights = [term.unit_weights for term in problem.terms]
+    for k in range(_REWEIGHTINGS if weighted else 1):
+        if weighted:
+            residuals = None if k == 0 else _dense(compiled.residuals(x, observed))
+            before, weights = weights, problem._weights(x, residuals)
+            if k > 0 and _change(weights, before) < _CONVERGED:
                 break
-            root_weight = new
-        parameters = ca.vertcat(ca.DM(root_weight), ca.DM(problem.start), ca.DM(scale), observed)
-        z, stats = _minimum(compiled, z, parameters)
+        W = _matrix(weights)
+        jacobian = csc_array(W @ _sparse(compiled.jacobian(x, observed)))
+        scale = _column_scale(jacobian)
+        if problem.exact_hessian and not weighted:  # some columns of J may vanish
+            scale = np.full_like(scale, scale.min())
+        parameters = ca.vertcat(_entries(weights), ca.DM(x), ca.DM(scale), observed)
+        z, stats = _minimum(compiled, 0.0 * scale, parameters)
         if not stats["success"]:
             raise DidNotConverge(
                 f"{problem.name} could not be computed: IPOPT stopped after "
@@ -202,14 +274,11 @@ def _solved(problem: LeastSquares) -> IpoptSolution:
                 "Solve_Succeeded or Solved_To_Acceptable_Level; check the nominal model and the "
                 "observations, or reject the ones with large residuals."
             )
-        status = str(stats["return_status"])
-    x = problem.start + scale * z
+        x = x + scale * z
     return IpoptSolution(
         x=x,
-        residuals=root_weight * _dense(compiled.residuals(x, observed)),
-        jacobian=csc_array(diags_array(root_weight) @ _sparse(compiled.jacobian(x, observed))),
-        n_shared=len(x) if problem.n_shared is None else problem.n_shared,
-        status=status,
+        residuals=np.asarray(W @ _dense(compiled.residuals(x, observed))),
+        jacobian=csc_array(W @ _sparse(compiled.jacobian(x, observed))),
     )
 
 
@@ -227,30 +296,25 @@ def _minimum(compiled: _Compiled, z: Array, parameters: ca.DM) -> tuple[Array, d
     return _dense(found["x"]), stats
 
 
-def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
-    """Return square roots of 1 / (1 + (chi / limit)^2), chi being the size of each block."""
-    inside = block >= 0
-    size = np.zeros(int(block.max(initial=0)) + 1)
-    np.add.at(size, block[inside], residuals[inside] ** 2)
-    chi = np.sqrt(size)
-    limit = max(_OUTLIER * float(np.median(chi[np.unique(block[inside])])), _MIN_THRESHOLD)
-    root_weight = np.ones(len(block))
-    root_weight[inside] = 1.0 / np.sqrt(1.0 + (chi[block[inside]] / limit) ** 2)
-    return root_weight
+def _cauchy(chi: Array) -> Array:
+    """Return the square roots (n,) of Cauchy's weights of residuals of size chi (n,)."""
+    limit = max(_OUTLIER * float(np.median(chi)), _MIN_THRESHOLD)
+    return np.asarray(1.0 / np.sqrt(1.0 + (chi / limit) ** 2))
 
 
 # Compiled problems
 
 
-# Function, shape and bytes of the index, and shapes of what one observation saw
-_TermKey = tuple[ca.Function, tuple[int, ...], bytes, tuple[tuple[int, ...], ...]]
-_Structure = tuple[int, tuple[_TermKey, ...], bool, bool]  # unknowns, terms, exact Hessian, robust
+# Function, whether its weights are all one, shape and bytes of the index, and shapes of what one
+# observation saw
+_TermKey = tuple[ca.Function, bool, tuple[int, ...], bytes, tuple[tuple[int, ...], ...]]
+_Structure = tuple[int, tuple[_TermKey, ...], bool]  # unknowns, terms, exact Hessian
 
 
 class _Compiled(NamedTuple):
     """The functions of a structure."""
 
-    solver: ca.Function  # parameters: square roots of weights, start, scale, observed
+    solver: ca.Function  # parameters: weights, start, scale, observed
     residuals: ca.Function  # (x, observed) -> (m,)
     jacobian: ca.Function  # (x, observed) -> sparse (m, n)
     watch: _Watch  # of the solver
@@ -287,15 +351,23 @@ class _Watch(ca.Callback):
 @lru_cache(maxsize=_CACHE_SIZE)
 def _compiled(structure: _Structure) -> _Compiled:
     """Return the functions of a structure, the solver in scaled unknowns."""
-    n, terms, exact_hessian, robust = structure
+    n, terms, exact_hessian = structure
     residuals, jacobian = _residuals_and_jacobian(n, terms)
-    m = residuals.size1_out(0)
-    z, p = ca.MX.sym("z", n), ca.MX.sym("p", m + 2 * n + residuals.size1_in(1))
-    root_weight, start, scale = p[:m], p[m : m + n], p[m + n : m + 2 * n]
-    observed = p[m + 2 * n :]
+    blocks = list[ca.Sparsity]()
+    for function, is_plain, (n_of_term, _), _, _ in terms:
+        r = function.size1_out(0)
+        block = ca.Sparsity.diag(n_of_term * r) if is_plain else ca.Sparsity.dense(r, r)
+        blocks += [block] * (1 if is_plain else n_of_term)
+    pattern = ca.diagcat(*blocks)
+    n_weights = pattern.nnz()
+    z, p = ca.MX.sym("z", n), ca.MX.sym("p", n_weights + 2 * n + residuals.size1_in(1))
+    weights, start, scale, observed = ca.vertsplit(
+        p, [0, n_weights, n_weights + n, n_weights + 2 * n, p.size1()]
+    )
+    W = ca.MX(pattern, weights)
     x = start + scale * z
-    weighted = root_weight * residuals(x, observed)
-    slope = ca.diag(root_weight) @ jacobian(x, observed) @ ca.diag(scale)
+    weighted = ca.mtimes(W, residuals(x, observed))
+    slope = ca.mtimes(W, jacobian(x, observed)) @ ca.diag(scale)
     cost = 0.5 * ca.sumsqr(weighted)
     gradient = ca.densify(ca.mtimes(slope.T, weighted))  # IPOPT reads it as full
     options: dict[str, Any] = dict(_OPTIONS)
@@ -311,8 +383,6 @@ def _compiled(structure: _Structure) -> _Compiled:
             ["x", "p", "lam_f", "lam_g"],
             ["triu_hess_gamma_x_x"],
         )
-    if robust:  # more iterations only look for a descent below rounding
-        options["ipopt.acceptable_iter"] = 2
     watch = _Watch(n)
     options["iteration_callback"] = watch
     nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
@@ -323,12 +393,12 @@ def _residuals_and_jacobian(
     n_unknowns: int, terms: Sequence[_TermKey]
 ) -> tuple[ca.Function, ca.Function]:
     """Return (x, observed) -> residuals of all terms, and their sparse derivative by x."""
-    n_observed = sum(shape[0] * a * b for _, shape, _, sizes in terms for a, b in sizes)
+    n_observed = sum(shape[0] * a * b for *_, shape, _, sizes in terms for a, b in sizes)
     x, seen = ca.MX.sym("x", n_unknowns), ca.MX.sym("observed", n_observed)
     residuals, values = [ca.MX(0, 1)], [ca.MX(0, 1)]
-    rows, columns = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
+    rows, columns = [_NONE], [_NONE]
     n_before = place = 0
-    for function, (n, n_local), content, sizes in terms:
+    for function, _, (n, n_local), content, sizes in terms:
         observed = []
         for a, b in sizes:
             size = n * a * b
@@ -337,8 +407,9 @@ def _residuals_and_jacobian(
         index = np.frombuffer(content, dtype=np.int64).reshape(n, n_local)
         padded = np.where(index >= 0, index, n_unknowns).ravel().tolist()
         local = ca.reshape(ca.vertcat(x, 0.0)[padded], n_local, n)
-        residuals.append(ca.vec(function.map(n)(local, *observed)))
-        values.append(ca.vec(_derivative(function).map(n)(local, *observed)))
+        arguments = local, ca.MX.zeros(function.size1_in(1), n), *observed
+        residuals.append(ca.vec(function.map(n)(*arguments)))
+        values.append(ca.vec(_derivative(function, 0).map(n)(*arguments)))
         # CasADi stores columns: of one observation all residuals by its first unknown come first.
         n_rows = int(function.size1_out(0))
         of_observation = n_before + np.arange(n * n_rows).reshape(n, 1, n_rows)
@@ -357,11 +428,43 @@ def _residuals_and_jacobian(
     )
 
 
-def _derivative(function: ca.Function) -> ca.Function:
-    """Return the derivative of a function of (local, *observed) by its local unknowns, full."""
+@lru_cache(maxsize=64)
+def _derivative(function: ca.Function, which: int) -> ca.Function:
+    """Return the full derivative of a term's function by its local unknowns (0) or errors (1)."""
     inputs = [ca.SX.sym(f"i{k}", *function.size_in(k)) for k in range(function.n_in())]
-    jacobian = ca.densify(ca.jacobian(function(*inputs), inputs[0]))
+    jacobian = ca.densify(ca.jacobian(function(*inputs), inputs[which]))
     return ca.Function("derivative", inputs, [jacobian])
+
+
+def _matrix(weights: Sequence[Array]) -> csc_array[np.float64]:
+    """Return the weights of all terms as one matrix of blocks."""
+    entries, rows, columns, first = [np.zeros(0)], [_NONE], [_NONE], 0
+    for W in weights:
+        n, r = W.shape[:2]
+        place = first + np.arange(n * r).reshape(n, r)
+        entries.append(W.ravel())
+        rows.append((place if W.ndim == 2 else np.repeat(place, r, axis=1)).ravel())
+        columns.append((place if W.ndim == 2 else np.tile(place, (1, r))).ravel())
+        first += n * r
+    where = np.concatenate(rows), np.concatenate(columns)
+    return csc_array((np.concatenate(entries), where), shape=(first, first))
+
+
+def _entries(weights: Sequence[Array]) -> ca.DM:
+    """Return the weights of all terms as CasADi stores their matrix: column by column."""
+    return ca.DM(np.concatenate([np.swapaxes(W, 1, W.ndim - 1).ravel() for W in weights]))
+
+
+def _change(weights: Sequence[Array], before: Sequence[Array]) -> float:
+    """Return the largest relative change of a weight."""
+    return max(
+        (
+            float(np.max(np.linalg.norm(W - V, axis=(1, 2)) / np.linalg.norm(V, axis=(1, 2))))
+            for W, V in zip(weights, before, strict=True)
+            if V.ndim == 3  # others depend on nothing
+        ),
+        default=0.0,
+    )
 
 
 def _dense(column: ca.DM) -> Array:
@@ -375,80 +478,8 @@ def _sparse(matrix: ca.DM) -> csc_array[np.float64]:
     return csc_array((np.array(matrix.nonzeros()), row, first), shape=matrix.shape)
 
 
-# Elimination of what belongs to one group of observations
-
-
 def _column_scale(jacobian: csc_array[np.float64]) -> Array:
     """Return the change of each unknown that moves the residuals by one unit, (n,)."""
     norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=0)).ravel())
     floor = 1e-6 * float(norms.max(initial=0.0)) or 1.0
     return np.asarray(1.0 / np.maximum(norms, floor))
-
-
-def _shared_triangle(jacobian: csc_array[np.float64], n_shared: int) -> tuple[Array, Array]:
-    """Return R (n_shared, n_shared) of the scaled Jacobian without the others, and the scale."""
-    scale = _column_scale(jacobian)
-    entries = jacobian.tocoo()
-    row, column = np.asarray(entries.row, np.intp), np.asarray(entries.col, np.intp)
-    values = entries.data * scale[column]
-    group_of_row, place_of_column = _groups(jacobian, n_shared)
-    alone = group_of_row < 0
-    shared_rows = np.zeros((int(alone.sum()), n_shared))
-    here = alone[row]
-    shared_rows[(np.cumsum(alone) - 1)[row[here]], column[here]] = values[here]
-    n_groups = int(group_of_row.max(initial=-1)) + 1
-    if n_groups:
-        slot = _rank_in_group(group_of_row)
-        n_local = int(place_of_column.max()) + 1
-        filled = np.zeros((n_groups, int(slot.max()) + 1, n_local + n_shared))
-        local, place = column >= n_shared, n_local + column
-        place[local] = place_of_column[column[local] - n_shared]
-        filled[group_of_row[row[~here]], slot[row[~here]], place[~here]] = values[~here]
-        rest = _eliminated(filled[:, :, :n_local], filled[:, :, n_local:])
-        shared_rows = np.concatenate([shared_rows, rest])
-    reduced = np.asarray(np.linalg.qr(shared_rows, mode="r"))
-    missing = np.zeros((n_shared - len(reduced), n_shared))
-    return np.vstack([reduced, missing]), scale[:n_shared]
-
-
-def _groups(jacobian: csc_array[np.float64], n_shared: int) -> tuple[IntArray, IntArray]:
-    """Return the group of each row, -1 for none, and each other unknown's place in its group."""
-    n_rows, n = jacobian.shape
-    if n == n_shared:
-        return np.full(n_rows, -1), np.zeros(0, dtype=np.intp)
-    entries = jacobian[:, n_shared:].tocoo()
-    row, column = np.asarray(entries.row, np.intp), np.asarray(entries.col, np.intp)
-    # The first unknown of each group, by what shares a row; SciPy's graphs take 10 ms to load.
-    first, before = np.arange(n - n_shared), np.zeros(0, dtype=np.intp)
-    while not np.array_equal(first, before):
-        before, of_row = first.copy(), np.full(n_rows, n)
-        np.minimum.at(of_row, row, first[column])
-        np.minimum.at(first, column, of_row[row])
-    group = np.unique(first, return_inverse=True)[1].ravel()
-    group_of_row = np.full(n_rows, -1)
-    group_of_row[row] = group[column]
-    return group_of_row, _rank_in_group(group)
-
-
-def _rank_in_group(group: IntArray) -> IntArray:
-    """Return the place of each entry in its group."""
-    order = np.argsort(group, kind="stable")
-    in_order = group[order]
-    rank = np.zeros(len(group), dtype=np.intp)
-    rank[order] = np.arange(len(group)) - np.searchsorted(in_order, in_order)
-    return rank
-
-
-def _eliminated(local: Array, shared: Array) -> Array:
-    """Return what the rows [local, shared] of (k, r, n) groups say about the shared unknowns alone.
-
-    Rows are rotated until as few as possible contain the local ones, which are then dropped.
-    """
-    n_local, n_shared = local.shape[2], shared.shape[2]
-    if n_local == 0:
-        return shared.reshape(-1, n_shared)
-    rows = np.asarray(np.linalg.qr(np.concatenate([local, shared], axis=2), mode="r"))
-    left, singular, _ = np.linalg.svd(rows[:, :, :n_local])
-    rotated = np.swapaxes(left, 1, 2) @ rows[:, :, n_local:]
-    rotated[:, : singular.shape[1]][singular >= _RANK] = 0.0
-    return np.asarray(rotated.reshape(-1, n_shared))

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import (
     EquationKind,
@@ -63,9 +63,9 @@ class NominalMachine:
         return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
 
     @cached_property
-    def carried(self) -> BoolArray:
-        """Which legs are rods on an actuator, so that A moves, (n_legs,)."""
-        return np.array([leg.actuator is not None for leg in self.legs], dtype=np.bool_)
+    def actuators(self) -> dict[int, Actuator]:
+        """What moves the joints at A of legs that are rods on actuators, by leg."""
+        return {j: leg.actuator for j, leg in enumerate(self.legs) if leg.actuator is not None}
 
     @cached_property
     def on_platform(self) -> BoolArray:
@@ -90,28 +90,6 @@ class NominalMachine:
     def base_normals(self) -> Array:
         """:attr:`base_axes`; in a planar machine z for all, where it is no parameter."""
         return self.base_axes if self.spatial else np.tile([0.0, 0.0, 1.0], (self.n_legs, 1))
-
-    def A_at(self, leg: IntArray, q: Array) -> Array:
-        """Return A of legs (k,) in R_b at readings (k,), (k, 3) [m]."""
-        A = self.parameters.base_joints[leg]
-        for here, actuator in self._carried(leg):
-            A[here] = actuator.at(A[here[0]], q[here])
-        return A
-
-    def turns_at(self, leg: IntArray, q: Array) -> Array:
-        """Return how what carries legs (k,) has turned in R_b at readings (k,), (k, 3, 3)."""
-        R = np.tile(np.eye(3), (len(leg), 1, 1))
-        for here, actuator in self._carried(leg):
-            R[here] = actuator.rotations(q[here])
-        return R
-
-    def _carried(self, leg: IntArray) -> list[tuple[IntArray, Actuator]]:
-        """Return which of legs (k,) each actuator moves, leg by leg."""
-        return [
-            (np.flatnonzero(leg == j), own.actuator)
-            for j, own in enumerate(self.legs)
-            if own.actuator is not None and np.any(leg == j)
-        ]
 
 
 def nominal_machine(machine: Machine) -> NominalMachine:

@@ -1,60 +1,128 @@
 """Section 3.4: offsets q0 of the legs from the distances between their ends, eqs (13) and (14).
 
 A leg ends in B = A + (q + q0) u (13). The distance between the ends of two legs is constant over
-poses. As printed (``literal``), consecutive positions of each view are compared (14):
+poses: consecutive positions of each view are compared (14),
 
     C_2 = sum over pairs of legs (j, g) and positions k of (|B_j B_g|_k+1 - |B_j B_g|_k)^2
-
-That uses each distance twice and ties views to nothing. The default compares every distance with
-one unknown d_jg a pair of legs, the same in all poses and views, weighted by its covariance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
 from itertools import combinations
 
-import casadi as ca
 import numpy as np
 
+from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LegColumns
-from legcal.paper.criteria import Criteria
-from legcal.paper.least_squares import IpoptSolution, LeastSquares, Term, solve_least_squares
-from legcal.paper.leg_directions import LegDirections
+from legcal.paper.equations import change_of_distance, end_of_leg
+from legcal.paper.joints_in_camera import JointsInCamera
+from legcal.paper.least_squares import (
+    LeastSquares,
+    Term,
+    evaluated,
+    solve_least_squares,
+    undetermined,
+)
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import Unknowns
+from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
 
-_REWEIGHTINGS = 2
 _APART = 1e-3  # mean leg lengths: nearer platform joints count as one
 
 
+@dataclass(frozen=True, eq=False)
+class LegDirections:
+    """Legs of (13) as steps 3 and 4 see them: by group, then by leg."""
+
+    group: IntArray  # (n,): legs of one group are those of one pose in one view
+    view: IntArray  # (n,)
+    leg: IntArray  # (n,)
+    A: Array  # (n, 3): base joint centres in the frame of the group [m], at the readings
+    of_A: Array  # (n, 3, 3): covariances of these [m^2]; zero where actuators move them
+    u: Array  # (n, 3): unit directions from base to platform
+    basis: Array  # (n, 2, 3): e1, e2 normal to u
+    reading: Array  # (n,) sign * q [m], length less offset; zero if constant, NaN if passive
+    covariance: Array  # (n, 3, 3) of u along e1 and e2 [rad^2], and of the reading [m^2]
+    turn: Array  # (n, 3, 3): how what is fixed in the carriage or arm has turned in R_b
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+    def groups(self) -> list[IntArray]:
+        """Return the indices of the legs of each group."""
+        order = np.argsort(self.group, kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
+
+    @property
+    def columns(self) -> Array:
+        """The legs as (13) takes them, (n, 13)."""
+        basis = self.basis.reshape(-1, 6)
+        return np.hstack([self.A, self.u, self.reading[:, None], basis])
+
+    def ends(self, q0: Array) -> Array:
+        """Return B = A + (q + q0) u of (13) in the frame of each group, (n, 3) [m]."""
+        return evaluated(end_of_leg(), q0[self.leg, None], self.columns)
+
+
+def leg_directions(
+    machine: NominalMachine, joints: JointsInCamera, measurements: Measurements
+) -> LegDirections:
+    """Return the legs as step 1 found them in each camera; images of one pose are averaged."""
+    axes = joints.axes
+    key = np.stack([measurements.view[axes.row], measurements.pose[axes.row], axes.leg], axis=1)
+    distinct, first, which, count = np.unique(
+        key, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    total = np.zeros((len(distinct), 3))
+    np.add.at(total, which.ravel(), axes.u)
+    u = total / np.linalg.norm(total, axis=1, keepdims=True)
+    v, k, j = distinct.T
+    q = measurements.q[axes.row[first], j]
+    basis, turn = normal_basis(u), np.tile(np.eye(3), (len(j), 1, 1))
+    onto = basis @ np.swapaxes(axes.basis[first], 1, 2)
+    covariance = np.zeros((len(j), 3, 3))
+    of_u = axes.covariance[first, :2, :2] / count[:, None, None]
+    covariance[:, :2, :2] = onto @ of_u @ np.swapaxes(onto, 1, 2)
+    covariance[:, 2, 2] = measurements.sigma_q**2
+    of_A = joints.covariance[v, j, :3, :3]
+    for leg, actuator in machine.actuators.items():
+        of_A[j == leg] = 0.0
+        turn[j == leg] = actuator.rotations(q[j == leg])
+    return LegDirections(
+        group=v * measurements.n_poses + k,
+        view=v,
+        leg=j,
+        A=joints.A_at(v, j, q),
+        of_A=of_A,
+        u=u,
+        basis=basis,
+        reading=machine.sign[j] * np.where(machine.constant[j], 0.0, q),
+        covariance=covariance,
+        turn=turn,
+    )
+
+
 def identify_offsets(
-    machine: NominalMachine,
-    directions: LegDirections,
-    sigma_q: float,
-    *,
-    criteria: Criteria = "default",
-) -> NominalMachine:
-    """Return the machine with offsets and constant lengths from distances of leg ends, eq (14).
+    machine: NominalMachine, directions: LegDirections, *, weighted: bool
+) -> tuple[NominalMachine, tuple[str, ...]]:
+    """Return the machine with offsets and constant lengths by (14), and what stayed nominal.
 
     Raises NotIdentifiable if the distances do not fix every offset, and DidNotConverge.
     """
     pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
-    nominal = machine
-    if criteria == "literal":
-        solution = solve_least_squares(build_consecutive(machine, directions))
-        _check_identifiable(machine, directions, pairs, solution)
-        return replace(machine, legs=unknowns.legs(solution.x, machine.legs))
-    for _ in range(_REWEIGHTINGS):
-        q0 = machine.offsets
-        solution = solve_least_squares(build_constant_distances(nominal, directions, q0, sigma_q))
-        _check_identifiable(nominal, directions, pairs, solution, mean_length(directions, q0))
-        machine = replace(machine, legs=unknowns.legs(solution.x, machine.legs))
-    return machine
+    problem = build_consecutive(machine, directions)
+    with_held, held = problem, np.zeros(0, dtype=np.intp)
+    if weighted:
+        with_held, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
+    x = solve_least_squares(with_held, weighted=weighted).x
+    _check_identifiable(machine, directions, pairs, undetermined(problem.jacobian(x)))
+    left = left_near_nominal("Step 3 (14)", machine, unknowns, held)
+    return replace(machine, legs=unknowns.legs(x, machine.legs)), left
 
 
 def build_consecutive(machine: NominalMachine, directions: LegDirections) -> LeastSquares:
@@ -69,68 +137,13 @@ def build_consecutive(machine: NominalMachine, directions: LegDirections) -> Lea
         last[key] = k
     _check_any(found, "view shows the same two legs in two images")
     before, after = np.array(found, dtype=np.intp).T
-    term = Term(
-        _change_of_distance(),
-        unknowns.place[directions.leg[pairs[after]], LegColumns.LENGTH],
-        (observed_legs(directions, pairs[before]), observed_legs(directions, pairs[after])),
-    )
+    seen = tuple(np.swapaxes(directions.columns[pairs[k]], 1, 2) for k in (before, after))
+    covariance = np.zeros((len(before), 12, 12))
+    for k, each in enumerate((*pairs[before].T, *pairs[after].T)):
+        covariance[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = directions.covariance[each]
+    index = unknowns.place[directions.leg[pairs[after]], LegColumns.LENGTH]
+    term = Term(change_of_distance(), index, seen, covariance)
     return LeastSquares("The offsets (eq 14)", (term,), unknowns.vector(machine.legs))
-
-
-def build_constant_distances(
-    machine: NominalMachine, directions: LegDirections, q0: Array, sigma_q: float
-) -> LeastSquares:
-    """Build the default criterion, in standard deviations: distances equal d_jg in all poses.
-
-    Offsets ``q0`` (n_legs,) are those of the weights and of the start of the distances.
-    """
-    pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
-    ends = leg_ends(directions, q0)
-    covariance = leg_end_covariance(directions, q0, sigma_q)
-    legs = directions.leg[pairs]
-    _, which = np.unique(legs, axis=0, return_inverse=True)
-    which = which.ravel()
-    start = unknowns.vector(machine.legs)
-    term = Term(
-        _constant_distance(),
-        np.column_stack([unknowns.place[legs, LegColumns.LENGTH], len(start) + which]),
-        (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs)),
-        robust=True,
-    )
-    distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
-    mean = np.bincount(which, weights=distance) / np.bincount(which)
-    return LeastSquares("The offsets (step 3)", (term,), np.concatenate([start, mean]))
-
-
-# Ends of legs and their distances
-
-
-def leg_ends(directions: LegDirections, q0: Array) -> Array:
-    """Return B = A + (q + q0) u of (13) in the frame of each group, (n, 3) [m]."""
-    length = directions.reading + q0[directions.leg]
-    return directions.A + length[:, None] * directions.u
-
-
-def leg_end_covariance(directions: LegDirections, q0: Array, sigma_q: float) -> Array:
-    """Return the covariance of the leg ends of (13) given A and q0, (n, 3, 3) [m^2]."""
-    length = directions.reading + q0[directions.leg]
-    across = np.swapaxes(directions.basis, 1, 2) @ directions.covariance @ directions.basis
-    along = directions.u[:, :, None] * directions.u[:, None, :]
-    return np.asarray(length[:, None, None] ** 2 * across + sigma_q**2 * along)
-
-
-def distance_sigma(ends: Array, covariance: Array, pairs: IntArray) -> Array:
-    """Return the standard deviation of the distance between two leg ends, (n_pairs,) [m]."""
-    a, b = pairs.T
-    apart = ends[a] - ends[b]
-    n = apart / np.linalg.norm(apart, axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.einsum("pi,pij,pj->p", n, covariance[a] + covariance[b], n)))
-
-
-def mean_length(directions: LegDirections, q0: Array) -> float:
-    """Return the mean length of the legs that have one [m]."""
-    length = directions.reading + q0[directions.leg]
-    return float(np.mean(length[np.isfinite(length)]))
 
 
 def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
@@ -155,42 +168,14 @@ def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
     pairs = pairs_of_legs(directions, q0)
     legs = directions.leg[pairs]
     gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)
-    apart = gap > _APART * mean_length(directions, q0)
+    length = directions.reading + q0[directions.leg]
+    apart = gap > _APART * float(np.mean(length[np.isfinite(length)]))
     chosen: IntArray = pairs[apart & ~machine.on_platform[legs].any(axis=1)]
     _check_any(
         chosen.tolist(),
         "image shows two legs that turn against the platform and end in different places of it",
     )
     return chosen
-
-
-def observed_legs(directions: LegDirections, pairs: IntArray) -> Array:
-    """Return A, u and reading of both legs of each pair, one leg a column, (n_pairs, 7, 2)."""
-    seen = np.column_stack([directions.A, directions.u, directions.reading])
-    return np.swapaxes(seen[pairs], 1, 2)
-
-
-def distance_of_ends(q0: ca.SX, legs: ca.SX) -> ca.SX:
-    """Return the distance between the ends A + (q + q0) u of two legs (7, 2), eq (13)."""
-    ends = [legs[:3, k] + (legs[6, k] + q0[k]) * legs[3:6, k] for k in range(2)]
-    return ca.norm_2(ends[0] - ends[1])
-
-
-@cache
-def _change_of_distance() -> ca.Function:
-    """Return (q0 of two legs; legs before, legs after) -> the change of (14)."""
-    q0 = ca.SX.sym("q0", 2)
-    before, after = ca.SX.sym("before", 7, 2), ca.SX.sym("after", 7, 2)
-    change = distance_of_ends(q0, after) - distance_of_ends(q0, before)
-    return ca.Function("change", [q0, before, after], [change])
-
-
-@cache
-def _constant_distance() -> ca.Function:
-    """Return (q0 of two legs and d_jg; legs, sigma) -> distance observed less d_jg, in sigmas."""
-    local, legs, sigma = ca.SX.sym("local", 3), ca.SX.sym("legs", 7, 2), ca.SX.sym("sigma")
-    residual = (distance_of_ends(local[:2], legs) - local[2]) / sigma
-    return ca.Function("constant", [local, legs, sigma], [residual])
 
 
 # Refusals
@@ -209,16 +194,11 @@ def _check_identifiable(
     machine: NominalMachine,
     directions: LegDirections,
     pairs: IntArray,
-    solution: IpoptSolution,
-    largest_sigma: float = np.inf,
+    loose: BoolArray,
 ) -> None:
     """Refuse when an offset can change without any distance noticing."""
     with_offset = np.flatnonzero(np.isfinite(machine.offsets))
-    loose = solution.undetermined(len(with_offset))
-    if np.isfinite(largest_sigma):
-        sigma = np.sqrt(np.diag(solution.covariance())[: len(with_offset)])
-        loose |= sigma > largest_sigma
-    loose &= ~machine.on_platform[with_offset]
+    loose = loose & ~machine.on_platform[with_offset]
     if not loose.any():
         return
     names, reasons = [machine.leg_names[j] for j in with_offset[loose]], []

@@ -1,315 +1,454 @@
 """Section 3.5: joints and axes on the platform, universal axes at the base, passive legs.
 
-As printed (``literal``) they follow one by one, (16) to (19). Distances decide neither z of
-coplanar joints nor the handedness, so the default lays the leg ends B of all poses on one rigid
-body, with one platform pose for every group of three or more legs (two in a plane); two legs give
-their distance. The platform joint predicts the whole leg: its direction is compared with the
-observed one, and its length with reading plus offset:
+With the offsets known, the leg ends B of every pose are points of one rigid body. Mean distances
+of a view equal those in the platform frame R_e (16):
 
-    direction of R B + t - A = u,    |R B + t - A| = q + q0
+    C_3 = sum over views and pairs of legs (mean |B_j B_g| in R_c - |B_j B_g| in R_e)^2
 
-The offsets stay free: (13) multiplies a noisy direction by the unknown length, which biases (14),
-while here directions are predicted and not multiplied. A passive leg has no reading, and takes part
-with its direction alone, which is (19). The constraints of a leg (normal to its revolute
-axis, no twist) are further residuals, with the axes among the unknowns: one image gives a poor pose
-of the platform, and an axis computed from such poses inherits that; all constraints together make
-the poses much better, and the joints with them.
+With weights, joints, offsets and poses of the platform are then solved for together by (18), which
+shows z of coplanar joints too. Where the platform is gives revolute axes on it by v . u = 0 (7),
+the ends of passive legs by u x A B = 0 (19), universal axes and twists by the closure of legs
+without an S joint.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import combinations
 
-import casadi as ca
 import numpy as np
 
-from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.geometry.covariances import whitener
+from legcal.errors import NotIdentifiable
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.equations import leg_equations
-from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns
-from legcal.paper.criteria import Criteria, Transformation
-from legcal.paper.joints_in_base import JointsInBase
-from legcal.paper.joints_in_camera import JointsInCamera
-from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
-from legcal.paper.leg_directions import LegDirections
-from legcal.paper.leg_equations import constraint_of_leg, direction_of_leg, length_of_leg
-from legcal.paper.nominal import NominalMachine
-from legcal.paper.offsets import (
+from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
+from legcal.machine.parameters import tied_twist, twist_after
+from legcal.paper.equations import (
+    closure_of_leg,
     distance_of_ends,
-    distance_sigma,
-    leg_end_covariance,
-    leg_ends,
-    observed_legs,
+    end_of_leg,
+    end_on_axis,
+    end_on_ray,
+    mean_distance,
 )
-from legcal.paper.platform_pose import PlatformPoses, locate_platform
-from legcal.paper.platform_printed import platform_as_printed
+from legcal.paper.gibbs import angles_of, axis_frames, stepped_poses
+from legcal.paper.joints_in_base import JointsInBase
+from legcal.paper.joints_in_camera import AcrossAxes
+from legcal.paper.least_squares import (
+    LeastSquares,
+    Term,
+    derivatives,
+    evaluated,
+    solve_least_squares,
+)
+from legcal.paper.nominal import NominalMachine
+from legcal.paper.offsets import LegDirections, pairs_of_legs
+from legcal.paper.platform_pose import PlatformPoses, across_rays, locate_platform
 from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import fix_weak_directions, nominal_prior
+from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal, with_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
-_MIN_SIGMA_LENGTH = 1e-5  # of the mean length: keeps exact sessions well conditioned
-_MIN_SIGMA_CONSTRAINT = 1e-5  # [rad]: the same
-_IN_PLANE = np.array([0, 1, -1, -1, -1, 2])  # of displacement and turn of a planar platform
-NEAR_NOMINAL = (
-    "Step 4 kept the axes of legs without an S joint near the nominal ones: the poses show them "
-    "too poorly to find them alone."
-)
+_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
+_SIGMA_CLOSURE = 1e-4  # of all closures together, rms: what changes them by less is not observed
 
 
 def locate_platform_joints(
     machine: NominalMachine,
     base: JointsInBase,
     directions: LegDirections,
-    sigma_q: float,
     *,
-    criteria: Criteria = "default",
-    transformation: Transformation | None = None,
+    weighted: bool,
     free_twists: bool = False,
 ) -> tuple[NominalMachine, tuple[str, ...]]:
     """Return the machine of steps 2 and 3 with all that step 4 estimates, and diagnostics.
 
-    These are B, axes on the platform, universal axes at the base, twists if they are freed, and
-    offsets again by the default criterion; diagnostics say what was left at nominal, and why. (18)
-    is solved by point equality, or as printed in the literal steps, unless ``transformation`` says
-    otherwise; the default criterion only starts there. Raises NotIdentifiable if the images do not
-    tie all joints together, or do not determine something that moves the platform; DidNotConverge.
+    These are B, axes on the platform, universal axes at the base, and twists if they are freed;
+    diagnostics say what was left at nominal, and why. Raises NotIdentifiable if the images do not
+    determine something that moves the platform, and DidNotConverge.
     """
-    if transformation is None:
-        transformation = "cross_product" if criteria == "literal" else "points"
     unknowns = Unknowns.of_platform(machine, free_twists=free_twists)
-    if criteria == "literal":
-        legs, diagnostics = platform_as_printed(machine, unknowns, base, directions, transformation)
-        return replace(machine, legs=legs), diagnostics
-    rigid = RigidProblem.of(machine, unknowns, base, directions, sigma_q, transformation)
-    # What is not determined is judged near the nominal model: there the platform moves as it
-    # should. Axes that the poses show too poorly to converge without it stay near the nominal ones.
-    problem = build_rigid_platform(rigid)
-    n, terms = len(unknowns), problem.terms
-    twisting = [leg.twist is not None for leg in machine.legs]
-    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start : LegColumns.OWN]
-    prior = nominal_prior(np.unique(turns[turns >= 0]))
-    solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
-    legs = unknowns.legs(solution.x, machine.legs)
-    information = solution.without_last(sum(len(term.index) for term in prior)).information()
-    poses, nominal = rigid.poses_in_base(solution.x[n:]), unknowns.vector(machine.legs)
-    fixed, diagnostics = fix_weak_directions(machine, unknowns, information, legs, poses, nominal)
-    if prior or fixed:
-        terms = (*terms, *fixed)
-        problem = replace(problem, terms=terms, start=solution.x)
-        try:
-            solution = solve_least_squares(problem)
-        except DidNotConverge:
-            solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
-            diagnostics = (*diagnostics, NEAR_NOMINAL)
-        legs = unknowns.legs(solution.x, machine.legs)
-    return replace(machine, legs=legs), diagnostics
+    problem = build_mean_distances(machine, unknowns, directions)
+    held = np.zeros(0, dtype=np.intp)
+    if weighted:
+        problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
+    x = unknowns.vector(machine.legs)
+    x[: len(problem.start)] = solve_least_squares(problem, weighted=weighted).x
+    legs = unknowns.legs(x, machine.legs)
+    unposed = [
+        name
+        for name, leg in zip(machine.leg_names, legs, strict=True)
+        if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
+    ]
+    on_rays = weighted and machine.spatial and not machine.actuators
+    if not unposed and not on_rays:
+        left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
+        return replace(machine, legs=legs), left
+    seen = _SeenLegs.of(machine, legs, base, directions, weighted=weighted, by_rays=not on_rays)
+    if on_rays and len(seen.poses.R):
+        seen, legs, shown = _ends_on_rays(seen, unknowns, legs)
+        held = np.setdiff1d(held, shown)
+    left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
+    if not unposed:
+        return replace(machine, legs=legs), left
+    if not len(seen.poses.R):
+        number = "three" if machine.spatial else "two"
+        shape = " that do not lie on one line" if machine.spatial else ""
+        raise NotIdentifiable(
+            f"Axes and passive ends of leg {', '.join(unposed)} could not be identified: no pose "
+            f"shows {number} legs of known length at once with ends{shape}, needed to know where "
+            "the platform is (eq 18); add images that show several legs at once."
+        )
+    legs = tuple(_with_axis_and_end(seen, unknowns, j, leg) for j, leg in enumerate(legs))
+    legs, of_closure = _close_legs(seen, unknowns, legs)
+    return replace(machine, legs=_in_own_frame(machine, legs)), (*left, *of_closure)
 
 
-_OF_STEP_4 = {EquationKind.PLATFORM_AXIS, EquationKind.DIRECTION_1, EquationKind.TWIST}
+def build_mean_distances(
+    machine: NominalMachine, unknowns: Unknowns, directions: LegDirections
+) -> LeastSquares:
+    """Build the criterion C_3 of (16): mean distances of a view equal those in R_e.
+
+    Two legs that end in one place have none. In a plane the heights of R_e are nominal.
+    """
+    q0 = machine.offsets
+    pairs = pairs_of_legs(directions, q0)
+    B = machine.parameters.platform_joints[directions.leg[pairs]]
+    apart = _APART * float(np.mean(q0[np.isfinite(q0)]))
+    pairs = pairs[np.linalg.norm(B[:, 1] - B[:, 0], axis=1) > apart]
+    key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])
+    distinct, which = np.unique(key, axis=0, return_inverse=True)
+    which, legs = which.ravel(), distinct[:, 1:]
+    ends = q0[directions.leg[pairs]], np.swapaxes(directions.columns[pairs], 1, 2)
+    distance = evaluated(distance_of_ends(), *ends)[:, 0]
+    slope = derivatives(distance_of_ends(), 1, *ends)[:, 0].reshape(-1, 2, 3)
+    variance = np.einsum("pki,pkij,pkj->p", slope, directions.covariance[pairs], slope)
+    n = np.bincount(which)
+    mean, of_mean = (np.bincount(which, weights=w) for w in (distance, variance))
+    place = unknowns.place[:, LegColumns.B]
+    observed = np.swapaxes(unknowns.known_B[legs], 1, 2), mean / n
+    index, covariance = place[legs].reshape(-1, 6), (of_mean / n**2)[:, None, None]
+    return LeastSquares(
+        "The platform joints (eq 16)",
+        (Term(mean_distance(), index, observed, covariance),),
+        unknowns.vector(machine.legs)[: int(place.max()) + 1],
+        exact_hessian=True,
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class RigidProblem:
-    """What the rigid criterion is built of."""
+class _SeenLegs:
+    """Legs in R_b where their camera is located, else in its frame, and the platform there."""
 
-    machine: NominalMachine  # as steps 2 and 3 have it: the start
-    unknowns: Unknowns
+    machine: NominalMachine  # as steps 2 and 3 have it
     directions: LegDirections
-    poses: PlatformPoses  # to start from
-    in_base: BoolArray  # (n,), which of the directions are in R_b: twists count for these
-    A_covariance: Array  # (n, 3, 3) [m^2]
-    sigma_q: float  # [m]
+    in_base: BoolArray  # (n,) which are in R_b
+    centre: Array  # (n, 3) of the camera [m]
+    poses: PlatformPoses
+    weighted: bool
 
     @classmethod
     def of(
         cls,
         machine: NominalMachine,
-        unknowns: Unknowns,
+        legs: tuple[Leg, ...],
         base: JointsInBase,
         directions: LegDirections,
-        sigma_q: float,
-        transformation: Transformation = "points",
-    ) -> RigidProblem:
-        """Gather it, platform poses to start from among it."""
-        placed = np.array([T is not None for T in base.T_Rb_camera])
-        centre = np.zeros((len(directions), 3))
+        *,
+        weighted: bool,
+        by_rays: bool,
+    ) -> _SeenLegs:
+        """Locate cameras and platform by (18): each A, and each B, is on the ray that shows it."""
+        A, u, basis = directions.A.copy(), directions.u.copy(), directions.basis.copy()
+        of_A = directions.of_A.copy()
+        centre, in_base = np.zeros_like(A), np.zeros(len(A), dtype=np.bool_)
         for v, T in enumerate(base.T_Rb_camera):
-            if T is not None:
-                centre[directions.view == v] = T.translation
-        q0, of_A = machine.offsets, _covariance_of_A(directions, base)
-        covariance = leg_end_covariance(directions, q0, sigma_q) + of_A
+            here = np.flatnonzero(directions.view == v)
+            if T is None or not len(here):
+                continue
+            R = T.rotation.as_matrix()
+            of_A[here] = R @ of_A[here] @ R.T
+            A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
+            basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
+            centre[here], in_base[here] = T.translation, True
+        directions = replace(directions, A=A, of_A=of_A, u=u, basis=basis)
+        q0 = machine.offsets
+        slope = derivatives(end_of_leg(), 1, q0[directions.leg, None], directions.columns)
         poses = locate_platform(
-            directions,
-            leg_ends(directions, q0),
-            machine.parameters.platform_joints,
-            centre=centre,
-            transformation=transformation,
+            directions.groups(),
+            np.array([leg.B for leg in legs])[directions.leg],
+            directions.ends(q0),
+            slope @ directions.covariance @ np.swapaxes(slope, 1, 2) + of_A,
+            centre,
             spatial=machine.spatial,
-            on_a_line=True,
-            weight=1.0 / np.einsum("nii->n", covariance),
+            weighted=weighted,
+            by_rays=by_rays,
         )
-        in_base = placed[directions.view]
-        return cls(machine, unknowns, directions, poses, in_base, of_A, sigma_q)
+        return cls(machine, directions, in_base, centre, poses, weighted)
 
-    def index(self, rows: IntArray) -> IntArray:
-        """Return the places of the local unknowns of :mod:`legcal.paper.leg_equations`, (k, 15)."""
-        free = np.arange(6) if self.machine.spatial else _IN_PLANE
-        first = len(self.unknowns) + (free.max() + 1) * self.poses.pose[rows, None]
-        steps = np.where(free >= 0, first + free, -1)
-        of_leg = self.unknowns.place[self.directions.leg[rows], LegColumns.B.start : LegColumns.OWN]
-        return np.hstack([of_leg, steps])
+    def across(self, rows: IntArray) -> AcrossAxes:
+        """Return some directions as (7) of one axis on the platform takes them."""
+        u, basis = self.directions.u[rows], self.directions.basis[rows]
+        R, axis = self.poses.R[self.poses.pose[rows]], np.zeros(len(rows), dtype=np.intp)
+        return AcrossAxes(u, basis, R, self.covariance(rows), axis)
 
-    def known(self, rows: IntArray) -> tuple[Array, Array, Array, Array]:
-        """Return what is known of some of the legs: B in part, the pose at step zero, and A."""
-        pose, B = self.poses.pose[rows], self.unknowns.known_B[self.directions.leg[rows]]
-        return B, self.poses.R[pose], self.poses.t[pose], self.directions.A[rows]
-
-    def sigma(self, rows: IntArray, about: EquationKind, least: float) -> Array:
-        """Return standard deviations of an equation (k,), *least* with an exact A.
-
-        Lengths and constraints hold exactly, but between joints A that have errors: an error of A
-        changes the length and the direction of the leg by far more than a reading is wrong.
-        """
-        directions, variance = self.directions, np.zeros(len(rows))
-        legs = self.machine.legs
-        key = np.column_stack([directions.leg[rows], directions.A[rows]])
-        _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
-        for k, i in enumerate(first):
-            here = np.flatnonzero(which.ravel() == k)
-            leg = _standing(legs[directions.leg[rows[i]]], directions, rows[i])
-            pose = self.poses.pose[rows[here]]
-            linear = leg_equations(leg, self.poses.R[pose], self.poses.t[pose])
-            by_A = linear.by_local[:, linear.kinds.index(about), :3]
-            of_A = self.A_covariance[rows[here]]
-            variance[here] = np.einsum("ni,nij,nj->n", by_A, of_A, by_A)
-        return np.asarray(np.sqrt(least**2 + variance))
-
-    def poses_in_base(self, x: Array) -> tuple[Array, Array]:
-        """Return R and t of the poses of groups in R_b, from the unknowns of all poses."""
-        steps = np.zeros((len(self.poses.R), 6))
-        free = np.arange(6) if self.machine.spatial else _IN_PLANE
-        steps[:, free >= 0] = x.reshape(len(steps), free.max() + 1)
-        numbers = np.unique(self.poses.pose[self.in_base])
-        return self.poses.stepped(steps, numbers[numbers >= 0])
+    def covariance(self, rows: IntArray) -> Array:
+        """Return the covariances (k, 8, 8) of some directions and of steps of their poses."""
+        found = np.zeros((len(rows), 8, 8))
+        found[:, :2, :2] = self.directions.covariance[rows, :2, :2]
+        found[:, 2:, 2:] = self.poses.covariance[self.poses.pose[rows]]
+        return found
 
 
-def _standing(leg: Leg, directions: LegDirections, i: int) -> Leg:
-    """Return a leg with its joint at A where one of the directions begins."""
-    axis = leg.base_axis
-    if axis is not None and leg.actuator is not None:
-        axis = directions.turn[i] @ axis
-    return replace(leg, A=directions.A[i], base_axis=axis, actuator=None)
+# Ends, offsets and poses together
 
 
-def _covariance_of_A(directions: LegDirections, base: JointsInBase) -> Array:
-    """Return the covariance of A of each leg in the frame of its group, (n, 3, 3) [m^2].
+def _ends_on_rays(
+    seen: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
+) -> tuple[_SeenLegs, tuple[Leg, ...], IntArray]:
+    """Return legs with B and offsets, and where the platform is, by (18), and what it shows.
 
-    Cameras that step 2 placed know A together; errors of their places are not counted.
+    These are unknowns. What it shows less of than the nominal model stays where (14) and (16) have
+    it.
     """
-    joints, leg = base.in_cameras, directions.leg
-    together = np.zeros((len(leg), 3, 3))
-    alone = _seen_covariance(joints, directions, directions.view)
-    for v, T in enumerate(base.T_Rb_camera):
-        if T is not None:
-            R, located = T.rotation.as_matrix(), joints.located[v, leg]
-            C = _seen_covariance(joints, directions, np.full(len(leg), v))[located]
-            together[located] += R @ np.linalg.inv(C) @ R.T
-    placed = np.array([T is not None for T in base.T_Rb_camera])
-    known = np.einsum("nii->n", together) > 0.0
-    together[known] = np.linalg.inv(together[known])
-    return np.where(placed[directions.view, None, None], together, alone)
+    machine, directions, poses = seen.machine, seen.directions, seen.poses
+    q0 = machine.offsets
+    rows = np.flatnonzero(
+        (poses.pose >= 0) & np.isfinite(q0[directions.leg]) & ~machine.on_platform[directions.leg]
+    )
+    pose, leg = poses.pose[rows], directions.leg[rows]
+    place = np.column_stack(
+        [unknowns.place[leg, LegColumns.LENGTH], unknowns.place[leg, LegColumns.B]]
+    )
+    wanted = np.unique(place[place >= 0])
+    renumbered = np.full(len(unknowns) + 1, -1)
+    renumbered[wanted] = np.arange(len(wanted))
+    steps = len(wanted) + np.arange(6 * len(poses.R)).reshape(-1, 6)
+    covariance = np.zeros((len(rows), 6, 6))
+    covariance[:, :3, :3], covariance[:, 3:, 3:] = (
+        directions.covariance[rows],
+        directions.of_A[rows],
+    )
+    observed = (
+        unknowns.known_B[leg],
+        poses.R[pose],
+        poses.t[pose],
+        seen.centre[rows],
+        across_rays(directions.ends(q0)[rows], seen.centre[rows]),
+        directions.columns[rows],
+    )
+    index = np.hstack([renumbered[place], steps[pose]])
+    term = Term(end_on_ray(), index, observed, covariance, n_printed=2)
+    x = unknowns.vector(legs)
+    start = np.concatenate([x[wanted], np.zeros(steps.size)])
+    name = "The platform joints and poses (eq 18)"
+    problem = LeastSquares(name, (term,), start, exact_hessian=True)
+    problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
+    found = solve_least_squares(problem, weighted=True)
+    x[wanted] = found.x[: len(wanted)]
+    legs = unknowns.legs(x, legs)
+    R, t = stepped_poses(poses.R, poses.t, found.x[steps])
+    poses = PlatformPoses(poses.pose, R, t, found.covariances(steps))
+    seen = replace(seen, machine=replace(machine, legs=legs), poses=poses)
+    return seen, legs, np.setdiff1d(wanted, held)
 
 
-def _seen_covariance(joints: JointsInCamera, directions: LegDirections, view: IntArray) -> Array:
-    """Return the covariance of A of each leg as views (n,) show it, (n, 3, 3) [m^2]."""
-    C = joints.covariance[view, directions.leg, :3, :3]
-    for here, carrier in joints.carried(view, directions.leg):
-        by_unknowns = carrier.at(directions.q[here])[1]
-        C[here] = by_unknowns @ carrier.covariance @ np.swapaxes(by_unknowns, 1, 2)
-    return C
+# Axes on the platform and passive ends
 
 
-def build_rigid_platform(rigid: RigidProblem) -> LeastSquares:
-    """Build the rigid criterion in standard deviations; the legs of ``rigid`` are the start.
+def _with_axis_and_end(seen: _SeenLegs, unknowns: Unknowns, j: int, leg: Leg) -> Leg:
+    """Return leg *j* with its axis on the platform, (7), and its end if it is passive, (19)."""
+    machine, directions, nominal = seen.machine, seen.directions, leg.platform_axis
+    name = machine.leg_names[j]
+    rows = np.flatnonzero((directions.leg == j) & (seen.poses.pose >= 0))
+    if nominal is not None and EquationKind.PLATFORM_AXIS in leg.equations:
+        leg = replace(leg, platform_axis=_revolute_axis(seen, name, rows, nominal))
+    elif nominal is not None and leg.is_fixed_to_platform:
+        u = np.einsum("nij,ni->nj", seen.poses.R[seen.poses.pose[rows]], directions.u[rows])
+        fixed = replace(leg, platform_axis=fixed_direction(name, u))
+        twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
+        leg = replace(fixed, twist=twist)
+    if leg.kind is LegKind.PASSIVE:
+        free = np.flatnonzero(unknowns.place[j, LegColumns.B] >= 0)
+        if j in machine.frame_legs and not leg.is_fixed_to_platform:
+            free = np.arange(3 if machine.spatial else 2)
+        leg = replace(leg, B=_passive_end(seen, name, rows, leg.B, free))
+    return leg
 
-    Axes in closed form from poses of noisy ends are further off than the nominal model. Raises
-    NotIdentifiable if no pose shows two legs at once.
+
+def _revolute_axis(seen: _SeenLegs, name: str, rows: IntArray, nominal: Array) -> Array:
+    """Return a revolute axis in R_e (3,) by (7), on the side of the nominal one.
+
+    Raises NotIdentifiable if the leg has fewer than two directions in the platform.
     """
-    directions, poses, machine = rigid.directions, rigid.poses, rigid.machine
-    q0, B = machine.offsets, machine.parameters.platform_joints
-    mean_offset = np.mean(q0[np.isfinite(q0)])
-    posed = np.flatnonzero(poses.pose >= 0)
-    # Groups without a pose: distances between ends are all they give.
-    alone = np.isfinite(q0[directions.leg]) & (poses.pose < 0)
-    pairs = np.array(
-        [
-            (a, b)
-            for rows in directions.groups()
-            for a, b in combinations(rows[alone[rows]].tolist(), 2)
-            if np.linalg.norm(B[directions.leg[a]] - B[directions.leg[b]]) > _APART * mean_offset
-        ],
-        dtype=np.intp,
-    ).reshape(-1, 2)
-    if not len(posed) and not len(pairs):
+    across, n = seen.across(rows), len(rows)
+    if not n or np.linalg.eigvalsh(across.scatter[0])[1] <= _SAME_DIRECTION * n:
+        found = f"one direction in {n} pose{'s' * (n != 1)}"
         raise NotIdentifiable(
-            "The platform joints could not be located: no pose shows two legs at once; needed "
-            "images of three or more; add images that show several legs at once."
+            f"The revolute axis of leg {name} on the platform could not be identified: found "
+            f"{found if n else 'no pose that shows its direction'} in the frame of the "
+            "platform, needed two different ones; add poses between which the leg turns about it."
         )
-    covariance = leg_end_covariance(directions, q0, rigid.sigma_q)
-    of_pairs = rigid.unknowns.place[directions.leg][pairs]
-    index = np.hstack(
-        [of_pairs[:, :, LegColumns.LENGTH], of_pairs[:, :, LegColumns.B].reshape(-1, 6)]
+    v, turns, _ = across.solve(weighted=seen.weighted)
+    axis = turned_axis(v[0], angles_of(turns[0]))
+    return axis if axis @ nominal > 0.0 else -axis
+
+
+def fixed_direction(name: str, u: Array) -> Array:
+    """Return the direction in R_e of a leg that is fixed to the platform: the mean of u (n, 3).
+
+    Raises NotIdentifiable if no pose shows it.
+    """
+    if not len(u):
+        raise NotIdentifiable(
+            f"The direction of leg {name} in the platform could not be identified: found no pose "
+            "that shows it together with three legs of known length, needed one; add images that "
+            "show several legs at once."
+        )
+    total = u.sum(axis=0)
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def _passive_end(
+    seen: _SeenLegs, name: str, rows: IntArray, B_nominal: Array, free: IntArray
+) -> Array:
+    """Return the platform joint centre (3,) of a passive leg: u x A B = 0 in all poses, eq (19).
+
+    Only the ``free`` coordinates of B are looked for: three; two in a plane, and on a leg that is
+    fixed to the platform, along which B may lie anywhere. Raises NotIdentifiable if the leg has too
+    few directions in the platform.
+    """
+    n, place, B = len(rows), np.full(3, -1), B_nominal.copy()
+    place[free] = np.arange(len(free))
+    pose, directions = seen.poses.pose[rows], seen.directions
+    observed = (
+        np.tile(np.where(place < 0, B, 0.0), (n, 1)),
+        seen.poses.R[pose],
+        seen.poses.t[pose],
+        directions.A[rows],
+        directions.u[rows],
+        directions.basis[rows],
     )
-    sigma = distance_sigma(leg_ends(directions, q0), covariance, pairs)
-    with_length = posed[np.isfinite(q0[directions.leg[posed]])]
-    sigma_length = float(np.hypot(rigid.sigma_q, _MIN_SIGMA_LENGTH * mean_offset))
-    observed = directions.u[posed], directions.basis[posed], whitener(directions.covariance[posed])
-    readings = (
-        directions.reading[with_length],
-        rigid.sigma(with_length, EquationKind.LENGTH, sigma_length),
+    term = Term(end_on_axis(), np.tile(place, (n, 1)), observed, seen.covariance(rows))
+    problem = LeastSquares(f"The end of leg {name} (eq 19)", (term,), B[free])
+    J = problem.jacobian(problem.start).toarray() if n else np.zeros((1, len(free)))
+    if np.linalg.eigvalsh(J.T @ J)[0] <= _SAME_DIRECTION * n:
+        raise NotIdentifiable(
+            f"The end of leg {name} on the platform could not be located: found "
+            f"{n} pose{'s' * (n != 1)} of the platform that show{'s' * (n == 1)} "
+            "it, with axes that do not meet in one point there; needed two different directions in "
+            "the platform, each seen together with three legs of known length (eq 19); add images "
+            "at poses that differ more."
+        )
+    B[free] = solve_least_squares(problem, weighted=seen.weighted).x
+    return B
+
+
+# Universal axes and twists
+
+
+def _close_legs(
+    seen: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
+) -> tuple[tuple[Leg, ...], tuple[str, ...]]:
+    """Identify universal axes and twists by the closure, what the poses leave open at nominal.
+
+    ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
+    """
+    twisting = np.array([leg.twist is not None for leg in unknowns.start])
+    known_axis = np.array([leg.platform_joint is not JointType.UNIVERSAL for leg in unknowns.start])
+    turns = unknowns.place[twisting, LegColumns.BASE_AXIS.start : LegColumns.OWN]
+    wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, LegColumns.PLATFORM_AXIS])
+    if not len(wanted):
+        return legs, ()
+    problem = _build_closure(seen, unknowns, wanted, legs)
+    if not problem.terms:
+        names = ", ".join(np.array(seen.machine.leg_names)[twisting])
+        return legs, (
+            f"Step 4 left the axes of leg {names} at nominal: no camera in R_b shows it.",
+        )
+    if not seen.weighted:  # axes that nothing determines would end anywhere
+        near = with_prior(problem, np.arange(len(wanted)))
+        problem = replace(problem, start=solve_least_squares(near).x)
+    problem, held = hold_at_nominal(
+        problem,
+        seen.machine,
+        unknowns,
+        weighted=seen.weighted,
+        wanted=wanted,
+        nominal=np.zeros(len(wanted)),
     )
-    terms = (
-        Term(_ends_and_joints(), index, (observed_legs(directions, pairs), sigma), robust=True),
-        Term(direction_of_leg(), rigid.index(posed), (*rigid.known(posed), *observed), robust=True),
-        Term(length_of_leg(), rigid.index(with_length), (*rigid.known(with_length), *readings)),
-        *_constraints(rigid, posed),
-    )
-    x = rigid.unknowns.vector(machine.legs)
-    steps = np.zeros((6 if machine.spatial else 3) * len(poses.R))
-    start = np.concatenate([x, steps])
-    return LeastSquares("The platform joints (step 4)", terms, start, n_shared=len(x))
+    x = solve_least_squares(problem, weighted=seen.weighted).x
+    left = left_near_nominal("Step 4", seen.machine, unknowns, held)
+    return _closed(unknowns, legs, wanted, x), left
 
 
-@cache
-def _ends_and_joints() -> ca.Function:
-    """Return (q0 and B of two legs; legs, sigma) -> distance observed less that of B, in sigmas."""
-    local, legs, sigma = ca.SX.sym("local", 8), ca.SX.sym("legs", 7, 2), ca.SX.sym("sigma")
-    residual = (distance_of_ends(local[:2], legs) - ca.norm_2(local[2:5] - local[5:])) / sigma
-    return ca.Function("ends", [local, legs, sigma], [residual])
-
-
-def _constraints(rigid: RigidProblem, rows: IntArray) -> list[Term]:
-    """Return the residuals of constraints of legs at unknown poses, in standard deviations."""
-    legs, unknowns, directions, terms = rigid.machine.legs, rigid.unknowns, rigid.directions, []
-    constrained: dict[tuple[EquationKind, JointType, JointType], list[int]] = {}
-    for j, leg in enumerate(legs):
-        for about in _OF_STEP_4.intersection(leg.equations):
-            constrained.setdefault((about, leg.base_joint, leg.platform_joint), []).append(j)
-    for kind, those in sorted(constrained.items()):
-        usable = rows[rigid.in_base[rows]] if kind[0] is EquationKind.TWIST else rows
-        here = usable[np.isin(rigid.directions.leg[usable], those)]
-        if not len(here):
+def _build_closure(
+    seen: _SeenLegs, unknowns: Unknowns, wanted: IntArray, legs: tuple[Leg, ...]
+) -> LeastSquares:
+    """Build the closure of all legs without an S joint: sin(angle - twist) = 0."""
+    renumbered = np.full(len(unknowns) + 1, -1, dtype=np.intp)
+    renumbered[wanted] = np.arange(len(wanted))
+    place, directions = renumbered[unknowns.place], seen.directions
+    shown = seen.in_base & (seen.poses.pose >= 0)
+    twisting = [(j, leg) for j, leg in enumerate(legs) if leg.twist is not None]
+    n_rows = int(np.sum(shown & np.isin(directions.leg, [j for j, _ in twisting])))
+    terms = []
+    for joints in dict.fromkeys((leg.base_joint, leg.platform_joint) for _, leg in twisting):
+        of_kind = [j for j, leg in twisting if (leg.base_joint, leg.platform_joint) == joints]
+        rows = np.flatnonzero(shown & np.isin(directions.leg, of_kind))
+        if not len(rows):
             continue
-        of_row = rigid.directions.leg[here]
-        observed = (
-            directions.turn[here] @ unknowns.base_frames[of_row],
-            unknowns.platform_frames[of_row],
-            np.array([leg.twist or 0.0 for leg in legs])[of_row],
-            rigid.sigma(here, kind[0], _MIN_SIGMA_CONSTRAINT),
+        leg = directions.leg[rows]
+        base, platform = (
+            axis_frames(np.array([getattr(legs[j], name) for j in leg], dtype=np.float64))
+            for name in ("base_axis", "platform_axis")
         )
-        index, known = rigid.index(here), rigid.known(here)
-        terms.append(Term(constraint_of_leg(*kind), index, (*known, *observed)))
-    return terms
+        observed = (
+            directions.u[rows],
+            directions.basis[rows],
+            seen.poses.R[seen.poses.pose[rows]],
+            directions.turn[rows] @ base,
+            platform,
+            np.array([float(legs[j].twist or 0.0) for j in leg]),
+            np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),
+        )
+        index = place[leg, LegColumns.BASE_AXIS.start : LegColumns.OWN]
+        terms.append(Term(closure_of_leg(*joints), index, observed, seen.covariance(rows)))
+    return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
+
+
+def _closed(
+    unknowns: Unknowns, legs: tuple[Leg, ...], wanted: IntArray, x: Array
+) -> tuple[Leg, ...]:
+    """Return legs with universal axes turned from the nominal ones, and twists changed."""
+    values = np.zeros(len(unknowns) + 1)
+    values[wanted] = x
+    found = []
+    for leg, own in zip(legs, values[unknowns.place], strict=True):
+        if leg.twist is not None and leg.base_axis is not None and leg.platform_axis is not None:
+            base, platform = (
+                turned_axis(axis, angles_of(own[columns]))
+                for axis, columns in (
+                    (leg.base_axis, LegColumns.BASE_AXIS),
+                    (leg.platform_axis, LegColumns.PLATFORM_AXIS),
+                )
+            )
+            twist = leg.twist + float(own[LegColumns.TWIST])
+            leg = replace(leg, base_axis=base, platform_axis=platform, twist=twist)
+        found.append(leg)
+    return tuple(found)
+
+
+def _in_own_frame(machine: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+    """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
+    frame = list(machine.frame_legs)
+    if all(legs[j].kind is not LegKind.PASSIVE for j in frame):
+        return legs
+    T = frame_on_points(np.array([legs[j].B for j in frame])).inv()
+    found = []
+    for j, leg in enumerate(legs):
+        B, axis = T.apply(leg.B), leg.platform_axis
+        if j in frame:  # coordinates that are zero by the choice of the frame
+            B[frame.index(j) : len(frame)] = 0.0
+        axis = None if axis is None else np.asarray(T.rotation.apply(axis))
+        found.append(replace(leg, B=B, platform_axis=axis, twist=twist_after(leg, T.rotation)))
+    return tuple(found)

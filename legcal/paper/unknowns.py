@@ -103,11 +103,6 @@ class Unknowns:
         return _frames([leg.base_axis for leg in self.start])
 
     @cached_property
-    def platform_frames(self) -> Array:
-        """The same of axes at the platform."""
-        return _frames([leg.platform_axis for leg in self.start])
-
-    @cached_property
     def actuator_frames(self) -> Array:
         """The same of the axes of actuators."""
         return _frames([None if leg.actuator is None else leg.actuator.axis for leg in self.start])

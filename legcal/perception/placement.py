@@ -8,6 +8,7 @@ again is measuring with a better placement.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -161,7 +162,8 @@ class Placement:
     pixel_error: float = PIXEL_ERROR  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
-    shift: Array = field(default_factory=lambda: np.zeros(0))  # (n_views, n_legs, 2, 3), see below
+    # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
+    moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
@@ -171,10 +173,12 @@ class Placement:
     # by the legs that have them as parts; looked for once cameras are placed
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if len(self.shift) == 0:  # of A and B in each view against the nominal model [m]
-            zeros = np.zeros((len(self.T_base_camera), self.A_base.shape[1], 2, 3))
-            object.__setattr__(self, "shift", zeros)
+    @cached_property
+    def shift(self) -> Array:
+        """How far A and B are in each view from the nominal model, (n_views, n_legs, 2, 3) [m]."""
+        if self.moved is None:
+            return np.zeros((len(self.T_base_camera), self.A_base.shape[1], 2, 3))
+        return self.moved
 
     @classmethod
     def of_fit(
@@ -193,7 +197,7 @@ class Placement:
         """Return joint centres where views see them, (n_views, n_legs, 2, 3) from the model [m]."""
         of_row = shift[search.measurements.view]
         A, B = search.A_base + of_row[:, :, 0], search.B_base + of_row[:, :, 1]
-        return replace(self, A_base=A, B_base=B, shift=shift)
+        return replace(self, A_base=A, B_base=B, moved=shift)
 
     def require_one(self) -> None:
         """Raise NotVisible, one sentence for each view, if no view could be placed."""

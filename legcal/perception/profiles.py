@@ -21,7 +21,7 @@ SATURATED = 250.0  # grey level from which a pixel is saturated
 MAX_NOISY = 4  # saturated pixels of a block that may be noise
 MAX_OFFSET = 1.0  # how far an outline may be from where it was found [px]
 MIN_SHARE_CLIPPED = 0.5  # share of saturated pixels with which a background is clipped
-MAX_ROWS = 4096  # along one outline
+MAX_ROWS = 512  # along one outline
 TAPER = 1.0  # over which pixels come to count where the used range begins [px]
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 

@@ -1,14 +1,13 @@
-"""What a plan is to make small: errors of the platform over the workspace, or of parameters.
+"""The criterion of a plan: the mean error of the platform over the workspace.
 
-Errors of the platform are those of all its joints at the poses that stand for the workspace: the
-root mean square distance by which the covariance of the machine moves them.
+It is the root mean square distance by which the covariance of the machine moves all joints of the
+platform, over the poses that stand for the workspace. Where readings do not give the pose of the
+platform, the criterion is the determinant of the covariance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
@@ -18,23 +17,13 @@ from legcal.calibration.joint_fit.platform import (
     platform_by_parameters,
 )
 from legcal.calibration.joint_fit.variables import FittedLegs
-from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.files.schema import closest
+from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.configurations import workspace
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.model import Machine
 from legcal.planning.exchange import Criterion
-
-
-class Goal(StrEnum):
-    """The quantity that a plan minimises."""
-
-    MEAN = "mean"  # error of the platform, mean over the workspace
-    WORST = "worst"  # the same where it is largest
-    D_OPTIMAL = "d"  # determinant of the covariance of all parameters
-    PARAMETERS = "parameters"  # sigma of named parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,42 +54,18 @@ def workspace_of(machine: Machine, legs: FittedLegs) -> Workspace | None:
 
 
 def criterion_of(
-    goal: Goal,
     work: Workspace | None,
     legs: FittedLegs,
     basis: Array,  # (n_parameters, p)
-    named: Sequence[str] = (),
 ) -> Criterion:
-    """Return the criterion of a goal: of covariances (n, p, p), by their own unit.
-
-    Raises UsageError if the goal is not one of this machine.
-    """
-    units, names = legs.parametrization.units, legs.parametrization.names
-    length = float(np.mean([np.linalg.norm(leg.B) + leg.q0 for leg in legs.nominal]))
-    unit = np.array([1.0 if unit == "m" else length for unit in units])
-    if goal in (Goal.MEAN, Goal.WORST):
-        if work is None:
-            raise UsageError(
-                "The plan could not minimise the error of the platform: found a machine of which "
-                "readings do not give the pose, needed --criterion d or parameters; choose one."
-            )
+    """Return the criterion: of covariances (n, p, p) in the coordinates of a basis."""
+    if work is not None:
         moves = np.concatenate(list(np.moveaxis(work.joints, 1, 0)), axis=1) @ basis
         weights = np.einsum("wri,wrj->wij", moves, moves) / work.joints.shape[1]
-        if goal is Goal.MEAN:
-            mean = weights.mean(axis=0)
-            return lambda S: np.sqrt(np.maximum(np.einsum("ij,nij->n", mean, S), 0.0))
-        return lambda S: np.sqrt(np.maximum(np.einsum("wij,nij->nw", weights, S).max(axis=1), 0.0))
-    if goal is Goal.PARAMETERS:
-        unknown = [name for name in named if name not in names]
-        if unknown or not named:
-            found = f"'{unknown[0]}'" if unknown else "no name"
-            hint = closest(unknown[0], names) if unknown else f"name one, such as {names[0]}."
-            raise UsageError(
-                f"The plan could not minimise the sigma of parameters: found {found}, needed names "
-                f"of parameters of the machine; {hint}"
-            )
-        rows = (basis * unit[:, None])[[names.index(name) for name in named]]
-        return lambda S: np.sqrt(np.einsum("ri,nij,rj->n", rows, S, rows) / len(rows))
+        mean = weights.mean(axis=0)
+        return lambda S: np.sqrt(np.maximum(np.einsum("ij,nij->n", mean, S), 0.0))
+    length = float(np.mean([np.linalg.norm(leg.B) + leg.q0 for leg in legs.nominal]))
+    unit = np.array([1.0 if unit == "m" else length for unit in legs.parametrization.units])
     p = basis.shape[1]
     scale = float(np.linalg.slogdet(basis.T @ np.diag(unit**2) @ basis)[1])
     return lambda S: np.exp((np.linalg.slogdet(S)[1] + scale) / (2.0 * p))

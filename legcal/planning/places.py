@@ -10,18 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible, UsageError
-from legcal.files.motions import MotionEntry, Quaternion, Vector
 from legcal.files.quantity import LENGTH, parse_quantity
-from legcal.files.reading import read_json
-from legcal.files.schema import FileSchema, PlainName, read_yaml, validate
 from legcal.geometry.lines import direction_above
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
@@ -81,41 +75,12 @@ class Setting:
 USUAL = Setting()
 
 
-class PlaceEntry(FileSchema):
-    """A place of a tripod; without an orientation the camera looks at the machine."""
-
-    xyz: Vector
-    quat_xyzw: Quaternion | None = None
-
-
-class PlacesEntry(FileSchema):
-    """A file of places of tripods."""
-
-    places: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
-
-
-class ViewEntry(FileSchema):
-    """Where a camera of another file stands; what else is said of it does not matter."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    T_base_camera: MotionEntry
-
-
-class ViewsEntry(FileSchema):
-    """A file that has views: of cameras to simulate, a dataset, a result, a plan."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    views: Annotated[dict[PlainName, ViewEntry], Field(min_length=1)]
-
-
 @dataclass(frozen=True, eq=False)
 class Place:
     """A place of a camera."""
 
     T_base_camera: RigidTransform
-    name: str = ""  # that of a list
+    name: str = ""  # of a tripod that stands somewhere
     fixed: bool = False  # it is not moved any more
 
     def is_inside(self, bounds: Array | None) -> bool:
@@ -124,37 +89,6 @@ class Place:
             return True
         x = self.T_base_camera.translation
         return bool(np.all((x >= bounds[:, 0] - _ROUNDING) & (x <= bounds[:, 1] + _ROUNDING)))
-
-
-def read_places(path: Path, machine: Machine) -> list[Place]:
-    """Return the places of a list; without an orientation cameras look at the machine at home.
-
-    In place of a list, those of the views of any file that has some.
-    """
-    document = _document(path)
-    if "views" in document and "places" not in document:
-        views = validate(ViewsEntry, document, path).views
-        return [Place(v.T_base_camera.motion(), name, fixed=True) for name, v in views.items()]
-    entry = validate(PlacesEntry, document, path)
-    points, found = all_points(machine, [machine.home]), []
-    for name, place in entry.places.items():
-        position = np.array(place.xyz)
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        T = look_at(position, middle)
-        if place.quat_xyzw is not None:
-            turned = Rotation.from_quat(place.quat_xyzw)
-            T = RigidTransform.from_components(position, turned)
-        found.append(Place(T, name, fixed=True))
-    return found
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """Return what a YAML or JSON file holds."""
-    try:
-        found = read_json(path)  # a result is JSON, and long
-    except (OSError, ValueError):
-        found = None
-    return found if isinstance(found, dict) else read_yaml(path, "places file")
 
 
 def places_around(
@@ -176,7 +110,7 @@ def places_around(
             f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
             f"of it in the picture, tripods set to {1e2 * setting.shift:g} cm and "
             f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
-            "correct the focal length in its file, or name --places."
+            "correct the focal length in its file."
         )
     if bounds is None:
         return found

@@ -18,7 +18,6 @@ from legcal.files.schema import Document, Number, Version
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
-from legcal.planning.goals import Goal
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, MAX_LENGTH, Setting
@@ -66,10 +65,9 @@ class Plan:
         The camera that was planned with.
     views : tuple of PlannedView
         Camera places, each with its poses. Of a camera in the hand every image is a view.
-    goal : Goal
-        What was made small.
     value : float
-        The criterion of the session as planned [m; the determinant's root without a unit].
+        The criterion of the session as planned: the mean error of the platform over the workspace
+        [m], or where readings do not give its pose, the determinant's root.
     error : PlatformError or None
         Expected error of the platform over the workspace, one standard deviation: the root mean
         square over the draws; None where readings do not give its pose.
@@ -87,7 +85,6 @@ class Plan:
     setting: Setting
     noise: PredictedNoise
     sigma_q: float  # [m] of a reading of a motor that slides
-    goal: Goal
     views: tuple[PlannedView, ...]
     value: float
     error: PlatformError | None
@@ -120,11 +117,10 @@ class Plan:
         if self.error is None:
             return "The error of the platform is not predicted: readings do not give its pose."
         beside = f" beside those of {self.given}" if self.given else ""
-        most = f", at most {1e3 * self.error.max_displacement:.3f} mm" * (self.goal is Goal.WORST)
         return (
             f"Expected of {self.n_images} photographs{beside}: predicted error "
             f"{1e3 * self.error.mean_displacement:.3f} mm / "
-            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace{most}, "
+            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace, "
             f"the mean of {self.setting.draws} sessions with tripods up to "
             f"{1e2 * self.setting.shift:g} cm and {np.degrees(self.setting.turn):g} deg off and "
             f"the machine {1e3 * self.setting.length:g} mm."
@@ -148,7 +144,7 @@ class Plan:
             mechanism=self.machine.name,
             images=self.n_images,
             seed=self.seed,
-            criterion=self.goal.value,
+            criterion="d" if error is None else "mean",
             value=self.value,
             expected=expected,
             tolerance=Tolerance(
@@ -248,7 +244,7 @@ class PlanDocument(Document):
     mechanism: str
     images: int
     seed: int
-    criterion: Literal["mean", "worst", "d", "parameters"]
+    criterion: Literal["mean", "worst", "d", "parameters"]  # two of them from earlier versions
     value: Number  # of the criterion [m; the determinant's root without a unit]
     expected: ExpectedError | None  # None where readings do not give the pose of the platform
     tolerance: Tolerance

@@ -18,7 +18,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
@@ -26,7 +25,7 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
-from legcal.planning.goals import Goal, Workspace, criterion_of, workspace_of
+from legcal.planning.goals import Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
 from legcal.planning.laid_board import LaidBoard, lying
 from legcal.planning.order import in_short_order, ways
@@ -71,13 +70,11 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The planning task: machine, numbers of images and views, goal."""
+    """The planning task: machine, numbers of images and views, conditions."""
 
     predictor: Predictor
     n_images: int
     n_views: int
-    goal: Goal = Goal.MEAN
-    named: tuple[str, ...] = ()  # parameters
     setting: Setting = USUAL
     bounds: Array | None = None  # (3, 2) of cameras in the base link [m]
     places: tuple[Place, ...] = ()  # in place of those around the machine
@@ -232,7 +229,7 @@ def plan_session(
         [found for found in before if found is not None],
         work,
         basis,
-        criterion_of(task.goal, work, legs, basis, task.named),
+        criterion_of(work, legs, basis),
         rng,
         progress,
         stop,
@@ -305,7 +302,7 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
         raise NotVisible(
             f"{task.machine.yaml_path}: no session could be planned: found no place of the board "
             "flat on the base that a camera sees beside the legs wherever it is set, needed one; "
-            "use another board, higher --places, wider --bounds, or a camera with a wider view."
+            "use another board, wider --bounds, or a camera with a wider view."
         )
     return best
 
@@ -624,14 +621,10 @@ class _Search:
                 f"No free way was found to {blocked} of the poses, not even by home: lead the "
                 "machine there by hand, away from singularities and collisions."
             )
-        if task.goal in (Goal.MEAN, Goal.WORST) and not machine.is_determined:
+        if not machine.is_determined:
             notes.append(f"Readings do not give the pose: {machine.undetermined}.")
         parametrization = predictor.legs.parametrization
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-        for name in task.named:
-            i = parametrization.names.index(name)
-            size, unit = SHOWN_IN[parametrization.units[i]]
-            notes.append(f"{name}: {size * sigma[i]:.4f} {unit} expected (1 sigma).")
         return Plan(
             machine=machine,
             camera=predictor.camera,
@@ -639,7 +632,6 @@ class _Search:
             noise=predictor.noise,
             sigma_q=predictor.sigma_q,
             sigma_by_joint=predictor.sigma_by_joint,
-            goal=task.goal,
             views=_named(views, task),
             value=value,
             error=None if self.work is None else self.work.error(covariance),

@@ -51,7 +51,7 @@ def candidate_poses(
     if len(found) < max(_MIN_SHARE * n, 1):
         remedies = [
             "check legcal.home and the limits of the joints",
-            "say with --model-error that it is known better",
+            "plan with a smaller length in Setting (in Python), if it is known better",
         ]
         if setting.length > USUAL.length:
             remedies.reverse()

@@ -17,7 +17,6 @@ from legcal.machine.feasibility import poses_at
 from legcal.machine.kinematics import follow_each
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.planning.goals import Goal
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
 from legcal.planning.noise import read_noise
 from legcal.planning.places import (
@@ -27,7 +26,6 @@ from legcal.planning.places import (
     USUAL,
     Place,
     Setting,
-    read_places,
 )
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
@@ -56,13 +54,11 @@ def plan(
     images_per_view: int | None = None,
     cameras: int | None = None,
     target: float | None = None,
-    criterion: Goal | str = Goal.MEAN,
-    parameters: Sequence[str] = (),
     camera: str | Path | Camera | None = None,
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
     encoder_sigma: float | str | None = None,
     bounds: Array | None = None,
-    places: str | Path | None = None,
+    places: Sequence[Place] = (),
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
     hand_held: bool = False,
@@ -85,11 +81,6 @@ def plan(
     target : float, optional
         Expected error of the platform, mean over the workspace [m]: the fewest images that reach
         it, in place of a number of images.
-    criterion : Goal or str
-        What is made small: ``mean`` or ``worst`` error of the platform over the workspace, ``d``
-        (determinant of the covariance of all parameters), or sigma of ``parameters``.
-    parameters : sequence of str
-        Names of parameters, for that criterion.
     camera : path or Camera, optional
         The camera, or its file; 1024 x 768 pixels and 43 degrees wide by default, or that of the
         dataset that is given.
@@ -101,8 +92,8 @@ def plan(
         0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
     bounds : (3, 2) array, optional
         Lowest and highest x, y, z of cameras in the base link [m].
-    places : path, optional
-        A file of places of tripods, from which cameras are chosen.
+    places : sequence of Place
+        Tripods with their names, to choose from in place of those around the machine.
     given : path or Dataset, optional
         What was shot already; the plan says what to add.
     board : str, path or Board, optional
@@ -139,10 +130,10 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    listed = () if places is None else tuple(read_places(Path(places), machine))
+    listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
-    _check(criterion, parameters, target, bounds, listed, board, hand_held, setting, seed)
+    _check(target, bounds, listed, board, hand_held, setting, seed)
     shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
     before = () if shot is None else _given(machine, shot)
     if camera is None:
@@ -163,8 +154,6 @@ def plan(
         Predictor(machine, chosen, errors, sigma_q, lengths, sigma_by_joint),
         n_images,
         n_views,
-        Goal(criterion),
-        tuple(parameters),
         setting,
         bounds,
         listed,
@@ -309,8 +298,6 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
 
 
 def _check(
-    criterion: str,
-    parameters: Sequence[str],
     target: float | None,
     bounds: Array | None,
     places: Sequence[Place],
@@ -321,26 +308,12 @@ def _check(
 ) -> None:
     """Refuse what contradicts itself."""
     start, problems = "The plan could not be made: found", []
-    if criterion not in list(Goal):
-        problems.append(
-            f"{start} the criterion '{criterion}', needed {', '.join(Goal)}; choose one."
-        )
-    if parameters and criterion != Goal.PARAMETERS:
-        problems.append(
-            f"{start} parameters to know well and the criterion '{criterion}', which does not look "
-            "at them, needed --criterion parameters; give it, or leave out --parameter."
-        )
     if seed < 0:
         problems.append(f"{start} {seed} as the seed, needed 0 or more; correct --seed.")
     if target is not None and not 0.0 < target < 1.0:
         problems.append(
             f"{start} a target of {target:g} m, needed more than 0 and less than 1 m; correct "
             "--target."
-        )
-    if target is not None and criterion != Goal.MEAN:
-        problems.append(
-            f"{start} a target and the criterion '{criterion}', needed the mean error of the "
-            "platform, which the target is about; leave out --criterion."
         )
     if bounds is not None and places:
         problems.append(
@@ -351,15 +324,15 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    for what, size, most, unit, remedy in (
-        ("a model error of", setting.length, MAX_LENGTH, "m", "correct --model-error"),
-        ("axes off by", setting.angle, MAX_ANGLE, "rad", "correct the setting"),
-        ("cameras off by", setting.shift, MAX_LENGTH, "m", "correct the setting"),
-        ("cameras turned by", setting.turn, MAX_ANGLE, "rad", "correct the setting"),
+    for what, size, most, unit in (
+        ("a model error of", setting.length, MAX_LENGTH, "m"),
+        ("axes off by", setting.angle, MAX_ANGLE, "rad"),
+        ("cameras off by", setting.shift, MAX_LENGTH, "m"),
+        ("cameras turned by", setting.turn, MAX_ANGLE, "rad"),
     ):
         if not 0.0 <= size <= most:
             problems.append(
-                f"{start} {what} {size:g} {unit}, needed 0 to {most:g} {unit}; {remedy}."
+                f"{start} {what} {size:g} {unit}, needed 0 to {most:g} {unit}; correct the setting."
             )
     if not 1 <= setting.draws <= MAX_DRAWS:
         problems.append(

@@ -42,20 +42,14 @@ HAND = "hand"  # the view of a camera in the hand
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 
 
-def check_session(output: str | Path, *, force: bool = False) -> Path:
+def check_session(output: str | Path) -> Path:
     """Return the folder of a session; refuse one that holds anything that must not be replaced."""
     destination = output_path(output, PLANNED)
     check_destination(destination, PLANNED)
-    if destination.is_dir() and holds_files(destination) and not force:
+    if destination.is_dir() and holds_files(destination):
         raise UsageError(
             f"{destination}: the session could not be written: found an earlier session, needed a "
-            "new or empty folder; give another folder, or replace it with --force (in Python: "
-            "force=True)."
-        )
-    if (destination / "images").exists():
-        raise UsageError(
-            f"{destination}: the session could not be written: found photographs there, needed a "
-            "folder without any; they belong to the earlier plan: give another folder."
+            "new or empty folder; give another folder, or remove that one."
         )
     return destination
 
@@ -64,14 +58,13 @@ def write_session(
     plan: Plan,
     output: str | Path,
     *,
-    force: bool = False,
     pictures: Mapping[str, str | bytes] | None = None,
 ) -> list[Path]:
     """Write the folder of a session, complete or not at all, and return its files.
 
     *pictures* are further files by their names: drawings and pages.
     """
-    destination = check_session(output, force=force)
+    destination = check_session(output)
     with result_folder(destination, PLANNED) as folder:
         yaml_path, _ = write_model(plan.machine, folder)
         texts = {

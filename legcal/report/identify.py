@@ -31,17 +31,10 @@ CONDITIONS = {
     "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
-_STEPS = {
-    "joints_in_cameras": "1 joints in the cameras (6, 7)",
-    "base_joints": "2 base joints and axes (9)",
-    "offsets": "3 offsets and lengths (14)",
-    "platform_joints": "4 platform joints, axes (16-19)",
-}
 _LEGEND = (
-    "as printed: the rank with the equations of the paper as it prints them; "
-    "known length law: a leg with a reading (length = reading + offset), or constant"
+    "known length law: a leg with a reading (length = reading + offset), or of constant length"
 )
-_NEEDS = {"staged": "the four steps", "full": "the joint fit"}
+_NEEDS = {"full": "the joint fit"}
 _MAX_WEAK = 6  # directions shown
 _MAX_MENDED = 3
 _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
@@ -49,15 +42,11 @@ _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 def identify_table(report: Identifiability) -> RenderableType:
     """Return an identifiability report as people read it, on 80 columns."""
-    weak = [("step by step", report.staged), ("by the joint fit", report.full)]
-    if _directions(report.staged) == _directions(report.full):
-        weak = [("step by step or by the joint fit", report.full)]
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
-        _conditions(report),
-        [_ranks(report), Text(_LEGEND, style="dim")],
-        *(_weak(title, ranks) if ranks.weak else None for title, ranks in weak),
+        [_conditions(report), Text(_LEGEND, style="dim")],
+        _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
         _scale(report) if report.scale else None,
         [*_boards(report), *(_intrinsics(one) for one in report.intrinsics)],
@@ -116,30 +105,12 @@ def _conditions(report: Identifiability) -> Table:
     return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
 
 
-def _ranks(report: Identifiability) -> Table:
-    """Return the ranks of the steps and of the joint fit."""
-    by_name = {(s.name, s.criteria): s for s in report.steps}
-    rows = []
-    for name, title in _STEPS.items():
-        default, printed = by_name[name, "default"], by_name[name, "literal"]
-        other = f"{printed.rank} of {printed.of}"
-        rows.append((title, str(default.rank), str(default.of), other))
-    for title, ranks in (("the four steps", report.staged), ("the joint fit", report.full)):
-        rows.append((title, str(ranks.rank), str(ranks.of), ""))
-    return table("rank of the equations", ">rank", ">of", "as printed", rows=rows)
-
-
-def _weak(title: str, ranks: Ranks) -> Table:
+def _weak(ranks: Ranks) -> Table:
     """Return the directions that are not determined."""
     rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
     if len(ranks.weak) > _MAX_WEAK:
         rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
-    return table(f"not determined {title}", ">hides [mm]", ">[deg]", rows=rows)
-
-
-def _directions(ranks: Ranks) -> list[str]:
-    """Return the directions that are not determined."""
-    return [weak.direction for weak in ranks.weak]
+    return table("not determined", ">hides [mm]", ">[deg]", rows=rows)
 
 
 def _hidden(weak: WeakDirection) -> tuple[str, str]:
@@ -187,7 +158,7 @@ def _board(board: BoardReport, of: int, link: Link) -> str:
     subject = f"The calibration board on the {link}" if board.present else "A calibration board"
     before, after = board.without, board.with_board
     if not board.needed_for and before == after:
-        return f"{subject} is not needed: the ranks are the same without it."
+        return f"{subject} is not needed: the rank is the same without it."
     verb = "raises" if board.present else f"on the {link} would raise"
     text = f"{subject} {verb}"
     if board.needed_for:
@@ -196,10 +167,7 @@ def _board(board: BoardReport, of: int, link: Link) -> str:
         )
         where = "" if board.present else f" on the {link}"
         text = f"{subject}{where} is needed for {needed}; it raises"
-    text += (
-        f" the ranks from {before.staged_rank} to {after.staged_rank} of {of} step by step, and "
-        f"from {before.full_rank} to {after.full_rank} in the joint fit"
-    )
+    text += f" the rank from {before.full_rank} to {after.full_rank} of {of}"
     if not board.mends:
         return f"{text}."
     shown = list(board.mends[:_MAX_MENDED])
@@ -225,31 +193,31 @@ def _remedies(report: Identifiability) -> Table:
     rows = [
         (
             r.remedy,
-            f"{r.staged_rank}/{of}",
             f"{r.full_rank}/{of}",
             "enough" if r.enough else "helps",
         )
         for r in report.remedies
     ]
-    return table("remedy", ">steps", ">joint fit", "", rows=rows)
+    return table("remedy", ">rank", "", rows=rows)
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
     """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in report.full.weak)
+    determined = f"the joint fit determines {report.full.rank} of {report.full.of} parameters"
     lines: list[str | RenderableType] = []
     if report.identifiable:
-        rest = f", but for {harmless} directions that do not move the platform" if harmless else ""
-        lines.append(f"Identifiable: the joint fit determines all parameters{rest}.")
+        rest = (
+            f"; {harmless} directions that stay open do not move the platform" if harmless else ""
+        )
+        lines.append(f"Identifiable: {determined}{rest}.")
         if report.scale:
             lines.append(
                 "But for the scale: calibrate refuses this machine until a length or radii are "
                 "stated (--length, --set), or a board is seen."
             )
-        if not report.staged.complete:
-            lines.append("The steps alone do not: calibration starts from the nominal model.")
     else:
-        lines.append(Text("NOT identifiable: see what is not determined.", style="bold"))
+        lines.append(Text(f"NOT identifiable: {determined}.", style="bold"))
     if report.platform_sigma is not None:
         sigma = report.platform_sigma
         expected = (
@@ -265,8 +233,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
                     f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "
                     f"largest part of it; better is {', or '.join(ways)}."
                 )
-    weak = (*report.staged.weak, *report.full.weak)
-    if any(direction.dX_m is not None and not direction.harmless for direction in weak):
+    if any(weak.dX_m is not None and not weak.harmless for weak in report.full.weak):
         hidden = "The platform error of a direction is that for 1 mm in its largest component."
         lines.append(Text(hidden, style="dim"))
     failed = [CONDITIONS[c.name] for c in report.conditions if c.fails]

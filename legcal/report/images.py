@@ -1,4 +1,4 @@
-"""What people read of images: a calibrated camera, outlines of legs, a simulated dataset."""
+"""What people read of images: a calibrated camera, a simulated dataset."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
-from legcal.calibration.detection import DETECTION_PAGE, Detection
-from legcal.data.reasons import reason_in_words
 from legcal.report.render import heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
@@ -65,44 +63,6 @@ def _model_and_sheet(found: CameraCalibration) -> str:
     return (
         f"Lens model {found.lens}{unseen}. The board is bent by {bend:.2g} +- {sigma:.2g} mm, and "
         f"printed {wider:+.2g} +- {open_to:.2g} % wider than high."
-    )
-
-
-def detection_table(found: Detection, output: Path) -> RenderableType:
-    """Return the figures of ``detect``, and where they were written."""
-    document = found.document
-    views, rejected = document["views"], Counter[str]()
-    for view in views.values():
-        rejected.update(view["rejected"])
-    shown = (("contrast", 0, ""), ("length", 0, " px"), ("residual", 2, " px"))
-    rows = [
-        (
-            name,
-            str(view["images"]),
-            f"{view['legs_found']}/{view['legs_visible']}",
-            f"{view['used']}/{view['outlines']}",
-            *(
-                "-" if view[key] is None else f"{view[key]:.{digits}f}{unit}"
-                for key, digits, unit in shown
-            ),
-        )
-        for name, view in views.items()
-    ]
-    numbers = ("images", "legs found", "outlines used", *(key for key, _, _ in shown))
-    reasons = ", ".join(f"{n} {reason_in_words(why)}" for why, n in rejected.most_common())
-    return report(
-        heading(
-            document["mechanism"],
-            f": {document['used']} of {document['outlines']} outlines used in "
-            f"{document['images']} images",
-        ),
-        table("view", *(f">{name}" for name in numbers), rows=rows),
-        f"Not used: {reasons}." if reasons else None,
-        [
-            *(Text(view["problem"], style="red") for view in views.values() if view["problem"]),
-            *(Text(f"note: {note}", style="dim") for note in document["notes"]),
-            f"Look at {output / DETECTION_PAGE}.",
-        ],
     )
 
 

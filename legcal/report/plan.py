@@ -88,7 +88,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         ),
         table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
         table(
-            ">images", f">expected, {plan.goal.value}", rows=growth,
+            ">images", ">expected", rows=growth,
             title="With other numbers of images",
         ),
         [plan.sentence, *map(printable, plan.notes)],
@@ -125,10 +125,9 @@ def _told(plan: Plan) -> list[tuple[float, float]]:
 def _scaled(plan: Plan, value: float) -> tuple[float, str]:
     """Return what is expected where the criterion has another value, and its unit."""
     ratio = value / plan.value
-    if plan.error is None or plan.goal not in ("mean", "worst"):
+    if plan.error is None:
         return ratio, "of that planned"
-    error, is_worst = plan.error, plan.goal == "worst"
-    return 1e3 * ratio * (error.max_displacement if is_worst else error.mean_displacement), "mm"
+    return 1e3 * ratio * plan.error.mean_displacement, "mm"
 
 
 def _shown(plan: Plan, value: float) -> str:
@@ -360,7 +359,7 @@ def _draw_growth(plan: Plan) -> Figure:
     least = 1 if plan.given else min(_LEAST, plan.n_images)
     known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)
     scale, unit = _scaled(plan, 1.0)
-    what = f"expected, {plan.goal.value}" if unit == "mm" else f"criterion: {plan.goal.value}"
+    what = "expected error of the platform" if unit == "mm" else "determinant's root"
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):

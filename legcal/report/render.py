@@ -8,7 +8,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.errors import escaped
+from legcal.errors import escaped, printable
+from legcal.pages import document
 
 Cells = Sequence[str | Text]
 
@@ -51,6 +52,16 @@ def table(
     for row in rows:
         found.add_row(*map(shown, row))
     return found
+
+
+def text_table(found: document.Table) -> Table:
+    """Return a table of a page as text; nothing is a dash."""
+    rows = [[cell if isinstance(cell, str) else cell.text for cell in row] for row in found.rows]
+    return table(
+        *found.columns,
+        rows=[[printable(text) or "-" for text in row] for row in rows],
+        title=found.title,
+    )
 
 
 def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None) -> Group:

@@ -12,8 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.image_tables import inverse
-from legcal.data.measurements import INCH, few, readings_of_lengths, row_names
-from legcal.files.quantity import LENGTH
+from legcal.data.measurements import few, row_names
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.kinematics import follow_poses
 from legcal.machine.leg import Leg
@@ -25,7 +24,7 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
 _FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
 _FOCAL_STEP = 1.25  # between them, about
-_SHIFTS = (1, -1, 2, -2)  # rows
+_LATE = {1: "late", -1: "early"}  # by how many rows readings are moved back
 _ZEROS = 8  # steps of the zero of an encoder, in its travel
 _STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
 _SAME_END = 0.01  # of the largest reading: ends of a travel as far from zero
@@ -162,7 +161,7 @@ def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake
         *_of_directions(encoders),
         *_of_zeros(encoders),
         *_of_images(data, given),
-        *_of_model(data, given),
+        *_of_model(given),
         *_of_radii(given),
         *_of_cameras(given),
     ]
@@ -221,9 +220,9 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 
 
 def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
-    """Return readings of a view that stand k rows late from its first-th one on in the file.
+    """Return readings of a view that stand a row late (k = 1) or early (-1) from a row on.
 
-    The last ones, whose own are not known, are left as they are.
+    That is its first-th one in the file. The last ones, whose own are not known, stay as they are.
     """
     rows = rows_of_views(data)[v][first:]
     q = given.q.copy()
@@ -232,9 +231,9 @@ def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: in
     where = row_names(data.dataset.measurements)[row]
     return Mistake(
         "readings shifted",
-        f"the readings of view {name} look as if they stood {_rows_late(k)} from {where} on, as if "
-        + ("an image were missing there" if k > 0 else "a row of readings were missing there"),
-        f"with the readings moved by {_rows(k)}",
+        f"the readings of view {name} look as if they stood 1 row too {_LATE[k]} from {where} on, "
+        f"as if {'an image' if k > 0 else 'a row of readings'} were missing there",
+        "with the readings moved by 1 row",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -250,22 +249,14 @@ def rows_of_views(data: OrderedDataset) -> list[IntArray]:
     ]
 
 
-def _rows(k: int) -> str:
-    return f"{abs(k)} row{'s' * (abs(k) > 1)}"
-
-
-def _rows_late(k: int) -> str:
-    return f"{_rows(k)} too {'early' if k < 0 else 'late'}"
-
-
 def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings of other images: shifted by rows, views exchanged."""
+    """Yield readings of other images: shifted by a row, in all views or in one."""
     of_view = rows_of_views(data)
     names = [one.name for one in data.measurements.views]
     every = [rows for rows in of_view if len(rows)]
 
     def moved(which: Sequence[IntArray], k: int, view: str = "") -> Iterator[Mistake]:
-        if any(len(rows) <= abs(k) + 1 for rows in which):
+        if any(len(rows) <= 2 for rows in which):
             return
         q = given.q.copy()
         for rows in which:
@@ -273,32 +264,20 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         where = f" of view {view}" if view else ""
         yield Mistake(
             "readings shifted",
-            f"the readings{where} look as if they stood {_rows_late(k)}: each image has those of "
-            "another",
-            f"with the readings moved by {_rows(k)}",
+            f"the readings{where} look as if they stood 1 row too {_LATE[k]}: each image has those "
+            "of another",
+            "with the readings moved by 1 row",
             "check which image belongs to which row",
             replace(given, q=q),
             amount_of=f"rows{where}",
         )
 
-    for k in _SHIFTS:
+    for k in _LATE:
         yield from moved(every, k)
     for v, rows in enumerate(of_view):
         if len(every) > 1:
-            for k in _SHIFTS[:2]:
+            for k in _LATE:
                 yield from moved([rows], k, names[v])
-    for a, b in combinations(range(len(of_view)), 2):
-        if len(of_view[a]) != len(of_view[b]) or len(of_view[a]) < 2:
-            continue
-        q = given.q.copy()
-        q[of_view[a]], q[of_view[b]] = given.q[of_view[b]], given.q[of_view[a]]
-        yield Mistake(
-            "views exchanged",
-            f"the readings of views {names[a]} and {names[b]} look exchanged",
-            "with the views exchanged",
-            "check which images belong to which view",
-            replace(given, q=q),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,33 +341,21 @@ class _Encoders:
 
 
 def _of_units(encoders: _Encoders) -> Iterator[Mistake]:
-    """Yield readings in another unit, and whole leg lengths."""
-    legs, every, turning = encoders.legs, encoders.every, encoders.turning
-    sliding = [k for k in every if k not in turning]
-    has_travel = all(0.0 < leg.travel[1] - leg.travel[0] < np.inf for leg in legs)
-    lengths = (LENGTH["mm"], "millimetres"), (LENGTH["cm"], "centimetres"), (INCH, "inches")
+    """Yield angles in another unit; lengths in another one are outside the travel and refused."""
+    turning = encoders.turning
+    of = (
+        ""
+        if len(turning) == len(encoders.legs)
+        else f" of {few([encoders.names[k] for k in turning])}"
+    )
     angles = (np.pi / 180.0, "degrees"), (180.0 / np.pi, "radians that were taken for degrees")
-    # Readings in their travel are metres; radians that are taken for degrees are in it as well.
-    units = [(scale, unit, sliding) for scale, unit in (() if has_travel else lengths)]
-    units += [(scale, unit, turning) for scale, unit in angles]
-    for scale, unit, which in units:
-        if which:
-            some = few([encoders.names[k] for k in which])
-            of = "" if len(which) == len(every) else f" of {some}"
-            yield Mistake(
-                "unit",
-                f"the readings{of} look like {unit}",
-                "taken so",
-                f"multiply these readings by {scale:g}",
-                encoders.reading(scale * encoders.q[:, which], which),
-            )
-    if encoders.move_legs_alone:
+    for scale, unit in angles if turning else ():
         yield Mistake(
-            "whole lengths",
-            "the readings look like whole leg lengths",
-            "less the leg length at reading zero",
-            "subtract that (legcal inspect shows it), or make a model whose offsets are zero",
-            encoders.reading(readings_of_lengths(encoders.q, legs), every),
+            "unit",
+            f"the readings{of} look like {unit}",
+            "taken so",
+            f"multiply these readings by {scale:g}",
+            encoders.reading(scale * encoders.q[:, turning], turning),
         )
 
 
@@ -556,8 +523,8 @@ def _turned_over(
     )
 
 
-def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield joints in other places: left-handed tables, platform joints of other legs."""
+def _of_model(given: Assumed) -> Iterator[Mistake]:
+    """Yield joints in other places: those of a left-handed table."""
     machine = given.machine
     mirrored = replace(
         machine,
@@ -572,23 +539,6 @@ def _of_model(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         replace(given, machine=mirrored),
         test="compare the signs of y in the model with where the legs stand in a picture",
     )
-    order = inverse(data.order.legs).tolist()
-    n = len(order)
-    alike = len({leg.type for leg in machine.legs}) == 1  # else other joints stand there
-    for k in range(1, n) if alike else ():
-        legs = list(machine.legs)
-        for f, j in enumerate(order):
-            other = machine.legs[order[(f + k) % n]]
-            legs[j] = replace(machine.legs[j], B=other.B, platform_axis=other.platform_axis)
-        name = machine.legs[order[k]].name
-        yield Mistake(
-            "platform joints from another leg",
-            f"the platform joints of the model look as if they were listed from another leg on: "
-            f"that of {machine.legs[order[0]].name} is where that of {name} stands",
-            f"with the platform joints moved on by {k}",
-            "correct the order of the platform joints in the model",
-            replace(given, machine=replace(machine, legs=tuple(legs))),
-        )
 
 
 def _mirrored(leg: Leg) -> Leg:
@@ -604,72 +554,28 @@ def _mirrored(leg: Leg) -> Leg:
 
 
 def _of_radii(given: Assumed) -> Iterator[Mistake]:
-    """Yield diameters in place of radii, and tubes in place of rods."""
-    legs = given.machine.legs
-    radii = sorted({c.radius for leg in legs for c in leg.cylinders})
-    kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
-    factors = (0.5, "twice as large as they are"), (2.0, "half of what they are")
-
-    def of_one_kind(factor: float, only: float | None) -> Assumed:
-        def scaled(leg: Leg, radius: float) -> float:
-            is_own = only is None or abs(radius - only) <= _SAME_RADIUS * radius
-            return factor * radius if is_own else radius
-
-        return _with_radii(given, scaled)
-
-    def of_one_leg(factor: float, own: Leg) -> Assumed:
-        return _with_radii(given, lambda leg, r: factor * r if leg is own else r)
-
-    which = [(None, "the radii"), *((r, f"the radius {1e3 * r:g} mm") for r in kinds[:2])]
-    for factor, what in factors:
-        for only, name in which[: 1 if len(kinds) < 2 else None]:
-            end = what if only is None else what.replace("they are", "it is")
-            yield Mistake(
-                "diameter for radius",
-                f"{name} of the legs in the model look{'s' * (only is not None)} {end}: a "
-                f"{'diameter in place of a radius' if factor < 1.0 else 'radius halved twice'}",
-                f"with {name} {_scaled_by(factor)}",
-                "correct the <visual> cylinders of the model",
-                of_one_kind(factor, only),
-            )
-    for own in legs:
-        for factor, what in factors if own.cylinders else ():
-            yield Mistake(
-                "diameter for radius",
-                f"the radii of leg {own.name} in the model look {what}",
-                f"with the radii {_scaled_by(factor)}",
-                "correct its <visual> cylinders in the model",
-                of_one_leg(factor, own),
-                is_small=True,
-            )
-    pairs = {leg.name: both for leg in legs if len(both := {c.radius for c in leg.cylinders}) == 2}
-
-    def other(leg: Leg, radius: float) -> float:
-        return next(iter(pairs.get(leg.name, {radius}) - {radius}), radius)
-
-    if pairs:
-        every = dict.fromkeys(
-            f"{1e3 * min(both):g} and {1e3 * max(both):g} mm" for both in pairs.values()
-        )
-        yield Mistake(
-            "tube and rod exchanged",
-            f"the radii of tube and rod look exchanged ({', '.join(every)})",
-            "with the radii exchanged",
-            "exchange the radii in the <visual> cylinders of the model",
-            _with_radii(given, other),
-        )
-
-
-def _scaled_by(factor: float) -> str:
-    return "halved" if factor < 1.0 else "doubled"
-
-
-def _with_radii(given: Assumed, radius: Callable[[Leg, float], float]) -> Assumed:
-    """Return what is true with other radii of visible cylinders, by leg and radius."""
+    """Yield diameters in place of radii: of all parts, or of those that are equally thick."""
     machine = given.machine
-    return replace(
-        given, machine=machine.with_radii(lambda j, c: radius(machine.legs[j], c.radius))
-    )
+    radii = sorted({c.radius for leg in machine.legs for c in leg.cylinders})
+    kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
+
+    def halved(only: float | None) -> Assumed:
+        def radius(r: float) -> float:
+            return 0.5 * r if only is None or abs(r - only) <= _SAME_RADIUS * r else r
+
+        return replace(given, machine=machine.with_radii(lambda _, c: radius(c.radius)))
+
+    which = [(None, "the radii", "they are"),
+             *((r, f"the radius {1e3 * r:g} mm", "it is") for r in kinds[:2])]  # fmt: skip
+    for only, name, they_are in which[: 1 if len(kinds) < 2 else None]:
+        yield Mistake(
+            "diameter for radius",
+            f"{name} of the legs in the model look{'s' * (only is not None)} twice as large as "
+            f"{they_are}: a diameter in place of a radius",
+            f"with {name} halved",
+            "correct the <visual> cylinders of the model",
+            halved(only),
+        )
 
 
 def _of_cameras(given: Assumed) -> Iterator[Mistake]:

@@ -206,13 +206,13 @@ def identifiability_of_dataset(
 
 def ranks_of_dataset(
     dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[Condition, ...], Ranks, Ranks]:
-    """Return conditions, and ranks step by step and at once, of what a dataset records.
+) -> tuple[tuple[Condition, ...], Ranks]:
+    """Return the paper's conditions, and the rank of the joint fit, of what a dataset records.
 
     They are those of :func:`identifiability_of_dataset`, without what would change them.
     """
     analysis = _analysis_of(dataset, choices)
-    return conditions_of(dataset.machine, analysis.predicted), analysis.staged, analysis.full
+    return conditions_of(dataset.machine, analysis.predicted), analysis.full
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
@@ -235,18 +235,13 @@ def check_identifiable(
     once.
     """
     analysis = _analysis_of(dataset, choices)
-    staged, full = analysis.staged, analysis.full
+    full = analysis.full
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
     if analysis.predicted.actuators and is_scale_open(analysis):
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
-    if any(not weak.harmless for weak in staged.weak):
-        notes.append(
-            f"The four steps alone leave open {_directions(staged, harmless=False)}; the "
-            "joint fit does not."
-        )
     if full.weak:  # what is left is harmless
         notes.append(
             "Not determined, and without effect on the platform: "
@@ -290,8 +285,7 @@ def _judge(
         *(conditions_of(machine, predicted.with_board(board=b)) for b in (False, True)),
     )
     platform_board = judge_board(analysis, (), (), link="platform")
-    staged, full = analysis.staged, analysis.full
-    enough = staged.complete and full.complete
+    full = analysis.full
     notes = []
     if analysis.motion.why_not:
         why = "the machine is singular at poses inside its travel"
@@ -309,16 +303,14 @@ def _judge(
         r=sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
         n_ac=int(predicted.with_length.sum()),
         conditions=conditions,
-        staged=staged,
         full=full,
         identifiable=full.complete,
-        steps=analysis.step_ranks,
         views=tuple(tuple(predicted.leg_names[j] for j in view) for view in predicted.views),
         images=tuple(int((predicted.view == v).sum()) for v in range(predicted.n_views)),
         board=board,
         platform_board=platform_board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
-        remedies=() if enough else find_remedies(analysis, replanning),
+        remedies=() if full.complete else find_remedies(analysis, replanning),
         recommendation=recommendation,
         notes=tuple(notes),
         scale=scale_sources(analysis),

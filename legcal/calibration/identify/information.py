@@ -35,10 +35,10 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.square_root import information_rows, marginal_rows
 from legcal.geometry.lines import cross, normal_basis
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms, pose_equations
-from legcal.machine.leg import EquationKind, LegColumns
+from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, parametrize
 
@@ -71,9 +71,6 @@ class WhitenedEquations:
     # displacements; and by readings of actuators, in metres
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
-    leg: IntArray  # (m,): the leg of each row
-    demand: tuple[EquationKind, ...]  # (m,): what it is about
-    reading: BoolArray  # (m,): rows of the readings of actuators, of the first leg on each
 
     def at(self, poses: IntArray) -> WhitenedEquations:
         """Return the equations at some of the poses, in that order."""
@@ -91,7 +88,6 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
     columns = list(freedoms(predicted.frame_legs))
     by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
-    leg, kinds = equations.leg, equations.kinds
     if actuators:  # what moves joints is unknown at each pose, of actuators it is measured
         unit, n = predicted.unit_of_q, len(actuators)
         first = by_pose.shape[2]
@@ -101,10 +97,7 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
         by_pose = np.concatenate([by_pose, rows], axis=1)
         none = np.zeros((n_poses, n, by_parameters.shape[2]))
         by_parameters = np.concatenate([by_parameters, none], axis=1)
-        leg = np.append(leg, [int(np.argmax(predicted.carried_by == a)) for a in range(n)])
-        kinds = (*kinds, *[EquationKind.LENGTH] * n)
-    reading = np.arange(len(leg)) >= len(equations.leg)
-    return WhitenedEquations(by_pose, by_parameters, leg, kinds, reading)
+    return WhitenedEquations(by_pose, by_parameters)
 
 
 def image_rows(predicted: PredictedObservations) -> Array:
@@ -273,7 +266,7 @@ def _images(
 
 def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
     """Return the factor of what legs demand of poses, readings among it."""
-    m = len(equations.leg)
+    m = equations.by_pose.shape[1]
     demanded = Residuals.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
     touches = (("parameters", np.zeros(n_poses, dtype=np.intp), _WHOLE),)
     return Factor("legs", lambda _: demanded, touches, n_poses, m, np.arange(n_poses))

@@ -183,12 +183,6 @@ class PredictedObservations:
         """Number of frames: of cameras that nothing ties to others, and of the board."""
         return int(self.frame.max(initial=-1)) + 1
 
-    @cached_property
-    def frames(self) -> tuple[tuple[int, ...], ...]:
-        """The legs that are seen in each frame."""
-        seen = [self.seen[self.frame == f].any(axis=0) for f in range(self.n_frames)]
-        return tuple(tuple(np.flatnonzero(row).tolist()) for row in seen)
-
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
@@ -341,11 +335,9 @@ class PredictedObservations:
             return replace(self, platform_board=np.full(len(self.view), board, dtype=np.bool_))
         return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
-    def columns(self, *kinds: int | slice, legs: BoolArray | None = None) -> IntArray:
-        """Return the parameters that stand for numbers (:class:`LegColumns`) of some legs."""
-        place = self.parametrization.place
-        place = place if legs is None else place[legs]
-        found = np.concatenate([place[:, kind].ravel() for kind in kinds])
+    def columns(self, kind: int) -> IntArray:
+        """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
+        found = self.parametrization.place[:, kind]
         return np.unique(found[found >= 0])
 
 

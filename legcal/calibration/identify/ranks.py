@@ -1,4 +1,4 @@
-"""Ranks of a session, step by step and in the joint fit, and its weak directions in words."""
+"""The rank of a session in the joint fit, and its weak directions in words."""
 
 from __future__ import annotations
 
@@ -17,20 +17,7 @@ from legcal.calibration.identify.information import (
     whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import PredictedObservations
-from legcal.calibration.identify.report import Ranks, RmsMotion, StepRank, WeakDirection
-from legcal.calibration.identify.steps import (
-    MAX_SIGMA,
-    Located,
-    StepInformation,
-    consecutive_distances,
-    distance_rows,
-    identify_base,
-    identify_platform,
-    locate_joints,
-    mean_distances,
-    offsets_from_distances,
-    scalar_products,
-)
+from legcal.calibration.identify.report import Ranks, RmsMotion, WeakDirection
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import GaussianPrior
@@ -40,6 +27,7 @@ from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, s
 from legcal.machine.equations import pose_sensitivity
 from legcal.vision.board import Link
 
+_MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move
 
@@ -62,8 +50,6 @@ class Analysis:
         predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
         other.__dict__.update(images=self.images)
-        if link == "platform":  # the steps do without it
-            other.__dict__.update(default_steps=self.default_steps, staged=self.staged)
         return other
 
     @cached_property
@@ -85,40 +71,6 @@ class Analysis:
     def arms(self) -> GaussianPrior:
         """What is known of the lines of arms without images."""
         return prior_of_arms(self.predicted, self.choices)
-
-    @cached_property
-    def located(self) -> Located:
-        """Step 1."""
-        return locate_joints(self.predicted)
-
-    @cached_property
-    def distances(self) -> tuple[Array, Array, IntArray]:
-        """The distances of steps 3 and 4."""
-        return distance_rows(self.predicted, self.located)
-
-    @cached_property
-    def default_steps(self) -> tuple[StepInformation, ...]:
-        """Steps 2, 3 and 4, default criteria."""
-        return (
-            identify_base(self.predicted, self.located),
-            offsets_from_distances(self.predicted, *self.distances),
-            identify_platform(
-                self.predicted,
-                self.located,
-                self.images[:, : self.predicted.n_legs],  # no step uses arms
-                self.equations,
-            ),
-        )
-
-    @cached_property
-    def literal_steps(self) -> tuple[StepInformation, ...]:
-        """Steps 2, 3 and 4 as printed."""
-        rows, weight, key = self.distances
-        return (
-            scalar_products(self.predicted, self.located),
-            consecutive_distances(rows, weight, key, self.default_steps[1].columns),
-            mean_distances(self.predicted, weight, key),
-        )
 
     @cached_property
     def of_cameras(self) -> Array:
@@ -145,42 +97,12 @@ class Analysis:
         return PlatformMotion(self.predicted)
 
     @cached_property
-    def staged(self) -> Ranks:
-        """The four default steps together."""
-        weak = tuple(
-            direction
-            for step in self.default_steps
-            for direction in weak_directions(
-                self.predicted,
-                self.motion,
-                undetermined(self.predicted, step.information),
-                step.columns,
-            )
-        )
-        n_p = len(self.predicted.unit) - len(self.predicted.ties)
-        return Ranks(n_p - len(weak), n_p, weak)
-
-    @cached_property
     def full(self) -> Ranks:
         """The joint fit."""
         basis = undetermined(self.predicted, self.information)
         weak = weak_directions(self.predicted, self.motion, basis)
         n_p = len(self.predicted.unit) - len(self.predicted.ties)
         return Ranks(n_p - len(weak), n_p, weak)
-
-    @cached_property
-    def step_ranks(self) -> tuple[StepRank, ...]:
-        """The rank of each step, default and as printed."""
-        first = ("joints_in_cameras", self.located.rank, self.located.of)
-        found = [
-            StepRank(first[0], "default", *first[1:]),
-            StepRank(first[0], "literal", *first[1:]),
-        ]
-        for default, printed in zip(self.default_steps, self.literal_steps, strict=True):
-            for criteria, step in (("default", default), ("literal", printed)):
-                rank = determined(self.predicted, step.information)
-                found.append(StepRank(step.name, criteria, rank, len(step.columns)))
-        return tuple(found)
 
 
 class PlatformMotion:
@@ -228,16 +150,10 @@ class PlatformMotion:
         return split_by_motion(self.by_metres, basis, self.predicted.mean_length, _HARMLESS)
 
 
-def determined(predicted: PredictedObservations, information: Array) -> int:
-    """Return the rank of whitened rows: directions known to better than a leg's length."""
-    singular = np.linalg.svd(compress(information), compute_uv=False)
-    return int(np.sum(singular > _limit(predicted)))
-
-
 def undetermined(
     predicted: PredictedObservations,
     information: Array,
-    sigma: float = MAX_SIGMA,  # mean leg lengths
+    sigma: float = _MAX_SIGMA,  # mean leg lengths
 ) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
@@ -252,15 +168,10 @@ def missing(predicted: PredictedObservations, rows: Array, motion: PlatformMotio
 def weak_directions(
     predicted: PredictedObservations,  # where names and units come from
     motion: PlatformMotion,
-    basis: Array,  # (w, c): the space, in metres
-    columns: IntArray | None = None,  # (c,): which parameters; all without it
+    basis: Array,  # (w, p): the space, in metres
 ) -> tuple[WeakDirection, ...]:
     """Return the directions of a space in words, those that move the platform first."""
-    wide = basis
-    if columns is not None:
-        wide = np.zeros((len(basis), len(predicted.unit)))
-        wide[:, columns] = basis
-    parts = motion.split(wide)
+    parts = motion.split(basis)
     return tuple(
         _direction(predicted, motion, row, harmless)
         for part, harmless in zip(parts, (False, True), strict=True)
@@ -287,6 +198,6 @@ def _direction(
     )
 
 
-def _limit(predicted: PredictedObservations, sigma: float = MAX_SIGMA) -> float:
+def _limit(predicted: PredictedObservations, sigma: float = _MAX_SIGMA) -> float:
     """Return the least singular value that counts [1/m]."""
     return 1.0 / (sigma * predicted.mean_length)

@@ -32,12 +32,7 @@ from legcal.calibration.identify.report import (
     Remedy,
     WeakDirection,
 )
-from legcal.calibration.identify.steps import (
-    base_by_frames,
-    by_all_parameters,
-    offsets_from_distances,
-)
-from legcal.estimation.square_root import compress, eliminate, marginal_rows
+from legcal.estimation.square_root import compress, marginal_rows
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.directions import list_in_words
 from legcal.machine.leg import JointType
@@ -45,7 +40,6 @@ from legcal.machine.model import Machine
 from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
 from legcal.vision.board import Link
 
-_CAMERA = 6  # unknowns of its pose
 _MOST_VIEWS = 4
 _MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
 _MENDED = 1e-6  # part of a direction outside of what stays open
@@ -75,8 +69,6 @@ def recommend(
     found = list[Recommendation]()
     candidates = _Candidates(machine, images, board=board, platform_board=platform_board)
     most = machine.n_legs + 1
-    if machine.actuators:  # rods in parallel have no lengths that the steps could find
-        candidates.by_steps = candidates.best(_MOST_VIEWS, machine.n_legs) is not None
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
             best = candidates.best(n_views, size)
@@ -100,7 +92,6 @@ class _Candidates:
         self.motion = self.every.motion
         self.ring = legs_around(self.predicted)
         self.of_size: dict[int, list[Analysis]] = {}
-        self.by_steps = True  # whether the steps must determine everything too
 
     def best(self, n_views: int, size: int) -> Recommendation | None:
         """Return the best set of so many views of so many legs, or None if none suffices."""
@@ -112,7 +103,7 @@ class _Candidates:
                 continue
             chosen = [self.analyses(size)[k] for k in which]
             information = self.together(chosen)
-            if not self.suffices(chosen, information):
+            if missing(self.predicted, information, self.motion):
                 continue
             sigma = self.motion.sigma(information)
             worst = float(np.linalg.svd(information, compute_uv=False)[-1])
@@ -158,14 +149,6 @@ class _Candidates:
             by_view = [marginal_rows(rows, kept) for rows in by_view]
         return marginal_rows(np.concatenate(by_view), np.arange(n_p))
 
-    def base_together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say in step 2."""
-        if not self.predicted.board.all():
-            return np.concatenate([a.default_steps[0].information for a in chosen])
-        by_view = [base_by_frames(a.predicted, a.located)[1] for a in chosen]
-        rows = np.concatenate([x.reshape(-1, x.shape[2]) for x in by_view])
-        return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
-
     def analyses(self, size: int) -> list[Analysis]:
         """Analyse every possible view of *size* legs by itself."""
         if size not in self.of_size:
@@ -182,24 +165,6 @@ class _Candidates:
                 for k in range(len(views))
             ]
         return self.of_size[size]
-
-    def suffices(self, chosen: Sequence[Analysis], information: Array) -> bool:
-        """Say whether views determine all that moves the platform, at once and step by step."""
-        predicted, n_p = self.predicted, len(self.predicted.unit)
-        if missing(predicted, information, self.motion):
-            return False
-        if not self.by_steps:
-            return True
-        last = np.concatenate([a.default_steps[2].information for a in chosen])
-        for k, rows in ((0, self.base_together(chosen)), (2, last)):
-            step = replace(chosen[0].default_steps[k], information=rows)
-            if missing(predicted, by_all_parameters(step, n_p), self.motion):
-                return False
-        together = (
-            np.concatenate(parts) for parts in zip(*(a.distances for a in chosen), strict=True)
-        )
-        offsets = offsets_from_distances(predicted, *together)
-        return not missing(predicted, by_all_parameters(offsets, n_p), self.motion)
 
 
 def judge_board(
@@ -222,8 +187,6 @@ def judge_board(
         for before, after in zip(without, with_board, strict=True)
         if before.fails and not after.fails
     ]
-    if every.staged.complete and not none.staged.complete:
-        needed.append("staged")
     if every.full.complete and not none.full.complete:
         needed.append("full")
     return BoardReport(is_present, tuple(needed), _ranks(none), _ranks(every), _mended(none, every))
@@ -231,23 +194,15 @@ def judge_board(
 
 def _ranks(analysis: Analysis) -> BoardRanks:
     """Return the ranks of an analysis."""
-    return BoardRanks(analysis.staged.rank, analysis.full.rank, analysis.full.complete)
+    return BoardRanks(analysis.full.rank, analysis.full.complete)
 
 
 def _mended(none: Analysis, every: Analysis) -> tuple[str, ...]:
     """Return the directions that move the platform and that only a board determines, in words."""
-    n_p = len(none.predicted.unit)
-    pairs = [
-        (by_all_parameters(a, n_p), by_all_parameters(b, n_p))
-        for a, b in zip(none.default_steps, every.default_steps, strict=True)
-    ]
-    found: list[str] = []
-    for before, after in [*pairs, (none.information, every.information)]:
-        open_before, open_after = (undetermined(none.predicted, rows) for rows in (before, after))
-        mended = _outside(open_before, open_after)
-        directions = weak_directions(none.predicted, none.motion, mended)
-        found += [d.direction for d in directions if not d.harmless]
-    return tuple(dict.fromkeys(found))
+    open_before, open_after = (undetermined(a.predicted, a.information) for a in (none, every))
+    mended = _outside(open_before, open_after)
+    directions = weak_directions(none.predicted, none.motion, mended)
+    return tuple(d.direction for d in directions if not d.harmless)
 
 
 def _outside(space: Array, part: Array) -> Array:
@@ -285,18 +240,16 @@ def find_remedies(
     ]
     found = tuple(r for kind in kinds for r in _try_kind(kind, before, n_parameters))
     enough = tuple(r for r in found if r.enough) or _other_views(analysis, replanning)
-    everything = tuple(r for r in enough if r.staged_rank == r.full_rank == n_parameters)
+    everything = tuple(r for r in enough if r.full_rank == n_parameters)
     return everything or enough or found
 
 
 @dataclass(frozen=True)
 class _Score:
-    """How many directions are open, step by step and at once; those that move the platform."""
+    """How many directions are open, and how many of them move the platform."""
 
-    staged: int
-    full: int
-    staged_harm: int
-    full_harm: int
+    open: int
+    harmful: int
 
 
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
@@ -304,17 +257,8 @@ def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     predicted, motion = analysis.predicted, analysis.motion
     extra = np.zeros((len(known), len(predicted.unit)))
     extra[np.arange(len(known)), list(known)] = _KNOWN
-    steps = [
-        np.concatenate([by_all_parameters(step, len(predicted.unit)), extra])
-        for step in analysis.default_steps
-    ]
-    full = np.concatenate([analysis.information, extra])
-    return _Score(
-        sum(len(undetermined(predicted, rows)) for rows in steps),
-        len(undetermined(predicted, full)),
-        sum(missing(predicted, rows, motion) for rows in steps),
-        missing(predicted, full, motion),
-    )
+    rows = np.concatenate([analysis.information, extra])
+    return _Score(len(undetermined(predicted, rows)), missing(predicted, rows, motion))
 
 
 def _try_kind(
@@ -324,15 +268,15 @@ def _try_kind(
     enough, helps = list[Remedy](), list[tuple[int, Remedy]]()
     for tried, (text, score) in enumerate(kind):
         after = score()
-        gain = before.staged_harm - after.staged_harm, before.full_harm - after.full_harm
-        if min(gain) < 0 or max(gain) == 0:
+        gain = before.harmful - after.harmful
+        if gain <= 0:
             continue
-        complete = after.staged_harm == 0 and after.full_harm == 0
-        remedy = Remedy(text, n_parameters - after.staged, n_parameters - after.full, complete)
+        complete = after.harmful == 0
+        remedy = Remedy(text, n_parameters - after.open, complete)
         if complete:
             enough.append(remedy)
         else:
-            helps.append((sum(gain), remedy))
+            helps.append((gain, remedy))
         if len(enough) == _MOST_OF_A_KIND or tried + 1 >= _MOST_TRIED:
             break
     return enough or [r for _, r in sorted(helps, key=lambda pair: -pair[0])[:1]]
@@ -415,15 +359,12 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
     names = analysis.predicted.leg_names
     views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
     n_p = analysis.full.of
-    return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, n_p, True),)
+    return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, True),)
 
 
 def _more(analysis: Analysis, predicted: PredictedObservations, poses: IntArray) -> _Score:
     """Return what is open in a session that shows more, at these of the poses of another."""
-    other = analysis.elsewhere(predicted, poses)
-    if len(analysis.full.weak) == 0:  # nothing to gain: more images take nothing away
-        other.__dict__.update(information=analysis.information)
-    return _score(other)
+    return _score(analysis.elsewhere(predicted, poses))
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
@@ -434,8 +375,8 @@ def _weak_legs(analysis: Analysis) -> list[int]:
 
 
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
-    """Return the directions that move the platform, those of the joint fit first."""
-    return [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
+    """Return the open directions that move the platform."""
+    return [d for d in analysis.full.weak if not d.harmless]
 
 
 def _widened(

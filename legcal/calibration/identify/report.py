@@ -28,20 +28,6 @@ class Ranks:
 
 
 @dataclass(frozen=True)
-class StepRank:
-    """The rank of one step's equations."""
-
-    name: str  # ``joints_in_cameras``, ``base_joints``, ``offsets`` or ``platform_joints``
-    # {"default", "literal"}: legcal's criteria, or the paper's as printed: (6) and (7), (9), (14),
-    # (16)
-    criteria: str
-    # rank, of: unknowns that are determined, and all of them. Those of the first step are joints
-    # and axes in the camera frames; the others are parameters
-    rank: int
-    of: int
-
-
-@dataclass(frozen=True)
 class WeakDirection:
     """A combination of parameters that the observations do not determine."""
 
@@ -80,7 +66,6 @@ class Recommendation:
 class BoardRanks:
     """The ranks of all parameters, with a board in every image or with none."""
 
-    staged_rank: int  # staged_rank, full_rank: step by step, and the joint fit
     full_rank: int
     # whether the joint fit determines all directions that move the platform
     identifiable: bool
@@ -91,12 +76,12 @@ class BoardReport:
     """What a calibration board does for a session."""
 
     present: bool  # whether the session has one, in every view
-    # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``staged`` (the
-    # four steps determine all that moves the platform), ``full`` (the joint fit does)
+    # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``full`` (the
+    # joint fit determines all that moves the platform)
     needed_for: tuple[str, ...]
     without: BoardRanks  # without, with_board: the ranks without and with a board in every image
     with_board: BoardRanks
-    # the directions that only a board lets step by step or at once determine, in words
+    # the directions that only a board determines, in words
     mends: tuple[str, ...]
 
 
@@ -113,15 +98,11 @@ class ScaleSource:
 
 @dataclass(frozen=True)
 class Remedy:
-    """Something that would help, with the ranks that it gives."""
+    """Something that would help, with the rank that it gives."""
 
     remedy: str  # what to do
-    # staged_rank, full_rank: the ranks that it gives, of all parameters; what is fixed counts as
-    # known
-    staged_rank: int
-    full_rank: int
-    # whether it determines everything that moves the platform, step by step and at once
-    enough: bool
+    full_rank: int  # of all parameters; what is fixed counts as known
+    enough: bool  # whether everything that moves the platform is determined with it
 
 
 @dataclass(frozen=True)
@@ -149,11 +130,9 @@ class Identifiability:
     r: int
     n_ac: int
     conditions: tuple[Condition, ...]  # the paper's, as printed
-    staged: Ranks  # staged, full: the four default steps, and the joint fit
-    full: Ranks
+    full: Ranks  # of the joint fit
     # whether the joint fit determines all directions that move the platform
     identifiable: bool
-    steps: tuple[StepRank, ...]  # each step, by legcal's criteria and by the printed ones
     views: tuple[tuple[str, ...], ...]  # the legs that each view shows
     images: tuple[int, ...]  # number of images of each view
     board: BoardReport  # what a calibration board on the base is needed for, and what it determines
@@ -225,10 +204,8 @@ class IdentifyDocument(SparseDocument):
     r: int
     n_ac: int
     conditions: list[ConditionBlock]
-    staged: Ranks
     full: Ranks
     identifiable: bool
-    steps: list[StepRank]
     views: list[list[str]]
     images: list[int]
     board: BoardBlock

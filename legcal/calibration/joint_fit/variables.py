@@ -274,7 +274,6 @@ class LegParameters:
     legs: FittedLegs
     free: BoolArray  # (p,) which kinematic parameters are unknowns
     values: Mapping[str, float]  # of fixed ones that are not at nominal
-    _last: tuple[tuple[Leg, ...], tuple[Array, Array]] | None = field(default=None, repr=False)
 
     @cached_property
     def unknown(self) -> IntArray:
@@ -365,11 +364,7 @@ class LegParameters:
 
     def tie_rows(self, geometry: tuple[Leg, ...]) -> tuple[Array, Array]:
         """Return what is left of each tie (w,) and its derivative by the unknowns (w, p_free)."""
-        if self._last is None or self._last[0] is not geometry:
-            found = geometry, self._ties_at(geometry, self.n_tied)
-            object.__setattr__(self, "_last", found)
-            return found[1]
-        return self._last[1]
+        return self._ties_at(geometry, self.n_tied)
 
     def on_ties(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
         """Return legs moved, as little as possible, to where all ties hold."""

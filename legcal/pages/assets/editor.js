@@ -95,7 +95,7 @@
     const h = edit?.ends ? lineOf(cameraOf(row), ends, row.h ?? lineOf(cameraOf(row), row.expected)) : row.h;
     return { ends, h, used: edit?.used ?? row.used, edited: Boolean(edit) };
   };
-  const covarianceOf = (row, ends) => { // as measured where it may be used: see docs/datasets.md
+  const covarianceOf = (row, ends) => { // as measured where it may be used: see docs/formats.md
     const [a, b, c] = numbers(row.cells, "s00", "s01", "s11"), most = 0.5 * (a + c + Math.hypot(a - c, 2 * b));
     const least = (a * c - b * b) / most, length = Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]);
     return least >= SIGMAS[0] ** 2 && most <= Math.min(SIGMAS[1], length) ** 2 ? [a, b, c] : null;

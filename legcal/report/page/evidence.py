@@ -57,7 +57,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     }
     blocks: list[Any] = [Facts(counts)]
     try:
-        conditions, staged, full = ranks_of_dataset(calibration.dataset, problem.choices)
+        conditions, full = ranks_of_dataset(calibration.dataset, problem.choices)
     except LegcalError:
         conditions = ()
     if conditions:
@@ -70,13 +70,11 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
             ]
             for c in conditions
         ]
-        ranks: list[list[Cell]] = [
-            [title, number(one.rank, 0), number(one.of, 0), "" if one.complete else "not enough"]
-            for title, one in (("four steps", staged), ("joint fit", full))
-        ]
+        enough = "" if full.complete else "not enough"
+        ranks: list[list[Cell]] = [[number(full.rank, 0), number(full.of, 0), enough]]
         blocks += [
             Table(("condition of the paper", ">equations", ">unknowns", ""), rows),
-            Table(("rank before any image was searched", ">rank", ">of", ""), ranks),
+            Table((">rank before any image was searched", ">of", ""), ranks),
         ]
     weak: list[list[Cell]] = [
         [row.in_words, number(1e3 * row.sigma_m, 4), _parts(one.parameters, one.components)]

@@ -114,12 +114,9 @@ def check_verdict(check: Check) -> Verdict:
 
 
 def identify_verdict(report: Identifiability) -> Verdict:
-    """Return whether a session determines its machine: amber where only the joint fit does."""
-    full, staged = report.full, report.staged
-    sentence = (
-        f"The joint fit determines {full.rank} of {full.of} parameters, the four steps "
-        f"{staged.rank} of {staged.of}."
-    )
+    """Return whether a session determines its machine: amber where a condition fails."""
+    full = report.full
+    sentence = f"The joint fit determines {full.rank} of {full.of} parameters."
     if not report.identifiable:
         word = "These images cannot determine the machine"
         reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
@@ -128,6 +125,7 @@ def identify_verdict(report: Identifiability) -> Verdict:
         word = "These images can determine all of the machine but its scale"
         ways = ", or ".join(one.assumed for one in report.scale if one.sigma is not None)
         return Verdict("doubtful", word, sentence, [f"To fix the scale: {ways}."] if ways else [])
-    if not (staged.complete and report.conditions_hold):
-        return Verdict("doubtful", "The joint fit can determine it, the steps cannot", sentence, [])
+    if not report.conditions_hold:
+        word = "The joint fit can determine it, but conditions of the paper fail"
+        return Verdict("doubtful", word, sentence, [])
     return Verdict("good", "These images determine the machine", sentence, [])

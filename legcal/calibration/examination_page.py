@@ -1,0 +1,251 @@
+"""What people read of an examination: tables of its figures, and its page with the photographs.
+
+On the page people correct outlines over the photographs. It holds the table as it was written,
+cameras without what it does not need of them, and where outlines were expected that were not found:
+such a one is placed there and dragged onto its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from legcal.calibration.detection import Detection, unique_names
+from legcal.calibration.examination import Examination, ViewCondition
+from legcal.calibration.summary import UNITS
+from legcal.data.dataset import OBSERVATIONS_NAME
+from legcal.data.measurements import row_names
+from legcal.data.outlines import format_observations
+from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.pages.document import (
+    MAX_ROWS,
+    Cell,
+    Items,
+    Number,
+    OutlineEditor,
+    Page,
+    Picture,
+    Row,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    number,
+)
+from legcal.pages.html import page_html
+from legcal.vision.camera import Camera
+from legcal.vision.visibility import PredictedLeg
+
+DETECTION_PAGE = "index.html"
+# Of an end that a person places over an enlarged photograph: edges are blurred over a pixel or two,
+# and where in that width their middle is the eye says to about half a pixel.
+SIGMA_BY_HAND = 0.5  # [px]
+MAX_BYTES = 8_300_000  # of the table and what is said of its images, in a page
+_OF_IMAGE = 250  # bytes in the page for each image
+_STATES = {"ok": "ok", "note": "ok", "warning": "look", "error": "wrong"}
+_HOW_TO_CORRECT = (
+    "Use or reject outlines, and drag their ends, over the photographs; then download the table "
+    "and copy it into the dataset, where legcal calibrate takes it. An end that is placed by hand "
+    "has the standard deviation that you state. Nothing changes in the files beside this page."
+)
+_TOO_MANY = (
+    "There are more outlines than a page should hold. To correct one, edit its row in "
+    "observations.csv: set its verdict, or its line (a, b, c) and ends, and its source to edited; "
+    "then copy the file into the dataset."
+)
+
+
+def tables_of(found: Examination) -> list[Table]:
+    """Return the figures of an examination: a line for each check, view and encoder."""
+    tables = [
+        Table(
+            ("check", "", "found"),
+            [(one.name, _STATES[one.state], one.found) for one in found.checks],
+            sortable=False,
+        ),
+        Table(
+            ("photographs of", ">images", ">blur [px]", ">clipped [%]", ">JPEG"),
+            [
+                (
+                    view.view,
+                    number(view.images, 0),
+                    number(view.blur_px, 1),
+                    number(None if view.clipped is None else 100.0 * view.clipped, 0),
+                    number(view.jpeg_quality, 0),
+                )
+                for view in found.views
+            ],
+        ),
+        Table(
+            ("view", ">legs", ">outlines used", ">contrast", ">length [px]", ">residual [px]",
+             "not used"),
+            [_outline_cells(view) for view in found.views if view.outlines is not None],
+        ),
+    ]  # fmt: skip
+    units = dict.fromkeys(UNITS[one.unit][1] for one in found.encoders)
+    rows = list[list[Cell]]()
+    for encoder in found.encoders:
+        scale = UNITS[encoder.unit][0]
+        low_high = None if encoder.travel is None else [scale * end for end in encoder.travel]
+        rows.append(
+            [
+                encoder.column,
+                number(scale * encoder.least, 3),
+                number(scale * encoder.greatest, 3),
+                "" if low_high is None else " to ".join(f"{end:z.6g}" for end in low_high),
+                number(None if encoder.used is None else 100.0 * encoder.used, 0),
+            ]
+        )
+    heading = f"encoder [{', '.join(units)}]"
+    tables.append(Table((heading, ">least", ">greatest", ">travel", ">used [%]"), rows))
+    return [table for table in tables if table.rows]
+
+
+def _outline_cells(view: ViewCondition) -> list[Cell]:
+    """Return the figures of the outlines of a view."""
+    rejected = ", ".join(f"{n} {reason_in_words(why)}" for why, n in view.rejected.items())
+    return [
+        view.view,
+        _share(view.legs_found, view.legs_visible),
+        _share(view.outlines_used, view.outlines),
+        number(view.contrast, 1),
+        number(view.length, 0),
+        number(view.residual, 3),
+        "camera not placed" if view.problem else rejected,
+    ]
+
+
+def _share(part: int | None, whole: int | None) -> Cell:
+    return Number(part, f"{part}/{whole}")
+
+
+def examination_page(found: Examination, detection: Detection) -> str:
+    """Return the text of ``index.html``."""
+    files, names = detection.overlay_files, row_names(detection.dataset.measurements)
+    anchors = unique_names(f"view-{view.view}" for view in found.views)
+    editor = _outline_editor(detection)
+    correct = [Text([_TOO_MANY])] if editor is None else [Text([_HOW_TO_CORRECT]), editor]
+    checks, *tables = tables_of(found)
+    findings = Items([f"{one.severity}: {one.what}" for one in found.findings])
+    blocks: list[Any] = [checks, findings, *tables]
+    sections = [
+        Section("found", "What was found", blocks),
+        Section("correct", "To correct an outline", correct),
+    ]
+    place = {} if editor is None else {row: k for k, row in enumerate(files)}
+    shown = _worst(detection)
+    if len(shown) < len(files):
+        few = f"The {len(shown)} of {len(files)} images with the fewest used outlines are shown."
+        blocks.append(Text([few]))
+    for view, anchor in zip(found.views, anchors, strict=True):
+        rows = [row for row in files if row in shown and detection.view_of(row) == view.view]
+        pictures = [
+            Picture(files[row], *_summary(detection, names, row), place.get(row)) for row in rows
+        ]
+        problem = [Text([view.problem])] if view.problem else []
+        sections.append(Section(anchor, view.view, [*problem, Row(pictures)]))
+    title = f"Outlines of {found.mechanism}"
+    return page_html(Page(title, found.dataset, _verdict(found), sections))
+
+
+def _verdict(found: Examination) -> Verdict:
+    if found.count("error"):
+        return Verdict("bad", "To be mended", found.sentence, [])
+    if found.count("warning"):
+        return Verdict("doubtful", "To be looked at", found.sentence, [])
+    return Verdict("good", "Ready", found.sentence, [])
+
+
+def _worst(detection: Detection) -> set[int]:
+    """Return the rows whose images a page shows: all, or those with the fewest used outlines."""
+    rows = list(detection.overlay_files)
+    used = np.bincount(detection.outlines.row[detection.outlines.used], minlength=max(rows) + 1)
+    order = np.argsort(used[rows], kind="stable")[:MAX_ROWS].tolist()
+    return {rows[k] for k in order}
+
+
+def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str, str]:
+    """Return what was found in the image of a row, and why legs are rejected."""
+    outlines, legs = detection.outlines, detection.dataset.machine.leg_names
+    here = np.flatnonzero(outlines.row == row).tolist()
+    used = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
+    rejected: dict[str, list[str]] = {}
+    for i in here:
+        why = outlines.reason[i]
+        if not outlines.used[i] and why.reason is not Reason.OUTSIDE:
+            name = legs[outlines.leg[i]]
+            of_reason = rejected.setdefault(why.summary, [])
+            if name not in of_reason:
+                of_reason.append(name)
+    reasons = "; ".join(f"{', '.join(legs)}: {why}" for why, legs in rejected.items())
+    return f"{names[row]}: {used}", f"({reasons})" if reasons else ""
+
+
+def _outline_editor(detection: Detection) -> OutlineEditor | None:
+    """Return the editor of outlines; None where the table is more than a page should hold."""
+    measurements, machine = detection.dataset.measurements, detection.dataset.machine
+    names = row_names(measurements)
+    images = []
+    for row, file in detection.photograph_files.items():
+        view = measurements.views[int(measurements.view[row])]
+        images.append(
+            {
+                "view": view.name,
+                "image": names[row],
+                "label": f"{view.name}, {names[row]}",
+                "photograph": file,
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "camera": int(measurements.view[row]),
+                "expected": _expected(detection, row),
+            }
+        )
+    cameras = [
+        {
+            "K": view.camera.K.tolist(),
+            "distortion": view.camera.distortion.tolist(),
+            "model": view.camera.model,
+        }
+        for view in measurements.views
+    ]
+    table = format_observations(detection.outlines, measurements, machine.leg_names)
+    found = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, WORDS_BY_CODE)
+    size = len(found.packed) + _OF_IMAGE * len(images)
+    return found if size <= MAX_BYTES else None
+
+
+def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
+    """Return both ends [px] of the outlines of an image that were expected and not found."""
+    measurements, names = detection.dataset.measurements, detection.dataset.machine.leg_names
+    outlines = detection.outlines
+    here = np.flatnonzero(outlines.row == row)
+    found = np.isfinite(outlines.h[here]).all(axis=1) & np.isfinite(outlines.ends[here]).all((1, 2))
+    lost = here[~found].tolist()
+    if not lost:
+        return {}
+    camera = measurements.views[int(measurements.view[row])].camera
+    legs = {(leg.leg, part.link): leg for leg in detection.predicted(row) for part in leg.segments}
+    expected = {}
+    for i in lost:
+        j, part, edge = int(outlines.leg[i]), outlines.part[i], int(outlines.edge[i])
+        leg = legs.get((j, part))
+        ends = None if leg is None else _ends(camera, leg, part, edge)
+        if ends is not None:
+            expected[f"{names[j]}\n{part}\n{edge}"] = np.round(ends, 2).tolist()
+    return expected
+
+
+def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int) -> Array | None:
+    """Return the ends (2, 2) of a predicted outline [px], the first nearer to the base."""
+    for i, segment in enumerate(leg.segments):
+        band = leg.bands[i]
+        if segment.link == part and band is not None:
+            h, t = leg.outlines[i][edge - 1], np.array([0.0, band.length])
+            xy = band.points(t, band.offsets(h, t))
+            rays = np.column_stack([xy, np.ones(2)])
+            return camera.distort(xy if cross(rays[1], rays[0]) @ h > 0.0 else xy[::-1])
+    return None

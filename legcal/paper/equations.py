@@ -1,0 +1,288 @@
+"""The paper's equations (6) to (19), each as one CasADi expression.
+
+Every function is one of the unknowns, of errors of what was observed, and of what was observed:
+(local, error, *observed) -> residuals. Errors are zero where residuals are evaluated; covariances
+of axes become weights by the derivatives with respect to them. Of the three residuals of a vector
+product two are independent: (6), (18) and (19) have those across the direction.
+
+An observed direction is u + e1 alpha1 + e2 alpha2, its normal basis E being e1, e2 as rows. An
+error of a pose is a step as :func:`~legcal.paper.gibbs.moved_points` has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations, combinations_with_replacement
+from math import comb
+
+import casadi as ca
+
+from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
+from legcal.machine.leg import JointType
+from legcal.paper.gibbs import moved_points, turned_frame, turned_points
+
+END_ERRORS = 3  # of the end of a leg (13): two of its direction, and that of its reading
+
+
+@cache
+def joint_on_axis() -> ca.Function:
+    """Return (6) and (6'): (A_1, A_2, A_3; alpha, beta; b, u, M, E) -> (M - A) x u (2,) [m].
+
+    The joint is at A = b_1 A_1 + b_2 A_2 + b_3 A_3, the numbers b being functions of its reading:
+    1, 0, 0 of a joint that stands, 1, q, 0 on a carriage, 1, cos q, sin q on an arm.
+    """
+    local, error, b = ca.SX.sym("local", 9), ca.SX.sym("error", 4), ca.SX.sym("b", 3)
+    u, M, E = ca.SX.sym("u", 3), ca.SX.sym("M", 3), ca.SX.sym("E", 2, 3)
+    A = ca.reshape(local, 3, 3) @ b
+    residual = ca.cross(M + E.T @ error[2:] - A, u + E.T @ error[:2])
+    return ca.Function("joint_on_axis", [local, error, b, u, M, E], [E @ residual])
+
+
+@cache
+def joint_of_motion(*, turns: bool) -> ca.Function:
+    """Return what (6') found as a joint: (A_1..A_n; -) -> (A, w, c) (9,).
+
+    A is the joint at reading 0, w the unit axis of the actuator and c a point of it. On a carriage
+    A_1 + q A_2 is the joint; on an arm A_1 + cos q A_2 + sin q A_3, where A_2 and A_3 are replaced
+    by the nearest vectors that are square to each other and of one length.
+    """
+    n = 3 if turns else 2
+    local = ca.SX.sym("local", 3 * n)
+    centre, x, *more = ca.vertsplit(local, 3)
+    w, A = x / ca.norm_2(x), centre
+    if turns:
+        normal = ca.cross(x, more[0])
+        w = normal / ca.norm_2(normal)
+        A = centre + 0.5 * (x + ca.cross(more[0], w))
+    joint = ca.vertcat(A, w, centre)
+    return ca.Function("joint_of_motion", [local, ca.SX.sym("error", 0)], [joint])
+
+
+@cache
+def leg_across_axis() -> ca.Function:
+    """Return (7): (turns of v; alpha, step; u, E, R, frame) -> v . u.
+
+    R takes the body of v to the frame of u; the frame (3, 3) of v has it and its normal basis as
+    columns.
+    """
+    turns, error, u, E = (ca.SX.sym("turns", 2), ca.SX.sym("error", 8), *_direction())
+    R, frame = ca.SX.sym("R", 3, 3), ca.SX.sym("frame", 3, 3)
+    v = turned_points(error[5:], R @ turned_frame(turns, frame)[:, 0])
+    residual = ca.dot(v, u + E.T @ error[:2])
+    return ca.Function("leg_across_axis", [turns, error, u, E, R, frame], [residual])
+
+
+@dataclass(frozen=True)
+class LegInView:
+    """A leg in a view, and what of it is a vector of V (8), (8')."""
+
+    places: tuple[int, ...]  # of A (3), turns of v, of w and displacements of c among the unknowns
+    has_axis: bool  # its revolute axis v is located
+    has_actuator: bool  # the axis w of what moves its joint at A is a vector
+    has_arm: bool  # so is the arm to its joint, from the nearest point of w
+
+
+def pairs_of_vectors(legs: Sequence[LegInView]) -> list[tuple[int, int]]:
+    """Return the pairs of vectors of V that (9) multiplies: all but squares of unit vectors."""
+    n_units = sum(leg.has_axis + leg.has_actuator for leg in legs)
+    n_others = comb(len(legs), 2) + sum(leg.has_arm for leg in legs)
+    pairs = combinations_with_replacement(range(n_others + n_units), 2)
+    return [(p, q) for p, q in pairs if p != q or p < n_others]
+
+
+@cache
+def vectors_of_view(legs: tuple[LegInView, ...]) -> ca.Function:
+    """Return (8): (-; errors; A, v, w, c of each leg) -> the vectors of V in a camera, (3 n,).
+
+    Errors are those of A, v, w and c, leg by leg; c is a point of the axis w.
+    """
+    n = len(legs)
+    none, error, seen = ca.SX.sym("local", 0), ca.SX.sym("error", 12 * n), ca.SX.sym("seen", 12, n)
+    shifted = seen + ca.reshape(error, 12, n)
+    of_legs = [tuple(ca.vertsplit(shifted[:, j], 3)) for j in range(n)]
+    return ca.Function("vectors", [none, error, seen], [ca.vertcat(*_vectors(legs, of_legs))])
+
+
+@cache
+def products_in_base(legs: tuple[LegInView, ...], n_unknowns: int) -> ca.Function:
+    """Return (9) and (9') of a view: (unknowns; -; ...) -> V_p . V_q in R_b less that in R_c.
+
+    Observed are, a column a leg, the known coordinates of A, the frames of v and of w and points of
+    w; then the products of :func:`pairs_of_vectors` in the camera, and the units of residuals.
+    """
+    n, pairs = len(legs), pairs_of_vectors(legs)
+    x, error, seen, unit = (ca.SX.sym("x", m) for m in (n_unknowns, 0, len(pairs), len(pairs)))
+    observed = [ca.SX.sym(f"o{k}", 3, size * n) for k, size in enumerate((1, 3, 3, 1))]
+    known, frames, of_actuators, points = observed
+    padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ...]]()
+    for j, leg in enumerate(legs):
+        own, each = padded[list(leg.places)], slice(3 * j, 3 * j + 3)
+        v = turned_frame(own[3:5], frames[:, each])[:, 0]
+        w = turned_frame(own[5:7], of_actuators[:, each])[:, 0]
+        c = points[:, j] + of_actuators[:, each][:, 1:] @ own[7:9]
+        of_legs.append((own[:3] + known[:, j], v, w, c))
+    V = _vectors(legs, of_legs)
+    residuals = ca.vertcat(*[ca.dot(V[p], V[q]) for p, q in pairs]) - seen
+    return ca.Function("products", [x, error, *observed, seen, unit], [residuals / unit])
+
+
+def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ...]]) -> list[ca.SX]:
+    """Return V of (A, v, w, c) of each leg: between joints, arms, then the unit vectors."""
+    V = [of_legs[g][0] - of_legs[j][0] for j, g in combinations(range(len(legs)), 2)]
+    for leg, (A, _, w, c) in zip(legs, of_legs, strict=True):
+        if leg.has_arm:
+            V.append(A - c - ca.dot(A - c, w) * w)
+    V += [v for leg, (_, v, _, _) in zip(legs, of_legs, strict=True) if leg.has_axis]
+    V += [w for leg, (_, _, w, _) in zip(legs, of_legs, strict=True) if leg.has_actuator]
+    return V
+
+
+def leg_end(q0: ca.SX, leg: ca.SX, error: ca.SX) -> ca.SX:
+    """Return (13): the end B = A + (q + q0) u of a leg (A, u, q, e1, e2), errors of u and q."""
+    u = leg[3:6] + leg[7:10] * error[0] + leg[10:13] * error[1]
+    return leg[:3] + (leg[6] + error[2] + q0) * u
+
+
+@cache
+def end_of_leg() -> ca.Function:
+    """Return (13): (q0; error; leg) -> B (3,) [m]."""
+    q0, error, leg = ca.SX.sym("q0"), ca.SX.sym("error", END_ERRORS), ca.SX.sym("leg", 13)
+    return ca.Function("end_of_leg", [q0, error, leg], [leg_end(q0, leg, error)])
+
+
+@cache
+def distance_of_ends() -> ca.Function:
+    """Return (q0 of two legs; errors; both legs) -> the distance of their ends [m]."""
+    q0, error, legs = ca.SX.sym("q0", 2), ca.SX.sym("error", 2 * END_ERRORS), _two_legs("legs")
+    return ca.Function("distance", [q0, error, legs], [_distance(q0, legs, error)])
+
+
+@cache
+def change_of_distance() -> ca.Function:
+    """Return (14): (q0 of two legs; errors; both before, after) -> the change of |B_j B_g| [m]."""
+    q0, error = ca.SX.sym("q0", 2), ca.SX.sym("error", 4 * END_ERRORS)
+    before, after = _two_legs("before"), _two_legs("after")
+    first, second = ca.vertsplit(error, 2 * END_ERRORS)
+    change = _distance(q0, after, second) - _distance(q0, before, first)
+    return ca.Function("change", [q0, error, before, after], [change])
+
+
+@cache
+def mean_distance() -> ca.Function:
+    """Return (16): (B_j, B_g; error; known, mean) -> |B_j B_g| in R_e less that of ends [m].
+
+    *known* (3, 2) are the coordinates that are no unknowns.
+    """
+    local, error, known = ca.SX.sym("local", 6), ca.SX.sym("error"), ca.SX.sym("known", 3, 2)
+    mean = ca.SX.sym("mean")
+    apart = local[3:] + known[:, 1] - local[:3] - known[:, 0]
+    residual = ca.norm_2(apart) - (mean + error)
+    return ca.Function("mean_distance", [local, error, known, mean], [residual])
+
+
+@cache
+def point_on_ray() -> ca.Function:
+    """Return (18): (P, step; error; known, R, t, centre, N, seen) -> (R P + t) x P_c (2,), range.
+
+    Both sides of the product [m^2] begin at the centre of the camera; N has two directions across
+    it. The third residual is what the product leaves out: by how much the point is too far along
+    the ray [m]. *known* are the coordinates of P that are no unknowns.
+    """
+    local, error, seen = ca.SX.sym("local", 9), ca.SX.sym("error", 3), ca.SX.sym("seen", 3)
+    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    point = moved_points(local[3:], R, t, local[:3] + known)
+    residual = _off_ray(point, seen + error, centre, N)
+    return ca.Function("ray", [local, error, known, R, t, centre, N, seen], [residual])
+
+
+@cache
+def end_on_ray() -> ca.Function:
+    """Return (18) of the end of a leg (13): (q0, B, step; error; known, R, t, centre, N, leg).
+
+    The residuals are those of :func:`point_on_ray`; errors are those of u, the reading, and A.
+    """
+    local, error = ca.SX.sym("local", 10), ca.SX.sym("error", END_ERRORS + 3)
+    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    leg = ca.SX.sym("leg", 13)
+    point = moved_points(local[4:], R, t, local[1:4] + known)
+    end = leg_end(local[0], leg, error) + error[END_ERRORS:]
+    residual = _off_ray(point, end, centre, N)
+    return ca.Function("end_on_ray", [local, error, known, R, t, centre, N, leg], [residual])
+
+
+@cache
+def end_on_axis() -> ca.Function:
+    """Return (19): (B; alpha, step; known, R, t, A, u, E) -> u x (B - A) (2,) [m]."""
+    B, error, known = ca.SX.sym("B", 3), ca.SX.sym("error", 8), ca.SX.sym("known", 3)
+    (R, t), A, (u, E) = _pose(), ca.SX.sym("A", 3), _direction()
+    end = moved_points(error[2:], R, t, B + known)
+    residual = E @ ca.cross(u + E.T @ error[:2], end - A)
+    return ca.Function("end_on_axis", [B, error, known, R, t, A, u, E], [residual])
+
+
+@cache
+def closure_of_leg(base_joint: JointType, platform_joint: JointType) -> ca.Function:
+    """Return the closure of a leg without an S joint, by which 3.5 finds universal axes.
+
+    (turns of a, of b, change of the twist; alpha, step; u, E, R, a, b, twist, unit) -> the sine of
+    how far the leg is from its twist, over the unit. a and b are the frames (3, 3) of the axes at
+    base and platform; of a leg fixed to the platform b has its direction there.
+    """
+    local, error, (u, E) = ca.SX.sym("local", 5), ca.SX.sym("error", 8), _direction()
+    R, a, b = (ca.SX.sym(name, 3, 3) for name in ("R", "a", "b"))
+    twist, unit = ca.SX.sym("twist"), ca.SX.sym("unit")
+    base = turned_frame(local[:2], a)[:, 0]
+    outer = turned_frame(local[2:4], b)[:, 1 if platform_joint is JointType.FIXED else 0]
+    direction = u + E.T @ error[:2]
+    p, w = (
+        axis_in_leg(joint, axis, direction, _SYMBOLS)
+        for joint, axis in (
+            (base_joint, base),
+            (platform_joint, turned_points(error[5:], R @ outer)),
+        )
+    )
+    sine = twist_residual(p, w, direction, twist + local[4], _SYMBOLS)
+    observed = [u, E, R, a, b, twist, unit]
+    return ca.Function("closure", [local, error, *observed], [sine / unit])
+
+
+@cache
+def nominal_value(n: int) -> ca.Function:
+    """Return (x (n,); -; row, target) -> row . x - target: what is known from the nominal model."""
+    x, row, target = ca.SX.sym("x", n), ca.SX.sym("row", n), ca.SX.sym("target")
+    none = ca.SX.sym("error", 0)
+    return ca.Function("nominal", [x, none, row, target], [ca.dot(row, x) - target])
+
+
+_SYMBOLS = VectorOps(ca.dot, ca.cross, lambda v: v / ca.norm_2(v), ca.cos, ca.sin)
+
+
+def _distance(q0: ca.SX, legs: ca.SX, error: ca.SX) -> ca.SX:
+    """Return the distance between the ends of two legs (13, 2), (13)."""
+    errors = ca.vertsplit(error, END_ERRORS)
+    first, second = (leg_end(q0[k], legs[:, k], errors[k]) for k in range(2))
+    return ca.norm_2(first - second)
+
+
+def _off_ray(point: ca.SX, seen: ca.SX, centre: ca.SX, N: ca.SX) -> ca.SX:
+    """Return how far a point is from the one seen: across its ray as in (18), and along it."""
+    along = ca.cross(N[0, :].T, N[1, :].T)
+    return ca.vertcat(N @ ca.cross(point - centre, seen - centre), ca.dot(along, point - seen))
+
+
+def _two_legs(name: str) -> ca.SX:
+    return ca.SX.sym(name, 13, 2)
+
+
+def _pose() -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3)
+
+
+def _ray() -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("centre", 3), ca.SX.sym("N", 2, 3)
+
+
+def _direction() -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("u", 3), ca.SX.sym("E", 2, 3)

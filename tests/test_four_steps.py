@@ -1,0 +1,388 @@
+"""The four steps: exact recovery, the printed criteria, what weights are worth, and refusals."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from actuated_sessions import MACHINES as ACTUATED
+from actuated_sessions import session as actuated
+from hexapod_sessions import extreme_poses, nominal_of
+from scipy.spatial.transform import RigidTransform, Rotation
+from staged_sessions import Observed, errors, exact_session, noisy_session, planned, shipped, staged
+from thinned import thinned
+
+from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.errors import NotIdentifiable
+from legcal.geometry.types import Array
+from legcal.machine.leg import LegKind, point_like_legs
+from legcal.machine.parameters import from_vector, to_vector
+from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
+from legcal.paper.criteria import Criteria
+from legcal.paper.four_steps import run_base_steps, run_platform_steps
+from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
+from legcal.simulation.paper import platform_errors
+
+CRITERIA: tuple[Criteria, ...] = ("default", "literal")
+# (9) and (16) are even in coordinates that are zero for coplanar joints: from 3 mm away they
+# converge slowly.
+EVEN = ("hexapod", "hexapod-strut", "6-sps", "nategh-agheli", "3-rps", "tricept")
+DETERMINED = ("3-rpr", "3-spr", "3-upu", "3-upu-tilted", "3-prs")
+
+
+def exact(name: str) -> Observed:
+    """Return an exact session; nominal legs are 3 mm and 1 deg off."""
+    observed = planned(actuated(name, images=8)) if name in ACTUATED else shipped(name)
+    return observed.known(1e-3)
+
+
+# Exact recovery
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+@pytest.mark.parametrize("name", thinned([*EVEN, *DETERMINED], ["3-rpr", "3-rps", "tricept"]))
+def test_exact_axes_give_the_machine_from_3_mm_and_1_degree(name: str, criteria: Criteria) -> None:
+    observed = exact(name)
+    before = np.abs(observed.errors(observed.nominal.legs))
+    found = observed.run(criteria)
+    error = np.abs(observed.errors(found.legs))
+    if name == "3-upu":  # what axes on base and platform have in common does not show
+        assert "base axes of legs 1, 2 and 3" in found.diagnostics[-1]
+        error, before = error[~observed.is_angle], before[~observed.is_angle]
+    slow = name in EVEN and criteria == "literal"
+    assert error.max() < (0.12 if slow else 1e-3) * before.max()
+    for T, true in zip(found.base.T_Rb_camera, observed.T_camera_Rb, strict=True):
+        assert T is not None
+        assert np.abs((T * true).as_matrix() - np.eye(4)).max() < (5e-3 if slow else 1e-5)
+    passive = [leg.kind is LegKind.PASSIVE for leg in observed.true_legs]
+    assert np.isnan(found.machine.offsets).tolist() == passive
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+@pytest.mark.parametrize("name", thinned(ACTUATED, ["6-rss", "delta", "3-prs"]))
+def test_exact_axes_give_joints_on_carriages_and_arms(name: str, criteria: Criteria) -> None:
+    observed = exact(name)
+    found = observed.run(criteria)
+    assert not any("moving" in text for text in found.diagnostics)
+    shared = {leg.actuator.joint: leg.actuator for leg in found.legs if leg.actuator}
+    for leg, true in zip(found.base.machine.legs, observed.true_legs, strict=True):
+        assert leg.actuator is not None
+        assert true.actuator is not None
+        assert np.abs(leg.A - true.A).max() < 2e-5
+        assert np.abs(leg.actuator.numbers(true.actuator)[:4]).max() < 5e-4  # even in some of them
+        assert np.allclose(leg.actuator.axis, shared[leg.actuator.joint].axis, atol=1e-12)
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+def test_twists_are_found_on_request(criteria: Criteria) -> None:
+    observed = exact("3-upu-tilted")
+    start = tuple(
+        replace(leg, twist=float(leg.twist or 0.0) + 0.01) for leg in observed.nominal.legs
+    )
+    observed = replace(observed, nominal=replace(observed.nominal, legs=start))
+    assert [leg.twist for leg in observed.run(criteria).legs] == [leg.twist for leg in start]
+    freed = observed.run(criteria, free_twists=True)
+    assert np.abs(observed.errors(freed.legs, twists=True)).max() < 1e-6
+
+
+# Criteria as printed
+
+PRINTED = {  # of legs 2 and 3 or 4 of noisy sessions: A, B, q0, and the axis, as first computed
+    "hexapod": [
+        (1, [0.3914152124794648, -0.08339065793461028, -0.001400064363207507],
+         [0.057489446087665, -0.062478382594860354, 0.004247123575244857], 0.3431036533368862,
+         None),
+        (3, [0.342694970556992, 0.38203761850985063, -0.0006972368403777643],
+         [0.36428110403845726, 0.07942792019416761, 0.001308084035415784], 0.3427577801278422,
+         None),
+    ],
+    "3-rps": [
+        (1, [0.5132267493407142, 0.0, 0.0], [0.3141555055466211, 0.0, 0.0], 0.3724419571698232,
+         [-0.4606222034795234, -0.8857314231657163, 0.05750679680266918]),
+        (2, [0.25323668121056997, 0.4489324138661524, 0.0],
+         [0.15723609035449898, 0.27180604079479304, 0.0], 0.38223015401639676,
+         [0.9997458826440819, -0.00913989070775614, -0.02060661384254448]),
+    ],
+    "3-spr": [
+        (2, [0.258925168144608, 0.4495010230332237, 0.0],
+         [0.1603012994091835, 0.27263636506157246, 0.0], 0.3864003181071549,
+         [0.9969302653316683, -0.07731971468229672, -0.012316971510008018]),
+    ],
+    "tricept": [
+        (3, [0.36434010679870016, 0.21025370580068353, -0.0030627960399320924],
+         [0.13194427181607235, 0.08437689175288943, 0.0], 0.0,
+         [-0.8580759271303936, -0.513373794199095, -0.012371366494476446]),
+    ],
+    "hexaglide": [
+        (3, [0.28894260684622347, 0.40079566887258605, 0.008319699582701626],
+         [0.20437430989193636, 0.04755348696029095, 0.00609283416143072], 0.38361859944982335,
+         None),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_printed_criteria_keep_their_numbers(name: str) -> None:
+    found = shipped(name, noise=0.25, n_poses=10).run("literal").legs
+    for j, A, B, q0, axis in PRINTED[name]:
+        own = found[j].base_axis if found[j].base_axis is not None else found[j].platform_axis
+        for value, printed in ((found[j].A, A), (found[j].B, B), (found[j].q0, q0), (own, axis)):
+            if printed is not None:
+                np.testing.assert_allclose(value, printed, rtol=1e-9, atol=1e-10)
+
+
+def test_printed_criteria_are_even_in_z_of_coplanar_joints_and_accept_a_mirror_image() -> None:
+    session = exact_session()
+    true, up = session.machine.parameters, np.array([1.0, 1.0, -1.0])
+    nominal = nominal_of(session.machine)
+    flat, mirrored = (
+        replace(nominal, legs=point_like_legs(replace(
+            true, base_joints=true.base_joints * by, platform_joints=true.platform_joints * by
+        )))
+        for by in (np.array([1.0, 1.0, 0.0]), up)
+    )  # fmt: skip
+    found = staged(session, flat, "literal").parameters
+    for joints in (found.base_joints, found.platform_joints):
+        assert np.abs(joints[:, 2]).max() < 1e-6
+    assert errors(found, session.machine).max() > 5e-4
+    assert errors(staged(session, mirrored, "literal").parameters, mirrored).max() < 1e-6
+    with_weights = staged(session, flat)
+    assert errors(with_weights.parameters, session.machine).max() < 1e-6
+    assert with_weights.diagnostics == ()
+
+
+# Weights
+
+
+@pytest.mark.parametrize(
+    ("noise", "criteria", "low", "high"),
+    [
+        (TableNoise(), "literal", 0.0, 1.0),  # worse than the nominal model
+        (TableNoise(), "default", 5.0, np.inf),
+        (OutlineNoise(0.25, 100), "literal", 0.0, 1.0),  # thin distant legs
+        (OutlineNoise(0.25, 100), "default", 5.0, np.inf),
+    ],
+)
+def test_weights_improve_the_model_where_weights_of_one_make_it_worse(
+    noise: OutlineNoise | TableNoise, criteria: Criteria, low: float, high: float
+) -> None:
+    means = np.zeros(2)
+    for seed in range(2):
+        session, nominal = noisy_session(seed, noise)
+        poses = extreme_poses(session.machine, 5, 99)
+        found = staged(session, nominal, criteria)
+        for k, legs in enumerate((nominal.legs, found.legs)):
+            means[k] += platform_errors(session.machine, legs, poses).dX
+    assert low < means[0] / means[1] < high
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rps"])
+def test_covariances_of_joints_in_cameras_are_true(name: str) -> None:
+    """Normalised squared errors of A by view and leg: 1 by rights; outlier weights cost a bit."""
+    squares = []
+    for seed in range(2):
+        observed = shipped(name, n_poses=10, noise=0.2, seed=seed)
+        joints = locate_joints_in_cameras(
+            observed.nominal, observed.axes, observed.measurements, weighted=True
+        )
+        for v, j in np.argwhere(joints.located):
+            e = joints.A[v, j] - observed.T_camera_Rb[v].apply(observed.A_Rb[j])
+            squares.append(e @ np.linalg.solve(joints.covariance[v, j, :3, :3], e) / 3.0)
+    assert 0.5 < np.mean(squares) < 1.7
+
+
+def test_directions_adjusted_to_their_joints_are_better_than_those_of_single_images() -> None:
+    observed = shipped("3-rps", n_poses=10, noise=0.3)
+    joints = run_base_steps(observed.nominal, observed.axes, observed.measurements).in_cameras
+    true = shipped("3-rps", n_poses=10).axes
+    before, after = (
+        np.linalg.norm(np.cross(axes.u, true.u), axis=1) for axes in (observed.axes, joints.axes)
+    )
+    assert np.sqrt(np.mean(after**2)) < 0.6 * np.sqrt(np.mean(before**2))
+
+
+def test_wrong_outlines_hardly_matter() -> None:
+    session, nominal = noisy_session(0, OutlineNoise())
+    offsets = np.zeros((len(session.outlines), 2))
+    offsets[::40] = 15.0
+    camera = session.measurements.views[0].camera
+    h, ends = shifted_outlines(camera, session.outlines.h, session.outlines.ends, offsets)
+    wrong = replace(session.outlines, h=h, ends=ends)
+    axes = axes_from_outlines(wrong, session.measurements, session.radii)
+    result = staged(replace(session, axes=axes), nominal)
+    assert any("Leg leg1 in image 1 was left out" in text for text in result.diagnostics)
+    clean = errors(staged(session, nominal).parameters, session.machine).max()
+    assert errors(result.parameters, session.machine).max() < 2.0 * clean + 1e-4
+
+
+# Invariance
+
+
+def in_other_frames(axes: LegAxes, R: Array) -> LegAxes:
+    """Return axes whose camera frames are turned by R (n, 3, 3)."""
+    return replace(
+        axes,
+        u=np.einsum("nij,nj->ni", R, axes.u),
+        M=np.einsum("nij,nj->ni", R, axes.M),
+        basis=np.einsum("nij,nkj->nki", R, axes.basis),
+    )
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+@pytest.mark.parametrize("change", ["cameras", "legs", "views"])
+def test_turned_cameras_and_other_orders_change_nothing(change: str, criteria: Criteria) -> None:
+    observed = shipped("3-rps", noise=0.1)
+    nominal, axes, m = observed.nominal, observed.axes, observed.measurements
+    order, legs = np.array([1, 2, 0]), np.arange(3)
+    if change == "cameras":
+        turns = np.array([T.rotation.as_matrix() for T in observed.T_camera_Rb])
+        axes = in_other_frames(axes, turns[m.view[axes.row]])
+    elif change == "legs":
+        legs, place = order, np.argsort(order)
+        axes, m = replace(axes, leg=place[axes.leg]), replace(m, q=m.q[:, order])
+        nominal = replace(
+            nominal,
+            leg_names=tuple(nominal.leg_names[j] for j in order),
+            legs=tuple(nominal.legs[j] for j in order),
+            frame_legs=tuple(int(place[j]) for j in nominal.frame_legs),
+        )
+    else:
+        m = replace(m, views=tuple(m.views[v] for v in order), view=np.argsort(order)[m.view])
+    first = observed.run(criteria)
+    second = replace(observed, nominal=nominal, axes=axes, measurements=m).run(criteria)
+    for one, other in zip([first.legs[j] for j in legs], second.legs, strict=True):
+        for a, b in ((one.A, other.A), (one.B, other.B), (one.q0, other.q0)):
+            assert np.allclose(a, b, rtol=0.0, atol=1e-6)
+        assert one.base_axis is not None
+        assert np.allclose(one.base_axis, other.base_axis, atol=1e-5)
+
+
+def test_scaling_all_lengths_scales_the_result() -> None:
+    scale = 100.0
+    session, nominal = noisy_session(0, OutlineNoise(), n_poses=6)
+    axes, m = session.axes, session.measurements
+    by = np.array([1.0, 1.0, scale, scale])
+    larger = replace(
+        session,
+        axes=replace(axes, M=scale * axes.M, covariance=axes.covariance * np.outer(by, by)),
+        measurements=replace(m, q=scale * m.q, sigma_q=scale * m.sigma_q),
+    )
+    vector = partial(to_vector, frame_legs=nominal.frame_legs)
+    scaled = from_vector(scale * vector(nominal.parameters), 6, nominal.frame_legs)
+    first = staged(session, nominal)
+    second = staged(larger, replace(nominal, legs=point_like_legs(scaled)))
+    apart = scale * vector(first.parameters) - vector(second.parameters)
+    assert np.abs(apart).max() < 1e-7 * scale
+
+
+# Where cameras stand
+
+
+def test_axes_across_the_line_of_two_joints_place_a_camera_unless_two_places_fit_alike() -> None:
+    A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    across = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1]])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    T = RigidTransform.from_components([0.2, -0.3, 1.0], Rotation.from_rotvec([0.4, 0.2, -0.3]))
+    seen = T.apply(A), T.rotation.apply(across) * [[1.0], [-1.0]]
+    (found,), fixed = candidate_camera_poses(A, across, *seen)
+    assert fixed
+    assert np.abs((found * T).as_matrix() - np.eye(4)).max() < 0.01  # of the turns that are tried
+    assert signs_seen(across, seen[1], found).tolist() == [1.0, -1.0]
+    square = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    assert len(candidate_camera_poses(A, square, A, square)[0]) == 2  # half a turn about the line
+    along = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    assert candidate_camera_poses(A, along, A, along)[1] is False
+    assert candidate_camera_poses(A[:1], along[:1], A[:1], along[:1]) == ([], False)
+
+
+# Which legs and images take part, and refusals
+
+
+def test_a_motor_that_counts_backwards_changes_nothing() -> None:
+    session, nominal = noisy_session(0, OutlineNoise(), n_poses=8)
+    sign = np.array([1, -1, 1, -1, -1, 1])
+    m = session.measurements
+    legs = tuple(replace(leg, sign=s) for leg, s in zip(nominal.legs, sign.tolist(), strict=True))
+    forth, back = (
+        run_platform_steps(run_base_steps(one, session.axes, m), replace(m, q=m.q * s))
+        for one, s in ((nominal, 1), (replace(nominal, legs=legs), sign))
+    )
+    assert np.allclose(back.parameters.offsets, forth.parameters.offsets, rtol=0.0, atol=1e-12)
+
+
+def test_legs_that_meet_in_one_platform_joint_are_no_pair() -> None:
+    observed = shipped("hexapod")
+    B = [observed.nominal.legs[j].B for j in (0, 0, 2, 2, 4, 4)]
+    legs = [replace(leg, B=b) for leg, b in zip(observed.nominal.legs, B, strict=True)]
+    some = observed.axes.choose(np.flatnonzero(np.isin(observed.axes.leg, (0, 1))))
+    base = run_base_steps(observed.nominal, observed.axes, observed.measurements)
+    machine = replace(base.machine, legs=tuple(legs))
+    base = replace(base, machine=machine, in_cameras=replace(base.in_cameras, axes=some))
+    with pytest.raises(NotIdentifiable, match="end in different places of it"):
+        run_platform_steps(base, observed.measurements)
+
+
+def without_leg_5(o: Observed) -> LegAxes:
+    return o.axes.choose(np.flatnonzero(o.axes.leg != 4))
+
+
+def once_a_view(o: Observed) -> LegAxes:
+    first = [np.flatnonzero(o.measurements.view == v)[0] for v in range(3)]
+    return o.axes.choose(np.flatnonzero((o.axes.leg != 4) | np.isin(o.axes.row, first)))
+
+
+def two_legs_a_view(o: Observed) -> LegAxes:
+    return o.axes.choose(np.flatnonzero(o.axes.leg // 2 == o.measurements.view[o.axes.row]))
+
+
+def leg_6_alone(o: Observed) -> LegAxes:
+    view = o.measurements.view[o.axes.row]
+    return o.axes.choose(np.flatnonzero((o.axes.leg == 5) == (view == 2)))
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+@pytest.mark.parametrize(
+    ("name", "shown", "words"),
+    [
+        ("hexapod", without_leg_5, "base joint of leg leg5 could not be located: found no view"),
+        ("hexapod", once_a_view, "found in one image, and at least two different directions"),
+        ("hexapod", two_legs_a_view, "3 scalar products in all views for 12 unknowns"),
+        ("hexapod", leg_6_alone, "locates the base joints of leg6 together with"),
+    ],
+)  # fmt: skip
+def test_what_images_do_not_show_is_refused_by_leg(
+    name: str, shown: Callable[[Observed], LegAxes], words: str, criteria: Criteria
+) -> None:
+    observed = shipped(name)
+    with pytest.raises(NotIdentifiable) as refusal:
+        replace(observed, axes=shown(observed)).run(criteria)
+    assert words in str(refusal.value)
+
+
+def test_a_view_without_a_leg_is_named_and_the_others_locate_it() -> None:
+    observed = exact("hexapod")
+    view = observed.measurements.view[observed.axes.row]
+    here = np.flatnonzero((view == 0) & (observed.axes.leg == 2))
+    axes = observed.axes.choose(np.setdiff1d(np.arange(len(view)), here[1:]))
+    found = replace(observed, axes=axes).run()
+    assert "leg3 in view c1 was left out: it was found in one image" in found.diagnostics[0]
+    assert np.abs(observed.errors(found.legs)).max() < 1e-5
+
+
+@pytest.mark.parametrize("criteria", CRITERIA)
+def test_offsets_and_axes_that_no_image_shows_together_are_refused(criteria: Criteria) -> None:
+    observed = shipped("3-spr")
+    m = observed.measurements
+    base = run_base_steps(observed.nominal, observed.axes, m, criteria=criteria)
+    axes = base.in_cameras.axes
+    first = [np.flatnonzero(m.view == v)[0] for v in range(3)]
+    for kept, words in (
+        (axes.leg == axes.row % 3, "no image shows two legs of known length"),
+        (np.isin(axes.row, first), "no view shows the same two legs in two images"),
+        (axes.leg != axes.row % 3, "no pose shows three legs of known length at once"),
+    ):
+        some = replace(base.in_cameras, axes=axes.choose(np.flatnonzero(kept)))
+        with pytest.raises(NotIdentifiable, match=words):
+            run_platform_steps(replace(base, in_cameras=some), m, criteria=criteria)
