@@ -1053,7 +1053,8 @@ def _models() -> Iterable[Refusal]:
         ("urdf-text", text(u, "not xml"), ("could not be read",)),
         ("utf-16", _in_utf_16, ("UTF-8",)),
     ]  # fmt: skip
-    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", rows)
+    placed = [(name, edits, ("{in}", *named)) for name, edits, named in rows]
+    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", placed)
     yield Refusal("model-urdf-alone", "inspect {in}/arm.urdf", ("arm.urdf",), "model",
                   (_alone,))  # fmt: skip
     yield Refusal("model-table", "inspect {in}/3-rps.yaml", ("3-rps.yaml", "legcal new"), "tables")
