@@ -51,11 +51,13 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import arms_at
-from legcal.perception.outline import WIDTH_TOLERANCE
-from legcal.planning.request import LENGTH_SIGMA
+from legcal.perception.outline import WIDTH_PART
+from legcal.perception.tuning import WIDTH_PX
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines, noisy_outlines
 from legcal.simulation.settings import Level, SimulationSettings
+
+LENGTH_SIGMA = 5e-5  # [m] of a length measured by hand
 
 N_VIEWS, N_POSES = 3, 15
 _CIRCLE = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 720)])
@@ -121,7 +123,7 @@ def seen_as(design: Design, sections: tuple[Array, Array]) -> Outlines:
 
 def _refused(outlines: Outlines, design: Design) -> Outlines:
     """Return outlines without the pairs of arms whose width is not that of the cylinder."""
-    exact, least = design.outlines, WIDTH_TOLERANCE
+    exact, least = design.outlines, (WIDTH_PX, WIDTH_PART)
     own = np.flatnonzero(are_of_arms(outlines, design.legs.nominal)).reshape(-1, 2)
     wide, expected = (
         np.linalg.norm(ends[own[:, 1]] - ends[own[:, 0]], axis=-1).mean(axis=1)

@@ -109,7 +109,7 @@ def information_of(design: Design, sigma_q: float, radius_sigma: float) -> Array
         shared[:, parameters] -= own @ np.linalg.pinv(F[constraints], rcond=_RANK) @ G[constraints]
         rows.append(_without(own @ right[rank:].T, shared))
     radius = np.array([design.legs.radii[part] for part in design.parts])
-    sigmas = np.concatenate([radius_sigma * radius, arm_sigmas(design.arms)])
+    sigmas = np.concatenate([radius_sigma * radius, arm_sigmas(design.arms, design.legs.nominal)])
     known = np.zeros((len(sigmas), n_cameras + n_parameters + len(sigmas)))
     known[:, n_cameras + n_parameters :] = np.diag(1.0 / sigmas)
     together = np.concatenate([*rows, known])

@@ -253,12 +253,15 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
 def closed_poses(
     legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array
 ) -> tuple[Array, Array]:
-    """Return the nearest poses at which everything holds that legs demand without a reading."""
+    """Return the nearest poses at which everything holds that legs demand without a reading.
+
+    A metre is as far as one radian.
+    """
     if len(frame_legs) < 3:  # turned and lifted into the plane of motion
         angle = np.arctan2(R[:, 1, 0], R[:, 0, 0])
         R = Rotation.from_euler("z", angle[:, None]).as_matrix()
         t = np.column_stack([t[:, :2], np.full(len(t), np.mean([x.A[2] - x.B[2] for x in legs]))])
-    found = solve_poses(legs, frame_legs, R, t)
+    found = solve_poses(legs, frame_legs, R, t, scale=np.ones(6))
     if found.missed.max(initial=0.0) < _CLOSED:
         return found.R, found.t
     raise DidNotConverge(
@@ -344,7 +347,9 @@ def draw_session(
     nominal = moved_legs(true.nominal, design.parametrization.place, step)
     arms = design.arms
     if len(arms):
-        nominal = moved_legs(nominal, arms.place, arm_sigmas(arms) * rng.normal(size=len(arms)))
+        nominal = moved_legs(
+            nominal, arms.place, arm_sigmas(arms, nominal) * rng.normal(size=len(arms))
+        )
     radii = {
         part: radius * float(1.0 + noise.radius_sigma * rng.normal())
         for part, radius in true.radii.items()
@@ -362,9 +367,11 @@ def draw_session(
     return OutlineSession(legs, measurements, outlines, home)
 
 
-def arm_sigmas(arms: Parametrization) -> Array:
+def arm_sigmas(arms: Parametrization, legs: Sequence[Leg]) -> Array:
     """Return how well lines of arms are known before [rad, m]: as the joint fit takes them."""
-    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": DEFAULT_SETTINGS.arm_point_sigma}
+    length = float(np.mean([leg.q0 for leg in legs]))
+    point = DEFAULT_SETTINGS.arm_point_sigma * length
+    known = {"rad": DEFAULT_SETTINGS.arm_axis_sigma, "m": point}
     return np.array([known[unit] for unit in arms.units])
 
 

@@ -38,15 +38,16 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.goals import workspace_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Predictor
-from legcal.planning.places import Place, all_points, places_along
+from legcal.planning.places import Place, all_points, places_along, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
 from legcal.planning.poses import surely_reached
-from legcal.planning.request import LENGTH_SIGMA
 from legcal.planning.session import write_session
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 from legcal.vision.camera import sample_camera
+
+LENGTH_SIGMA = 5e-5  # [m] of a length measured by hand
 
 MACHINES = ("hexapod", "3-upu-tilted", "3-rpr", "3-rps", "tricept")
 _LIFTS = {True: (0.1, 0.7), False: (0.8, 1.3)}  # [rad] of random places; planar machines: False
@@ -143,7 +144,7 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
         choices = Choices(priors={f"{rod[0].name}.length": known})
     sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
     predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
-    scene = Scene.nominal(Task(predictor, args.images, args.cameras))
+    scene = Scene.nominal(Task(predictor, args.images, args.cameras, usual_setting(machine.size)))
     work = workspace_of(machine, predictor.legs)
     if work is None:
         raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")

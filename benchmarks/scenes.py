@@ -34,12 +34,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.perception.camera_search import NOMINAL_JOINT_ERROR, place_camera, refined, scores
+from legcal.perception.camera_search import place_camera, refined, scores
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.detection import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import place_views
+from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
 from legcal.simulation.visibility import field_of_view, silhouette
 from legcal.workers import worker_pool
@@ -151,7 +152,7 @@ def has_doubt(scene: Scene) -> bool:
     true = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
     others = place_camera(pictures, n_legs).poses
     every = Pictures.of(pictures)
-    poses = refined(every, CameraPoses.joined([true, others]), IDEAL, NOMINAL_JOINT_ERROR)
+    poses = refined(every, CameraPoses.joined([true, others]), IDEAL, JOINT_ERROR)
     support = scores(every, poses, IDEAL[-1])
     apart = [not _same(_pose(poses, i), truth.T_base_camera) for i in range(len(poses))]
     return bool(np.max(support[apart], initial=0.0) >= AS_WELL * support[0])

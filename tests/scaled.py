@@ -15,15 +15,17 @@ def scaled_dataset(source: Path, folder: Path, factor: float) -> Path:
     Photographs are of directions alone: those of the larger machine from farther away are the same.
     Readings of a motor that turns stay, and all lengths must be written in metres.
     """
-    shutil.copytree(
-        source, folder, ignore=shutil.ignore_patterns(".legcal-cache*", "truth", "observations.csv")
-    )
+    kept = [".legcal-cache.json", "observations.csv"]  # of an earlier detection
+    left = kept if (source / kept[0]).exists() else []
+    shutil.copytree(source, folder, ignore=shutil.ignore_patterns("truth", *left))
     prismatic = set[str]()
     for urdf in folder.rglob("*.urdf"):
         prismatic |= _scale_urdf(urdf, factor)
     for model in folder.glob("models/*.yaml"):
         text = yaml.safe_load(model.read_text(encoding="utf-8"))
         _scale_pose(text["legcal"].get("home"), factor)
+        for joint in prismatic.intersection(text["legcal"].get("home_readings", {})):
+            text["legcal"]["home_readings"][joint] *= factor
         model.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
     path = folder / "dataset.yaml"
     text = yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +90,8 @@ def test_twists_are_found_on_request(criteria: Criteria) -> None:
 
 # Criteria as printed
 
-PRINTED = {  # of legs 2 and 3 or 4 of noisy sessions: A, B, q0, and the axis, as first computed
+# Of legs 2 and 3 or 4 of noisy sessions: A, B, q0, and the axis, as first computed
+PRINTED: dict[str, list[tuple[Any, ...]]] = {
     "hexapod": [
         (1, [0.3914152124794648, -0.08339065793461028, -0.001400064363207507],
          [0.057489446087665, -0.062478382594860354, 0.004247123575244857], 0.3431036533368862,
@@ -256,6 +258,7 @@ def test_turned_cameras_and_other_orders_change_nothing(change: str, criteria: C
         for a, b in ((one.A, other.A), (one.B, other.B), (one.q0, other.q0)):
             assert np.allclose(a, b, rtol=0.0, atol=1e-6)
         assert one.base_axis is not None
+        assert other.base_axis is not None
         assert np.allclose(one.base_axis, other.base_axis, atol=1e-5)
 
 

@@ -19,7 +19,6 @@ from thinned import thinned
 import legcal
 from legcal.calibration.identify.information import (
     INTRINSICS,
-    SIGMA_EXACT,
     expected_intrinsics,
     image_rows,
     intrinsics_changes,
@@ -121,9 +120,9 @@ def leg_values(session: PredictedObservations, step: Array, x: Array) -> Array:
         new = changed(leg, parameters[session.parametrization.place[j]])
         found = linearize_leg(new, R[None], (session.t[0] + x[3:])[None]).values[0]
         if leg.kind is not LegKind.PASSIVE:
-            sigma = session.sigma_q if leg.kind is LegKind.ACTUATED else SIGMA_EXACT
+            sigma = session.sigma_q if leg.kind is LegKind.ACTUATED else session.sigma_exact
             values.append(found[0] / sigma)
-        values += (found[1:] * session.length[0, j] / SIGMA_EXACT).tolist()
+        values += (found[1:] * session.length[0, j] / session.sigma_exact).tolist()
     return np.array(values)
 
 

@@ -131,9 +131,9 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
     )
     text = " ".join(str(line) for line in _verdict(report))
     assert "calibrate refuses this machine until a length or radii are stated" in text
-    assert "leg1.length measured to 0.05 mm" in identify_verdict(report).reasons[0]
+    assert "leg1.length measured to 0.019 mm" in identify_verdict(report).reasons[0]
     assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
-    assert "better is leg1.length measured to 0.05 mm, or a calibration board on the base" in text
+    assert "better is leg1.length measured to 0.019 mm, or a calibration board on the base" in text
 
 
 def gained(name: str) -> PredictedObservations:
@@ -174,7 +174,7 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     )
     dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
     wanted = (
-        "leg1.length measured to 0.05 mm, or a calibration board on the base .*=MEASURED.*--set"
+        "leg1.length measured to 0.019 mm, or a calibration board on the base .*=MEASURED.*--set"
     )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)

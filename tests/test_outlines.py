@@ -17,7 +17,7 @@ from legcal.machine.leg import Cylinder
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
-from legcal.perception.part_edges import MIN_LONE_SCORE, EdgePair, _alone
+from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone
 from legcal.perception.photographs import measure_photographs, with_measured_radii
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import MeasuredEdge
@@ -328,7 +328,7 @@ def test_an_edge_stands_alone_only_without_a_rival() -> None:
     # As the edges of parts, each beside another one of them.
     other = np.roll(np.arange(len(cases)), 1)
     both = np.stack([np.arange(len(cases)), other], axis=1)
-    least = np.full(len(cases), MIN_LONE_SCORE)
+    least = np.full(len(cases), LONE_SCORE)
     np.testing.assert_array_equal(_alone(shift[both], score[both], least), expected[both])
 
 

@@ -43,7 +43,7 @@ from legcal.planning.exchange import Session, choose
 from legcal.planning.goals import criterion_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
 from legcal.planning.noise import read_noise
-from legcal.planning.places import Place, Setting, parse_bounds
+from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.request import difference
@@ -53,7 +53,7 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
-FEW = Setting(draws=3)
+FEW = replace(usual_setting(load_mechanism("3-rpr").size), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 
@@ -379,11 +379,13 @@ def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -
     """From where a machine is shown as well, wherever that is."""
     predictor = Predictor(load_mechanism("hexapod"), sample_camera(), WHITE, 1e-6)
     poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
-    around = [p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1), poses)]
+    around = [
+        p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1, FEW), poses)
+    ]
     middle = np.mean(around[:2], axis=0)  # one nearer than the other
     box = middle[:, None] + [-0.01, 0.01]
     assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
-    places = planner._places(Task(predictor, 6, 1, bounds=box), poses)
+    places = planner._places(Task(predictor, 6, 1, FEW, bounds=box), poses)
     assert places
     assert all(place.is_inside(box) for place in places)
 
@@ -391,7 +393,7 @@ def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -
 def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
     """A tripod stands on the ground, whichever way the platform is."""
     places = planner._places(
-        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1),
+        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1, FEW),
         random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
     )
     below = [place.T_base_camera.translation[2] < -0.5 for place in places]
@@ -418,7 +420,7 @@ def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
 
 
 def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
-    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1)
+    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
     view = planned.views[0]
     candidates = Candidates(Place(view.T_base_camera), view.poses)
     found = Scene.nominal(task).of(candidates)
@@ -461,10 +463,14 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"noise": __file__}, UsageError, "found no JSON document"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
-    ({"setting": Setting(draws=0)}, UsageError, "0 draws"),
-    ({"setting": Setting(shift=50.0)}, UsageError, "off by 50 m"),
-    ({"setting": Setting(length=3.0)}, UsageError, "a model error of 3 m"),
-    ({"setting": Setting(length=0.5), "images": 4}, DidNotConverge, "; plan with a smaller length"),
+    ({"setting": Setting(0.05, 2e-3, draws=0)}, UsageError, "0 draws"),
+    ({"setting": Setting(50.0, 2e-3)}, UsageError, "off by 50 m"),
+    ({"setting": Setting(0.05, 3.0)}, UsageError, "a model error of 3 m"),
+    (
+        {"setting": Setting(0.05, 0.5), "images": 4},
+        DidNotConverge,
+        "; plan with a smaller length",
+    ),
     ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
     ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
 ]

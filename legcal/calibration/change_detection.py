@@ -27,7 +27,7 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, twist_after, vector_of
 from legcal.machine.rods import actuator_index, actuators_of
 
-_STEP = 1e-6  # [m or rad]
+_STEP = 1e-6  # of numerical derivatives [rad], and of the mean leg length
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,23 +181,29 @@ def possible_changes(
         for a, one in enumerate(actuators_of(legs))
     ]
 
-    def derivative(which: Sequence[int], moved: _Moved, k: int) -> Array:
+    def derivative(which: Sequence[int], moved: _Moved, k: int, unit: str) -> Array:
         """Return that of the parameters by number k of what changes at some legs, (p,)."""
+        size = _STEP * (machine.size if unit == "m" else 1.0)
         before, after = (
             _in_frames_of_joints(
                 [moved(leg, k, step) if j in which else leg for j, leg in enumerate(legs)],
                 frame_legs,
             )
-            for step in (-_STEP, _STEP)
+            for step in (-size, size)
         )
         change = vector_of(parametrization, after, legs) - vector_of(parametrization, before, legs)
-        return np.asarray(change / (2.0 * _STEP))
+        return np.asarray(change / (2.0 * size))
 
     for name, which, changes in things:
         of_thing = list[Change]()
         for what, components, units, link, moved in changes:
-            columns = np.column_stack([derivative(which, moved, k) for k in range(len(components))])
-            found = np.any(np.abs(columns) > _STEP, axis=0)
+            columns = np.column_stack(
+                [derivative(which, moved, k, unit) for k, unit in enumerate(units)]
+            )
+            is_length = np.array([unit == "m" for unit in (*parametrization.units, *units)])
+            metre = np.where(is_length, machine.size, 1.0)
+            relative = columns * metre[-len(units) :] / metre[: len(columns), None]
+            found = np.any(np.abs(relative) > _STEP, axis=0)
             if found.any():
                 kept = np.flatnonzero(found).tolist()
                 of_thing.append(

@@ -57,9 +57,9 @@ from legcal.workers import Run, in_turn
 Beside = Callable[[Calibration, Path], None]
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe
-RELOAD_TOLERANCE = 1e-11  # between reloaded and written parameters [m, rad]
+RELOAD_TOLERANCE = 2.5e-11  # mean leg lengths, [rad] between reloaded and written parameters
 MAX_HOME_RESIDUAL = 0.2  # of a leg length: of calibrated legs at the nominal home
-ROUNDING = 1e-9  # of numbers in files [m]
+ROUNDING = 2.5e-9  # mean leg lengths, [rad]: of numbers in files
 SYMMETRY_TOLERANCE = 1e-6  # relative, of covariances
 
 
@@ -145,11 +145,12 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     written = reload_and_check(yaml)
     found = parametrization_of(written, twists=True)
     apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)
-    off = float(np.abs(apart).max())
+    unit = np.where([unit == "m" for unit in found.units], machine.size, 1.0)
+    off = float(np.abs(apart / unit).max())
     if not off <= RELOAD_TOLERANCE:
         raise DidNotConverge(
-            f"{start} that its parameters, loaded again, differ by {off:.1e} m or rad from the "
-            f"computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
+            f"{start} that its parameters, loaded again, differ by {off:.1e} leg lengths or rad "
+            f"from the computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
         )
 
 
@@ -325,7 +326,8 @@ def _kinematic(
     sigma = np.sqrt(np.diagonal(of_all))[both]
     apart = (covariance[np.ix_(at, at)] - of_all[np.ix_(both, both)]) / np.outer(sigma, sigma)
     is_same = np.abs(apart).max(initial=0.0) <= SYMMETRY_TOLERANCE
-    if not is_same or np.abs(covariance - covariance.T).max() > ROUNDING:
+    largest = np.abs(covariance).max()
+    if not is_same or np.abs(covariance - covariance.T).max() > SYMMETRY_TOLERANCE * largest:
         raise unreadable(path, "another matrix in 'kinematic'", needed)
     return covariance, held
 
@@ -345,7 +347,7 @@ def _check_same_model(
         name
         for name, number in numbers.items()
         if ParameterId.parse(name).kind not in turned
-        and not abs(values.get(name, number) - number) <= ROUNDING
+        and not abs(values.get(name, number) - number) <= ROUNDING * machine.size
     ]
     later = ("twist", *ARMS)  # what results of earlier versions do not have
     other += [n for n in numbers if n not in values and ParameterId.parse(n).kind not in later]

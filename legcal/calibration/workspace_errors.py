@@ -32,7 +32,7 @@ from legcal.machine.parameters import geometries
 N_ACROSS, N_LEVELS = 7, 3  # places of the grid in x and y, and in z
 MIN_PLACES = 6  # of a grid that the machine reaches, for it to say anything
 _FLAT = 1e-3  # of the largest extent: a machine that moves in a plane
-_CLOSED = 1e-6  # [m] between a place and the pose that its readings give
+_CLOSED = 2.5e-6  # mean leg lengths, [rad] between a place and the pose that its readings give
 
 
 @brief
@@ -126,7 +126,7 @@ def _errors(
     nominal = poses_at_readings(machine, geometries(machine), q, wanted)
     calibrated = poses_at_readings(machine, solution.legs, q, nominal)
     apart, turned = pose_differences(nominal, wanted)
-    reached = (apart < _CLOSED) & (turned < _CLOSED)
+    reached = (apart < _CLOSED * machine.size) & (turned < _CLOSED)
     reached &= reach_readings(machine, solution.legs, q, calibrated)
     kept = np.flatnonzero(reached)
     if not len(kept):

@@ -49,7 +49,7 @@ from legcal.vision.image_file import inspect_image
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
-MIN_SIGMA = 1e-6  # [m], of readings whose noise nobody stated
+MIN_SIGMA = 2.5e-6  # mean leg lengths, of readings whose noise nobody stated
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
 
 
@@ -245,7 +245,9 @@ def plan_new_dataset(
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
     cameras = _cameras(folder, matching, view_of, options.cameras)
-    sigma, sigma_notes = _sigmas(options.encoder_sigma, sheet.motors, found)
+    sigma, sigma_notes = _sigmas(
+        options.encoder_sigma, sheet.motors, found, MIN_SIGMA * machine.size
+    )
     views_stated = any(row.view for row in rows)
     return NewDataset(
         machine=machine,
@@ -360,13 +362,14 @@ def _sigmas(
     given: float | str | Mapping[str, float] | None,
     motors: Sequence[Leg],
     readings: SheetReadings,
+    least: float,  # where nobody states one [m]
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
     if not any(leg.reads_angle for leg in motors):
         if isinstance(given, str):
             given = parse_quantity(given, LENGTH, "--encoder-sigma")
         if not isinstance(given, Mapping):
-            return _sigma(given, float(readings.digits.min()), motors)
+            return _sigma(given, max(float(readings.digits.min()), least), least, motors)
     if isinstance(given, Mapping):
         for leg in motors:
             _check_sigma(given.get(str(leg.prismatic), 0.0), leg)
@@ -382,7 +385,7 @@ def _sigmas(
                     "The standard deviation of a reading could not be used: " + str(error)
                 ) from None
         else:
-            found[name] = max(digit, usual_sigma(leg, MIN_SIGMA, unit))
+            found[name] = max(digit, usual_sigma(leg, least, unit))
     if given is None:
         said = [
             f"{name} {sigma:.2g} {leg.reading_unit}"
@@ -398,7 +401,9 @@ def _sigmas(
     return found, notes
 
 
-def _sigma(given: float | None, digit: float, motors: Sequence[Leg]) -> tuple[float, list[str]]:
+def _sigma(
+    given: float | None, usual: float, encoder: float, motors: Sequence[Leg]
+) -> tuple[float, list[str]]:
     """Return the standard deviation of a reading [m], and a note where nobody stated it."""
     if given is not None:
         least, most = ENCODER_SIGMAS
@@ -410,10 +415,9 @@ def _sigma(given: float | None, digit: float, motors: Sequence[Leg]) -> tuple[fl
         for leg in motors:
             _check_sigma(given, leg)
         return given, []
-    sigma = max(digit, MIN_SIGMA)
-    why = "the last digit of the table" if sigma > MIN_SIGMA else "that of a good encoder"
-    return sigma, [
-        f"encoder_sigma is {1e6 * sigma:g} um, {why}: give --encoder-sigma if "
+    why = "the last digit of the table" if usual > encoder else "that of a good encoder"
+    return usual, [
+        f"encoder_sigma is {1e6 * usual:.3g} um, {why}: give --encoder-sigma if "
         "readings are known better or worse."
     ]
 

@@ -30,7 +30,6 @@ from legcal.machine.coordinates import (
     turned_back,
 )
 from legcal.machine.kinematics import equations_of_readings
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__
@@ -80,7 +79,7 @@ class _Model:
 
     def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
         """Return the poses (k, 3, 4) near others at readings, and where there is one."""
-        machine, scale = self.machine, leg_scale(self.machine, self.machine.home)
+        machine, scale = self.machine, self.machine.size
         motors = list(machine.motors)
         found = solve(
             equations_of_readings(machine, q[:, motors]),

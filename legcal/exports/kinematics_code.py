@@ -31,7 +31,6 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.coordinates import COORDINATES, own_coordinates
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import EquationKind, Leg, LegKind
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.rods import actuator_index
 from legcal.version import __version__
@@ -107,7 +106,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
     """Return what templates are filled in with."""
     home = machine.home.as_matrix()
     legs, on = machine.legs, actuator_index(machine.legs)
-    scale = leg_scale(machine, machine.home)
+    scale = machine.size
     first = sorted(set(machine.reads))  # the leg of each reading
     home_readings = inverse_kinematics(machine, machine.home)[first]
     own = own_coordinates(machine)

@@ -12,8 +12,9 @@ from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve
 
-POSE_TOLERANCE = 1e-11  # [m, rad]: of a pose at which the chain is closed
-AXIS_TOLERANCE = 2e-3  # [rad], and of a leg: what axes may be off; no other posture is as near
+# [rad], and of a leg
+POSE_TOLERANCE = 2.5e-11  # of a pose at which the chain is closed
+AXIS_TOLERANCE = 2e-3  # what axes may be off; no other posture is as near
 RESTARTS = 60
 
 
@@ -25,7 +26,7 @@ def close_at(
     *,
     exact: bool = True,
 ) -> Array:
-    """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
+    """Return the configuration (nq,) that closes every loop with the platform at a pose.
 
     Sliders, and motors on which rods hang, are set from the pose, so that no leg is ever flipped;
     other joint angles are solved from ``start``, and from seeded random ones for legs that do not
@@ -39,9 +40,8 @@ def close_at(
         If a leg does not close, naming its closure and the distance left.
     """
     chain, metre = machine.chain, leg_scale(machine, T_base_platform)
-    tolerance = (
-        (POSE_TOLERANCE, POSE_TOLERANCE) if exact else (AXIS_TOLERANCE * metre, AXIS_TOLERANCE)
-    )
+    most = POSE_TOLERANCE if exact else AXIS_TOLERANCE
+    tolerance = metre * most, most
     angles = np.zeros(chain.nv, dtype=np.bool_)
     for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous", "prismatic"):
@@ -62,18 +62,19 @@ def close_at(
         columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
         step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
         configuration = chain.integrate(configuration, step)
-    everything = closure_equations(machine, T_base_platform, 1.0, angles)
+    everything = closure_equations(machine, T_base_platform, metre, angles)
     left = everything[0](configuration[None])[0][0]
     if np.abs(left).max(initial=0.0) >= CLOSED:
         angles[set_first] = True
         pose = T_base_platform if exact else None
         every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = closure_equations(machine, pose, 1.0, every)
+        equations, retract = closure_equations(machine, pose, metre, every)
         found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration, left = found.points[0], found.values[0]
     off = _off(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
-        problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
+        gap = worst_closure(machine, metre * left)
+        problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
     elif off[0] > tolerance[0] or off[1] > tolerance[1]:
         problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:

@@ -42,7 +42,7 @@ WALK = 6  # steps of a random walk between two configurations
 ON_THE_CHAIN = 7  # draws of eight, where following is quick
 MAX_FAILED = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
-TRAVEL_TOLERANCE = 1e-12  # [m]
+TRAVEL_TOLERANCE = 1e-11  # of the larger limit
 WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are reported
 WORKSPACE_SEED = 20020721
 
@@ -304,7 +304,8 @@ def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
 def _outside(machine: Machine, values: Array) -> BoolArray:
     """Return the same for joint values (..., n_legs)."""
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    outside = (values < lower - TRAVEL_TOLERANCE) | (values > upper + TRAVEL_TOLERANCE)
+    slack = TRAVEL_TOLERANCE * np.maximum(np.abs(lower), np.abs(upper))
+    outside = (values < lower - slack) | (values > upper + slack)
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 

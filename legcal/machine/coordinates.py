@@ -10,7 +10,6 @@ import numpy as np
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import machine_equations
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
@@ -28,7 +27,7 @@ def own_coordinates(machine: Machine) -> IntArray:
     """
     pose = machine.home.as_matrix()[None, :3]
     found = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
-    scale = leg_scale(machine, machine.home)
+    scale = machine.size
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     constraints = found.by_pose[0, ~found.measured] * unit
     _, _, rows = np.linalg.svd(np.vstack([constraints, np.zeros((6, 6))]))
@@ -52,7 +51,7 @@ def poses_at_coordinates(
 
     They are looked for from poses *near*, (3, 4) or (k, 3, 4).
     """
-    scale = leg_scale(machine, machine.home)
+    scale = machine.size
 
     def equations(poses: Array) -> tuple[Array, Array]:
         found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])

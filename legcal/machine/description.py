@@ -194,13 +194,15 @@ def _closes(described: Description, home: Home) -> bool:
     A, B = _joints(described)
     lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
     return all(
-        leg.offset + leg.travel[0] - _SLACK <= length <= leg.offset + leg.travel[1] + _SLACK
+        leg.offset + leg.travel[0] - _SLACK * length
+        <= length
+        <= leg.offset + leg.travel[1] + _SLACK * length
         for leg, length in zip(described.legs, lengths.tolist(), strict=True)
         if leg.offset is not None and leg.travel is not None
     )
 
 
-_SLACK = 1e-9  # [m]
+_SLACK = 2.5e-9  # of the length of a leg
 _MANY = 3  # legs that can hardly all fit by chance
 ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
 
@@ -260,7 +262,7 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
             continue
         q0 = leg.offset or 0.0
         low, high = q0 + leg.travel[0], q0 + leg.travel[1]
-        if not low - _SLACK <= length <= high + _SLACK:
+        if not low - _SLACK * length <= length <= high + _SLACK * length:
             outside.append((leg.name, 1e3 * float(length), 1e3 * low, 1e3 * high))
     if outside:
         shortest, longest = (f(x[1] for x in outside) for f in (min, max))

@@ -442,7 +442,7 @@ _WORDS = {
     EquationKind.TWIST: "twisted at its end",
     EquationKind.PLANE: "out of its plane",
 }
-_TOLERANCE = 1e-9  # [m]
+_TOLERANCE = 2.5e-9  # mean leg lengths
 
 
 def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
@@ -463,10 +463,11 @@ def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> st
         return None
     here = constraints_at(machine, T_base_platform)
     worst = np.abs(here.values).max()
-    if worst <= _TOLERANCE:
+    least = _TOLERANCE * machine.size
+    if worst <= least:
         return None
     at_home = np.abs(constraints_at(machine, machine.home).values).max()
-    if worst <= _TOLERANCE + 10.0 * at_home:
+    if worst <= least + 10.0 * at_home:
         return None
     return describe_worst(machine, here, "would be")
 

@@ -39,7 +39,7 @@ from legcal.machine.model import (
     slider_columns,
 )
 from legcal.machine.redundancy import contradictions
-from legcal.machine.solved_poses import TOLERANCE, project_pose
+from legcal.machine.solved_poses import ROUNDING, TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 from legcal.machine.ties import machine_ties
 
@@ -48,7 +48,7 @@ MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
 RANDOM_ANGLES = 6  # other angles of all legs that are tried
 FEW_RESTARTS = 2  # of legs that do not close from there
-SAME_START = 1e-9  # [m], and of rotation matrices: where a start is the last pose
+SAME_START = 2.5e-9  # mean leg lengths, and of rotation matrices: where a start is the last pose
 FEW_STEPS = 12  # of Newton's method at most, and
 REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
 
@@ -87,7 +87,9 @@ def forward_kinematics(
     """
     # The legs stand where the call before left them if that is where this one starts
     T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
-    if start is None or T_last is None or np.abs(start.as_matrix() - T_last).max() > SAME_START:
+    away = np.zeros((4, 4)) if start is None or T_last is None else start.as_matrix() - T_last
+    away[:3, 3] /= mechanism.size
+    if start is None or T_last is None or np.abs(away).max() > SAME_START:
         follower = Follower(mechanism, start)
     else:
         follower = Follower(mechanism)
@@ -451,7 +453,8 @@ def follow(
 def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
     """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
     equations = equations_of_readings(machine, readings[None])
-    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=1e-15)
+    tolerance = ROUNDING * machine.size
+    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
     return motion_of(found.points[0, :, :3], found.points[0, :, 3])
 
 
@@ -518,7 +521,7 @@ def _closed_from(
     machine: Machine, configuration: Array, free: IntArray
 ) -> tuple[Array | None, Array]:
     """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
-    equations, retract = closure_equations(machine, None, 1.0, free)
+    equations, retract = closure_equations(machine, None, machine.size, free)
     found = newton(
         equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )

@@ -24,6 +24,8 @@ from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.bodies import Connection
 
 TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
+# Of readings and of measured lengths whose standard deviation nobody states, in mean leg lengths
+SIGMA_READING, SIGMA_LENGTH = 5e-6, 1.25e-4
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
 MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # of the leg length; beyond, its unit is the mistake
 MAX_LEGS = 32  # the work of all that is done with them grows with the cube of their number
@@ -451,6 +453,16 @@ def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
         Leg(S, S, LegKind.PASSIVE if j in parameters.passive else LegKind.ACTUATED, A, B, float(q0))
         for j, (A, B, q0) in enumerate(joints)
     )
+
+
+def mean_length(legs: Sequence[Leg], pose: Array) -> float:
+    """Return the mean length of legs at a pose (3, 4) [m]."""
+    R, t = pose[:, :3], pose[:, 3]
+    lengths = [
+        leg.q0 if leg.actuator is not None else float(np.linalg.norm(R @ leg.B + t - leg.A))
+        for leg in legs
+    ]
+    return float(np.mean(lengths))
 
 
 def frame_point(legs: Sequence[Leg], frame_legs: Sequence[int], leg: int) -> Array:

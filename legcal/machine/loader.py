@@ -55,7 +55,6 @@ from legcal.machine.leg import (
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
-    leg_scale,
     mobility,
     motor_rank,
 )
@@ -156,7 +155,7 @@ def _load(source: Source) -> Machine:
         pose, configuration = closed_home(machine, given)
     except (ModelError, DidNotConverge):
         missed = np.abs(constraints_at(machine, machine.home).values).max(initial=0.0)
-        if missed <= MAX_POSE_ERROR * leg_scale(machine, machine.home):
+        if missed <= MAX_POSE_ERROR * machine.size:
             _check_dependence(machine, closes=False)
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)

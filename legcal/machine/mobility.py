@@ -22,7 +22,7 @@ from legcal.machine.model import (
 )
 from legcal.machine.solver import solve
 
-CLOSED = 1e-12  # [m], and [rad] for frames
+CLOSED = 2.5e-12  # mean leg lengths, and [rad] for frames
 RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
 STEP = 0.05  # [rad], and of a leg length
 CONFIGURATIONS = 3
@@ -56,7 +56,7 @@ def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
     configurations of :func:`mobility` where these are fewest.
     """
     _, sliders = slider_columns(machine, machine.motors)
-    scale, left = leg_scale(machine, machine.home), []
+    scale, left = machine.size, []
     for configuration in configurations:
         null_space = free_motions(machine, configuration)
         _, values, right = np.linalg.svd(null_space[sliders] / scale)
@@ -66,7 +66,7 @@ def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
 
 def _moved(machine: Machine, motions: Array) -> int:
     """Return the rank of the platform's twists by motions (nv, k) of the joints, as linearised."""
-    scale = leg_scale(machine, machine.home)
+    scale = machine.size
     twist = machine.chain.twist(machine.base, machine.platform) @ motions
     twist[:3] /= scale
     return int(np.sum(np.linalg.svd(twist, compute_uv=False) > RANK_TOLERANCE))
@@ -94,11 +94,11 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
 
 def project(machine: Machine, configuration: Array) -> Array | None:
     """Return the closed configuration nearest to one that is almost closed, None if none is."""
-    chain = machine.chain
+    chain, weights = machine.chain, _row_weights(machine)
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
-        return residual[None], jacobian[None]
+        return (weights * residual)[None], (weights[:, None] * jacobian)[None]
 
     found = solve(
         equations,
@@ -118,18 +118,24 @@ def free_motions(machine: Machine, configuration: Array) -> Array:
     """
     units = _column_units(machine)
     jacobian = machine.chain.linearize(configuration)[1] * units
-    row, scale = 0, leg_scale(machine, machine.home)
-    for closure in machine.chain.closures:
-        jacobian[row : row + 3] /= scale
-        row += closure.rows
+    jacobian *= _row_weights(machine)[:, None]
     _, values, right = np.linalg.svd(jacobian)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if len(values) else 0
     return np.asarray(units[:, None] * right[rank:].T)
 
 
+def _row_weights(machine: Machine) -> Array:
+    """Return what makes gaps of closures comparable: leg lengths beside [rad]."""
+    weights, row = np.ones(machine.chain.n_rows), 0
+    for closure in machine.chain.closures:
+        weights[row : row + 3] = 1.0 / machine.size
+        row += closure.rows
+    return weights
+
+
 def _column_units(machine: Machine) -> Array:
     """Return what turns tangent steps without a unit into [m] and [rad]."""
-    units = np.full(machine.chain.nv, leg_scale(machine, machine.home))
+    units = np.full(machine.chain.nv, machine.size)
     units[machine.chain.rotation_columns()] = 1.0
     return units
 

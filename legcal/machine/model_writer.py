@@ -33,8 +33,8 @@ from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.urdf import UrdfPatch
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
-CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
-ROUNDING = 4e-16  # [m]: what moves less does not move
+CLOSES = 2.5e-9  # mean leg lengths and [rad], home against the pose at its own readings
+ROUNDING = 1e-15  # mean leg lengths: what moves less does not move
 
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
@@ -120,7 +120,7 @@ def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None
     for name, (after, is_turned) in moved_origins(machine, legs).items():
         before = machine.urdf.joints[name].T_parent_origin
         xyz = np.asarray(after.translation)
-        stays = np.abs(xyz - before.translation).max() < ROUNDING
+        stays = np.abs(xyz - before.translation).max() < ROUNDING * machine.size
         rpy = roll_pitch_yaw(after.rotation.as_matrix()) if is_turned else None
         if rpy is not None or not stays:
             patch.set_origin(name, None if stays else xyz, rpy)
@@ -241,12 +241,12 @@ def check_closes(machine: Machine) -> None:
     found = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
     away = machine.home.inv() * found
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
-    if not max(shift, turn) <= CLOSES:
+    if not max(shift / machine.size, turn) <= CLOSES:
         raise DidNotConverge(
             f"{machine.yaml_path}: the mechanism does not close at home: found a pose "
             f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
-            f"readings, needed at most {1e3 * CLOSES:.0e} mm and {np.degrees(CLOSES):.0e} deg; "
-            f"check {machine.urdf.wording.home}."
+            f"readings, needed at most {1e3 * CLOSES * machine.size:.0e} mm and "
+            f"{np.degrees(CLOSES):.0e} deg; check {machine.urdf.wording.home}."
         )
 
 

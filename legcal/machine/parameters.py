@@ -30,7 +30,7 @@ from legcal.machine.model import Machine
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.rods import actuators_of
 
-_STEP = 1e-6  # [m or rad], of numerical derivatives
+_STEP = 1e-6  # of numerical derivatives: [rad], and of the extent of the joints
 # Of LegColumns, in this order
 _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
@@ -430,15 +430,17 @@ def turns_between(
 
     Twists, which are tied to axes, depend on these and on the turns of the axes.
     """
+    extent = float(np.ptp([leg.B for leg in calibrated], axis=0).max())
+    steps = _STEP * np.where([unit == "m" for unit in parametrization.units], extent, 1.0)
     by_step = []
     for start in (calibrated, nominal):
         columns = []
-        for step in _STEP * np.eye(len(parametrization)):
+        for size in np.diag(steps):
             ahead, behind = (
                 vector_of(parametrization, moved_legs(calibrated, parametrization.place, by), start)
-                for by in (step, -step)
+                for by in (size, -size)
             )
-            columns.append((ahead - behind) / (2.0 * _STEP))
+            columns.append((ahead - behind) / (2.0 * size.max()))
         by_step.append(np.column_stack(columns))
     return np.asarray(np.linalg.solve(by_step[1].T, by_step[0].T).T)
 

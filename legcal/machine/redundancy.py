@@ -23,7 +23,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import actuator_index
@@ -36,7 +35,7 @@ AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearl
 MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
 _MODEL = 0.005  # of the mean leg length, angles at it: errors of a nominal model
 _DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
-_AT_REST = 1e-6  # [m, rad] last step of a pose that was found
+_AT_REST = 2.5e-6  # mean leg lengths, [rad]: last step of a pose that was found
 _ROUNDS = 20  # in each of which a pose is set aside whose readings contradict each other
 _SAYS = 1e-6  # redundancy of a reading that may explain a contradiction, however wrong it is
 _OF_MEDIAN = 0.6745  # of the standard deviation: the median of absolute values
@@ -217,7 +216,7 @@ class _Surplus:
             else:
                 by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
         parametrization = parametrization_of(machine)
-        length = leg_scale(machine, machine.home)
+        length = machine.size
         size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
         by_model = found.by_parameters(parametrization) * (_MODEL * size)
         values, own, of_model = (

@@ -1,7 +1,7 @@
 """Platform poses from the equations of the legs alone: nearest ones, and those at readings."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -21,12 +21,12 @@ from legcal.machine.equations import (
     pose_equations,
     posture_constraints,
 )
-from legcal.machine.leg import Leg
+from legcal.machine.leg import Leg, mean_length
 from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
-TOLERANCE = 1e-13  # of a leg length
+TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # of a leg length
 MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
 DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
 
@@ -37,7 +37,8 @@ class SolvedPoses(NamedTuple):
     R: Array  # (k, 3, 3)
     t: Array  # (k, 3) [m]
     missed: Array  # (k,) the largest of what legs still miss [m]
-    size: Array  # (k,) the last step [m, rad]: not small where a pose has not come to rest
+    # (k,) the last step [rad], mean leg lengths: not small where a pose has not come to rest
+    size: Array
 
 
 def solve_poses(
@@ -47,6 +48,7 @@ def solve_poses(
     t: Array,
     lengthening: Array | None = None,
     steps: int = 60,
+    scale: Array | None = None,
 ) -> SolvedPoses:
     """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
 
@@ -54,7 +56,8 @@ def solve_poses(
     where unknown; without it poses move
     to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
     truth) the one with least squares is found; of redundant motors that with least squares of the
-    lengths, the constraints exact. After few *steps* poses are only nearer.
+    lengths, the constraints exact. After few *steps* poses are only nearer. Poses are near by their
+    numbers over *scale* (6,), by default 1 rad and the mean leg length.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
@@ -70,7 +73,11 @@ def solve_poses(
         return found.values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
-    found = solve(equations, poses_after, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
+    length = mean_length(legs, poses[0]) if len(poses) else 1.0
+    if scale is None:
+        scale = np.repeat([1.0, length], 3)
+    how: dict[str, Any] = {"tolerance": ROUNDING * length, "unit": scale, "rank": DEPENDENT}
+    found = solve(equations, poses_after, poses, steps=steps, **how)
     poses, missed, size = found.points, found.worst, found.size
     if lengthening is None or len(poses) == 0:
         return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
@@ -85,9 +92,8 @@ def solve_poses(
             lambda poses: least_squares_equations(with_known(poses)),
             poses_after,
             poses,
-            tolerance=1e-15,
-            rank=DEPENDENT,
             steps=steps,
+            **how,
         )
         poses, size = found.points, found.size
         missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
@@ -95,11 +101,11 @@ def solve_poses(
 
 
 def solve_postures(
-    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array, q: Array
+    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array, q: Array, scale: Array
 ) -> tuple[SolvedPoses, Array]:
     """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
 
-    Both move together, as little as possible; q are those of actuators.
+    Both move together, as little as possible over *scale* (6 + n,); q are those of actuators.
     """
     free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
     fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
@@ -117,7 +123,10 @@ def solve_postures(
 
     points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
     points = np.concatenate([points, q], axis=1)
-    found = solve(equations, retract, points, tolerance=1e-15, rank=DEPENDENT)
+    length = mean_length(legs, points[0, :12].reshape(3, 4)) if len(points) else 1.0
+    found = solve(
+        equations, retract, points, tolerance=ROUNDING * length, unit=scale, rank=DEPENDENT
+    )
     poses = found.points[:, :12].reshape(-1, 3, 4)
     solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
     return solved, found.points[:, 12:]

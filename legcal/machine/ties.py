@@ -29,8 +29,7 @@ from legcal.machine.equations import (
     n_pose_constraints,
     posture_constraints,
 )
-from legcal.machine.leg import Leg, LegColumns, frame_point
-from legcal.machine.mobility import leg_scale
+from legcal.machine.leg import Leg, LegColumns, frame_point, mean_length
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -46,7 +45,7 @@ _POSES, _TEST_POSES = (8, 16, 32, 64), 4  # where ties are taken, and where it i
 # they suffice
 _REACH = 0.15  # of these from home [rad], and of the mean leg length
 _RANK, _NEARLY = 1e-7, 1e-3  # of the largest singular value
-_AT_REST, _STEPS = 1e-13, 30  # [m, rad], the last of so many Gauss-Newton steps
+_AT_REST, _STEPS = 2.5e-13, 30  # mean leg lengths, [rad]: the last of so many Gauss-Newton steps
 _TRIAL = 1e-3  # of the mean leg length, and [rad]: errors that a machine must be able to have
 _WHOLLY = 1e-9
 _CLOSED = 1e-10  # of the mean leg length
@@ -187,8 +186,8 @@ def on_ties(
     for _ in range(_STEPS):
         found = ties.at(legs)
         left, along = independent(found, by_step(found, place) * scale, n)
-        step = -scale * (along.T @ left)
-        legs = moved_legs(legs, place, step)
+        step = -(along.T @ left)
+        legs = moved_legs(legs, place, scale * step)
         if np.abs(step).max(initial=0.0) < _AT_REST:
             break
     return tuple(legs)
@@ -219,7 +218,7 @@ def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -
     if ties.n_dependent == 0:
         return True
     home = np.concatenate([ties.postures.R[0], ties.postures.t[0][:, None]], axis=1)
-    length = _length(legs, home)
+    length = mean_length(legs, home)
     unit = np.where([name == "m" for name in parametrization.units], length, 1.0)
     step = _TRIAL * unit * np.random.default_rng(1).uniform(-1.0, 1.0, len(unit))
     place = parametrization.place
@@ -235,7 +234,7 @@ def ties_in_words(machine: Machine) -> str | None:
     if ties.n_dependent == 0:
         return None
     rows = ties.at(geometries(machine))
-    scale = np.where([name == "m" for name in found.units], leg_scale(machine, machine.home), 1.0)
+    scale = np.where([name == "m" for name in found.units], machine.size, 1.0)
     tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
     alone = [found.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
@@ -265,22 +264,9 @@ def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) 
 def _slopes(legs: Sequence[Leg], found: PoseEquations, home: Array) -> tuple[Array, Array]:
     """Return derivatives (k, m, 6 + n) by postures, and what makes these comparable, (6 + n,)."""
     joints = actuators_of(legs)
-    length = _length(legs, home)
+    length = mean_length(legs, home)
     unit = np.array([length] * 3 + [1.0] * 3 + [length if j.turns else 1.0 for j in joints])
     return np.concatenate([found.by_pose, found.by_q], axis=2) / unit, unit
-
-
-def _length(legs: Sequence[Leg], home: Array) -> float:
-    """Return the mean length of legs at a pose (3, 4) [m]."""
-    R, t = home[:, :3], home[:, 3]
-    return float(
-        np.mean(
-            [
-                leg.q0 if leg.actuator is not None else np.linalg.norm(R @ leg.B + t - leg.A)
-                for leg in legs
-            ]
-        )
-    )
 
 
 def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
@@ -318,7 +304,7 @@ def _postures_near(
         step = step @ left.T @ left
     step[0] = 0.0
     at = _Postures(*(np.repeat(part, n, axis=0) for part in at))
-    return _closed(legs, n_dependent, _moved(at, _length(legs, home) * step / unit))[0]
+    return _closed(legs, n_dependent, _moved(at, mean_length(legs, home) * step / unit))[0]
 
 
 def _closed(
@@ -336,10 +322,10 @@ def _closed(
         left, singular, right = np.linalg.svd(slopes)
         rank = left.shape[1] - n_dependent
         along = np.einsum("kmr,km->kr", left[:, :, :rank], found.values) / singular[:, :rank]
-        step = -np.einsum("kr,krc->kc", along, right[:, :rank]) / unit
-        if np.abs(step).max(initial=0.0) < _AT_REST:
+        step = -np.einsum("kr,krc->kc", along, right[:, :rank])
+        if np.abs(step).max(initial=0.0) < _AT_REST * mean_length(legs, home):
             break
-        at = _moved(at, step)
+        at = _moved(at, step / unit)
     return at, found, left[:, :, rank:]
 
 

@@ -16,6 +16,7 @@ from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
 from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
 from legcal.perception.profiles import TAPER, Edge, fading, read_profiles
+from legcal.perception.tuning import BLOCK_SIGMAS
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 
@@ -39,8 +40,7 @@ DEEP = 1.5  # inside, besides the blur, where the step to the leg is read [px]
 BEND = (0, 1, 4)  # functions of the limb model without an edge
 MAX_STEP = 0.8  # largest step of a block [px]
 
-DOUBTFUL = 0.25  # part of that width in which blocks count less when all are fitted together
-TUKEY = 4.0  # width of the biweight: blocks beyond have no weight [standard deviations]
+DOUBTFUL = 0.25  # part of BLOCK_SIGMAS in which blocks count less when all are fitted together
 N_ROUNDS, CONVERGED_LINE = 10, 1e-3  # of weights: at most, and until no end moves more [px]
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
 MIN_SCATTER = 0.01  # added to the standard deviation of a block [px]
@@ -439,7 +439,9 @@ def fit_lines(
         if turn < N_SCALES:
             scatter = 1.4826 * _medians(np.where(usable, pull, np.inf), n_usable)
             factor = np.where(fits, np.maximum(1.0, scatter), 1.0)
-        counted = usable * np.maximum(1.0 - (pull / (TUKEY * factor[:, None])) ** 2, 0.0) ** 2
+        counted = (
+            usable * np.maximum(1.0 - (pull / (BLOCK_SIGMAS * factor[:, None])) ** 2, 0.0) ** 2
+        )
         a, b, c, p, q = np.einsum("knm,nm->kn", products, counted)
         determinant = a * c - b * b
         singular = (np.count_nonzero(counted, axis=1) < MIN_BLOCKS) | (determinant < 1e-9 * a * c)

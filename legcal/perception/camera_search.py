@@ -26,42 +26,22 @@ from legcal.perception.pair_matching import (
     match_pairs,
 )
 from legcal.perception.pose_hypotheses import pose_hypotheses
+from legcal.perception.tuning import FITTING, JOINT_ERROR, LEAD, SEARCHING, SUPPORT
 
-# Of a pose that is clear, and of one that is accepted at all: share of the expected legs,
-# lead over the next pose in legs of all images together, and as a part.
-CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
-ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
-FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
-HINTED_SUPPORT = 0.6  # share near a rough pose that is clear
-MIN_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
-HINTED_MIN_SUPPORT = 1.6  # the same near a rough pose
-
-# Lengths are parts of the mean leg length.
-TOLERANCES = (0.12, 0.085, 0.06, 0.044, 0.03, 0.02, 0.015)  # of an axis
-LAST_TOLERANCES = (0.024, 0.017, 0.012, 0.01, 0.0075)  # with the joints known better
-NOMINAL_JOINT_ERROR = 0.015  # standard deviation of the joint centres of the nominal model
+# Lead over the next pose that is enough, clear, or that of a pose with few legs: in legs of all
+# images together, and as a part of them.
+ENOUGH, CLEAR, ALONE = (LEAD, 0.16), (2.0 * LEAD, 0.35), (1.5 * LEAD, 0.3)
+HINTED_SUPPORT = 3.0 * SUPPORT  # share of the expected legs near a rough pose that is clear
 START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, until one is clear
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 N_KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
-N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
-N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
-POLISH = (0.044, 0.03, 0.02)  # tolerances
-POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
-SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
-SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
-OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
-SAME_LEG = np.deg2rad(4.0), 0.6  # of two pairs on one leg: angle, distance in widths
+POLISH = SEARCHING[3:6]  # tolerances
+SAME_POSE = np.deg2rad(8.0), 0.08  # within an angle and a part of the distance
 MIN_MATCH_SCORE = 0.15  # score of a segment with its pair that counts as a match
-FINAL_TOLERANCE = 0.0075  # with which poses are scored in the end
-SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
-NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
-MIN_MATCHES, MIN_ERROR_OF_FEW = 3, 0.0075  # below so many the place of a leg is this uncertain
 
 LEFT_RIGHT = np.array([-1.0, 1.0])
 UP_DOWN = np.array([1.0, -1.0])
 UPSIDE_DOWN = np.array([-1.0, -1.0])
-NOT_MIRRORED_SUPPORT = 0.45  # share of the expected legs that mirrored images do not reach
-MIRROR_LEAD, MIRROR_PART = 0.3, 0.06  # of mirrored pictures: legs of all images, part
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +62,9 @@ class PoseCandidates:
     def needed(self) -> float:
         """How many legs must match in a picture on average for a pose to be accepted."""
         n = self.support.shape[1]
-        alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
-        share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
-        least = HINTED_MIN_SUPPORT if self.hinted else MIN_SUPPORT
+        alone = not self.hinted and self._leads(ALONE)
+        share = 0.6 * SUPPORT if alone else SUPPORT
+        least = 1.6 if self.hinted else 2.8  # legs in all images: two always fit some pose
         return float(max(share * self.expected[0].mean(), least / n))
 
     @property
@@ -102,12 +82,12 @@ class PoseCandidates:
     @property
     def leads_clearly(self) -> bool:
         """Whether the first pose is clearly better than the second one by pairs."""
-        return self._leads(CLEAR_LEAD, CLEAR_PART)
+        return self._leads(CLEAR)
 
     @property
     def leads(self) -> bool:
         """Whether the first pose is better than the second one by pairs."""
-        return self._leads(ENOUGH_LEAD, ENOUGH_PART)
+        return self._leads(ENOUGH)
 
     @property
     def is_convincing(self) -> bool:
@@ -123,15 +103,16 @@ class PoseCandidates:
             return False
         if self.hinted:
             return self.share >= HINTED_SUPPORT
-        return self.share >= CLEAR_SUPPORT and self.leads_clearly
+        return self.share >= 1.75 * SUPPORT and self.leads_clearly
 
     @property
     def share(self) -> float:
         """Share of the expected legs that agree with the first pose."""
         return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
 
-    def _leads(self, legs: float, part: float) -> bool:
+    def _leads(self, enough: tuple[float, float]) -> bool:
         """Say whether the first pose leads by so many legs and such a part of its score."""
+        legs, part = enough
         return self.lead >= max(legs, part * float(self.score[0]))
 
     def pose(self, i: int = 0) -> RigidTransform:
@@ -165,18 +146,18 @@ def place_camera(
         if len(poses) == 0:
             continue
         first = Pictures.of(best_first[:done])
-        poses = refined(first, poses, TOLERANCES[2:4], NOMINAL_JOINT_ERROR)
+        poses = refined(first, poses, SEARCHING[2:4], JOINT_ERROR)
         some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
-        score = scores(some, poses, TOLERANCES[3])
+        score = scores(some, poses, SEARCHING[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         poses = CameraPoses.joined(
-            [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
+            [poses, _reversed(some, poses.take(np.arange(min(4, len(poses)))))]
         )
-        poses = refined(some, poses, TOLERANCES[3:], NOMINAL_JOINT_ERROR)
-        score = scores(some, poses, TOLERANCES[-1])
+        poses = refined(some, poses, SEARCHING[3:], JOINT_ERROR)
+        score = scores(some, poses, SEARCHING[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
-        poses = CameraPoses.joined([poses, _polished(some.take(slice(POLISHING)), poses)])
-        best = _candidates(every, refined(every, poses, LAST_TOLERANCES, NOMINAL_JOINT_ERROR))
+        poses = CameraPoses.joined([poses, _polished(some.take(slice(4)), poses)])
+        best = _candidates(every, refined(every, poses, FITTING, JOINT_ERROR))
     return best
 
 
@@ -190,8 +171,8 @@ def _near_known(pictures: Pictures, known: Sequence[RigidTransform], n_legs: int
 
 def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """Return rough poses after all steps that lead to the pairs."""
-    poses = refined(pictures, poses, TOLERANCES[:3])
-    return refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), NOMINAL_JOINT_ERROR)
+    poses = refined(pictures, poses, SEARCHING[:3])
+    return refined(pictures, poses, (*SEARCHING[2:], *FITTING), JOINT_ERROR)
 
 
 def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -201,9 +182,9 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """
     n_legs = poses.shift.shape[1]
     found = []
-    for i in range(min(N_POLISHED, len(poses))):
+    for i in range(min(2, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
-        around = refined(pictures, around, POLISH, NOMINAL_JOINT_ERROR)
+        around = refined(pictures, around, POLISH, JOINT_ERROR)
         score = scores(pictures, around, POLISH[-1])
         found.append(around.take(_best(score, 1)))
     return CameraPoses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
@@ -216,11 +197,11 @@ def _reversed(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
 
 
 def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
-    """Return poses around one: the machine turned a little, further, nearer, or as it is."""
+    """Return poses around one: turned by 3 degrees, 5 % further or nearer, and as it is."""
     ends = pictures.all_ends
     middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
-    turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
-    further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
+    turns = np.deg2rad(3.0) * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
+    further = 1.0 + 0.05 * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
     new = Rotation.from_rotvec(turns).as_matrix() @ R
     return CameraPoses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
@@ -230,7 +211,7 @@ def place_near(
 ) -> PoseCandidates:
     """Return the camera pose near a rough one on which the pictures of a view agree."""
     T = T_base_camera.inv()
-    turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    turns = np.deg2rad(2.5) * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     every = Pictures.of(pictures)
@@ -259,12 +240,12 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
         return PoseCandidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
-    found = match_pairs(pictures, poses, FINAL_TOLERANCE)
+    found = match_pairs(pictures, poses, FITTING[-1])
     value = found.exclusive_score
     support, expected = (_by_legs(pictures, x).T for x in (value, found.visible))
-    joint_error = NOMINAL_JOINT_ERROR * pictures.size
+    joint_error = JOINT_ERROR * pictures.size
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
-    score = support.sum(axis=1) - SHIFT_COST * cost
+    score = support.sum(axis=1) - 0.06 * cost  # legs, for half a squared sigma
     order = _different(pictures, poses, found, value >= MIN_MATCH_SCORE, score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
@@ -292,8 +273,8 @@ def _different(
     least = np.maximum(np.diag(common), 1.0)
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
-        alike = common[i, kept] / least[i] >= SAME_MATCHES
-        if not np.any(alike & _near(poses, kept, i, OTHER_TURN, OTHER_PLACE)):
+        alike = common[i, kept] / least[i] >= 0.5
+        if not np.any(alike & _near(poses, kept, i, np.deg2rad(20.0), 0.25)):
             kept.append(i)
     return np.array(kept, dtype=np.intp)
 
@@ -301,26 +282,27 @@ def _different(
 def _one_leg(pairs: Array) -> BoolArray:
     """Return which pairs (n, n) may be of one leg: they continue each other or overlap.
 
+    They lie within 4 degrees and 0.6 widths of each other.
     Pairs (n, 9) are as in :class:`legcal.perception.pair_matching.Pictures`.
     """
     middle, along, normal, width = pairs[:, :2], pairs[:, 2:4], pairs[:, 4:6], pairs[:, 8]
     apart = np.abs(np.sum(middle * normal, axis=1)[:, None] - normal @ middle.T)
-    near = np.maximum(apart, apart.T) <= SAME_LEG[1] * width[:, None]
-    return np.asarray(near & (np.abs(along @ along.T) >= np.cos(SAME_LEG[0])))
+    near = np.maximum(apart, apart.T) <= 0.6 * width[:, None]
+    return np.asarray(near & (np.abs(along @ along.T) >= np.cos(np.deg2rad(4.0))))
 
 
 def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
     """Return the root mean square distance (n_legs,) of legs from their pairs, of the size."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
-    found = match_pairs(pictures, pose, FINAL_TOLERANCE)
+    found = match_pairs(pictures, pose, FITTING[-1])
     matched = found.exclusive_score[:, 0] >= MIN_MATCH_SCORE
     if matched.any():
         distance = distances(pictures, pose, found)[:, 0] / pictures.size
         np.add.at(square, pictures.leg[matched], distance[matched] ** 2)
         np.add.at(count, pictures.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))
-    error = np.where(count < MIN_MATCHES, np.maximum(error, MIN_ERROR_OF_FEW), error)
+    error = np.where(count < 3, np.maximum(error, 0.5 * JOINT_ERROR), error)  # of few matches
     return np.where(count > 0, error, np.inf)
 
 
@@ -333,9 +315,9 @@ def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     back = picture.R.T
     poses = CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     own = Pictures.of([picture])
-    poses = poses.take(_best(scores(own, poses, TOLERANCES[0]), N_KEPT[0]))
-    poses = refined(own, poses, TOLERANCES[:3])
-    score = scores(own, poses, TOLERANCES[2])
+    poses = poses.take(_best(scores(own, poses, SEARCHING[0]), N_KEPT[0]))
+    poses = refined(own, poses, SEARCHING[:3])
+    score = scores(own, poses, SEARCHING[2])
     return poses.take(_distinct(poses, score, N_KEPT[1]))
 
 
@@ -368,7 +350,7 @@ def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
     for i in np.argsort(-score, kind="stable").tolist():
         if len(kept) == n:
             break
-        if not np.any(_near(poses, kept, i, SAME_TURN, SAME_PLACE)):
+        if not np.any(_near(poses, kept, i, *SAME_POSE)):
             kept.append(i)
     return np.array(kept, dtype=np.intp)
 
@@ -410,7 +392,7 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 def may_be_mirrored(own: PoseCandidates) -> bool:
     """Say whether a placed view needs to be compared with its mirror image."""
-    return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
+    return not own.is_convincing or own.share < 2.25 * SUPPORT
 
 
 def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
@@ -421,4 +403,4 @@ def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
     if not own.is_convincing:
         return other.is_clear
     lead = float(other.score[0] - own.score[0])
-    return other.is_convincing and lead >= max(MIRROR_LEAD, MIRROR_PART * float(other.score[0]))
+    return other.is_convincing and lead >= max(0.5 * LEAD, 0.06 * float(other.score[0]))

@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.light import Samples, reduce
+from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
-MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
-MIN_LENGTH = 14.0  # of a joined edge [reduced px]
 MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
 MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
 MAX_GAP = 3.0  # between such pieces [lengths of the shorter one]
 DARK = 1.0 / 30.0  # part of the brightest light below which light is mostly noise
 MAX_PIECES = 400  # pieces of a picture, longest first
 MIN_SLOPE = (24.0, 80.0)  # of an edge, by the noise [8 levels/px of the stretched picture]
-NOISE_LEVELS = 2.5  # this many times the median slope is no noise
 STRONG = 2.0  # slope with which an edge begins, in the least one with which it goes on
 STRIDE = 4  # every such row and column is enough for a median
 # Of a sector: borders lie beside multiples of 45 deg, which whole grey levels often give, and where
@@ -87,7 +85,7 @@ def _pieces(small: Grey) -> Array:
     for k, slope in enumerate(slopes):
         cv2.Sobel(levels, cv2.CV_16S, 1 - k, k, dst=slope)
     some = slopes[:, ::STRIDE, ::STRIDE].astype(np.float32)
-    low = NOISE_LEVELS * _middle(cv2.magnitude(some[0], some[1]))
+    low = EDGE_SLOPE * _middle(cv2.magnitude(some[0], some[1]))
     low = min(max(low, MIN_SLOPE[0]), MIN_SLOPE[1])
     edge = cv2.Canny(slopes[0], slopes[1], low, STRONG * low, L2gradient=True)
     edge[[0, -1]], edge[:, [0, -1]] = 0, 0
@@ -103,7 +101,7 @@ def _pieces(small: Grey) -> Array:
     pieces = _straight(_edge_middles(slopes, at, gradient), gradient, chain.take(order))
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MAX_PIECES]
-    return np.asarray(pieces[order[length[order] >= MIN_PIECE_LENGTH]])
+    return np.asarray(pieces[order[length[order] >= 0.5 * EDGE_LENGTH]])
 
 
 def _middle(values: Image) -> float:
@@ -269,7 +267,7 @@ def _join(ends: Array) -> tuple[Array, Array]:
     label = _components(i, j, len(ends))
     order = np.argsort(label, kind="stable")
     found, covered = _fitted(ends[order], length[order], label[order])
-    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= MIN_LENGTH
+    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= EDGE_LENGTH
     return found[long], covered[long]
 
 

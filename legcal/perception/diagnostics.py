@@ -31,26 +31,17 @@ from legcal.perception.pair_matching import (
     match_pairs,
 )
 from legcal.perception.placement import Placement, Search, sensor_extent
+from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
-TOLERANCE = 0.015  # of an axis from its edge pair, of the mean leg length
-NOMINAL_TOLERANCE = 0.0375  # the same of a leg that nothing has moved from where the model has it
-MIN_SHARE = 0.35  # share of the legs that explain
-MIN_GAIN = 2.0, 0.15  # the same against the reading's: factor, more
-MIN_SHARE_OF_USUAL = 0.5  # of the share that the other images of the view reach
-ONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
-AMBIGUOUS = 0.85  # of the best explanation: then another one is about as good
+TOLERANCE = SEARCHING[-1]  # of an axis from its edge pair
+NOMINAL_TOLERANCE = 2.5 * TOLERANCE  # of a leg that nothing has moved from where the model has it
 _ORIGINAL = "replace it by the original"  # a remedy
-_ZOOMS = [1.02**k for k in range(-12, 36) if k]  # of images that are zoomed, or cut out and scaled
 _FLIPS = (
     (LEFT_RIGHT, Reason.MIRRORED), (UP_DOWN, Reason.MIRRORED), (UPSIDE_DOWN, Reason.UPSIDE_DOWN)
 )  # fmt: skip
 
-MAX_SHARE_OF_OTHERS = 0.5  # found, against other images
 N_REFERENCES = 3  # good images that others are compared with
-MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
-MIN_USUAL_SHARE = 0.3  # the least that images of a view must find to be compared with
-GOOD_PERCENTILE = 75.0  # percentile of what images find, for what good ones do
 TAKE_AGAIN = "take it again"  # a remedy
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 
@@ -191,7 +182,7 @@ def image_verdict(
     if explanation.reason:
         return explanation.reason, str(explanation.reason), explanation.remedy
     view = int(measurements.view[row])
-    if explanation.own >= MAX_SHARE_OF_OTHERS * usual[view]:
+    if explanation.own >= SHARE_OF_OTHERS * usual[view]:
         shows = f"shows little of the legs: found {much}, in other images most"
         return USED, shows, "look at its light and sharpness"
     return (
@@ -272,7 +263,7 @@ def explain(
     tried = [(share, why, _ORIGINAL) for share, why in others]
     zooms = [
         (_share(replace(picture, pairs=shrunk(pairs, picture.corners, z)), placement, view), z)
-        for z in _ZOOMS
+        for z in 1.02 ** np.setdiff1d(np.arange(-12, 36), 0)
     ]
     share = max(share for share, _ in zooms)
     zoom = float(np.median([z for own, z in zooms if own == share]))
@@ -308,8 +299,8 @@ def explain(
                 )
             )
     share, why, remedy = max(tried, key=lambda one: one[0])
-    factor, more = MIN_GAIN
-    least = max(MIN_SHARE, MIN_SHARE_OF_USUAL * usual.get(view, 0.0), factor * own, own + more)
+    # Clearly more of the legs than the reading's own, and enough of them
+    least = max(0.35, SHARE_OF_OTHERS * usual.get(view, 0.0), 2.0 * own, own + 0.15)
     return ImageExplanation(own, why, remedy) if share >= least else ImageExplanation(own)
 
 
@@ -329,7 +320,7 @@ def _at_other_reading(
     why = f"its legs are about where the reading of image {image} has them"
     difference = np.abs(measurements.q[row] - measurements.q[other])
     *_, second, first = np.argsort(np.nan_to_num(difference))
-    if difference[first] > ONE_READING * difference[second]:
+    if difference[first] > 3.0 * difference[second]:
         given, there = 1e3 * measurements.q[[row, other], first]
         name = search.leg_names[first]
         remedy = f"check its reading of {name}, {given:.2f} mm against {there:.2f} mm, and {remedy}"
@@ -346,7 +337,7 @@ def _best(
     ranked = sorted(readings, key=lambda one: -one[0])
     if ranked and ranked[0][1] in suspects:
         ranked = [one for one in ranked if one[1] in suspects]
-    if len(ranked) > 1 and ranked[1][0] > AMBIGUOUS * ranked[0][0]:
+    if len(ranked) > 1 and ranked[1][0] > 0.85 * ranked[0][0]:
         return []
     return ranked[:1]
 
@@ -407,8 +398,8 @@ def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
         every = [other.share for other in found.values()]
-        usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, GOOD_PERCENTILE))
-        if usual >= MIN_USUAL_SHARE and count.share < MAX_SHARE_OF_OTHERS * usual:
+        usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, 75.0))
+        if usual >= 0.3 and count.share < SHARE_OF_OTHERS * usual:
             suspects.append(row)
     return suspects
 
@@ -480,9 +471,7 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
         for leg, name in enumerate(search.leg_names)
         if not search.wanted[v, leg]
         and search.cylinders[leg]
-        and all(
-            share_shown(search, placement, row, legs=np.array([leg])) >= MIN_VISIBLE for row in rows
-        )
+        and all(share_shown(search, placement, row, legs=np.array([leg])) >= 0.5 for row in rows)
     ]
     if not clear:
         return []

@@ -52,16 +52,17 @@ from legcal.perception.pair_matching import (
     segment_equations,
 )
 from legcal.perception.placement import Search, sensor_extent
+from legcal.perception.tuning import JOINT_ERROR, SEARCHING
 from legcal.workers import Run
 
 N_CHAINS, SEED = 100, 1965  # random walks through the workspace, all at once
 STRIDE, STEPS, SNAPSHOTS = 0.12, 48, (24, 32, 40, 48)  # [rad] and leg lengths; poses that are tried
 KEPT = (100, 30, 8, 3)  # of them, before a step with each of these tolerances
 # Lengths are parts of the mean leg length.
-TOLERANCES = (0.12, 0.085, 0.06, 0.044)  # of an axis beside its pair, cameras being rough
-FITTED = (0.06, 0.044, 0.03, 0.02, 0.015, 0.015)  # of all images together
-EQUATION_SIGMA = 0.0075  # of lengths and constraints by the nominal model
-TRAVEL_SIGMA = 0.0125  # beyond the travel of a slider without a motor
+TOLERANCES = SEARCHING[:4]  # of an axis beside its pair, cameras being rough
+FITTED = (*SEARCHING[2:], SEARCHING[-1])  # of all images together
+EQUATION_SIGMA = 0.5 * JOINT_ERROR  # of lengths and constraints by the nominal model
+TRAVEL_SIGMA = JOINT_ERROR / 1.2  # beyond the travel of a slider without a motor
 # Of the score, for squares of what the model says against a pose; larger ones count no more.
 MODEL_COST, MODEL_WIDTH = 0.01, 5.0
 CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle [rad], place as a part of the distance

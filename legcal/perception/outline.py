@@ -19,29 +19,16 @@ from legcal.geometry.types import Array, IntArray
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
+from legcal.perception.tuning import CONTRAST, INLIER_SHARE, SCATTER_PX, WIDTH_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
-MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
-MIN_WIDTH = 5.0  # of a part [px]
-MAX_GUIDED_WINDOW = 0.8  # of the width, up to which a window separates both outlines
-MIN_CONTRAST = 4.0  # of an outline [grey levels]
-MIN_INLIER_SHARE = 0.6  # share of the blocks with an edge that must lie on the line
-MIN_KEPT = 0.25  # share of all unhidden blocks that must lie on it
-MIN_LONE_KEPT = 0.5  # the same of an edge without its partner
-MAX_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
-MAX_SIGMA = 1.0  # of an outline [px]
-STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
-MIN_STEP = 1.15  # part of the step that a saturated background must leave [px]
-WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
-NEAR_TOLERANCE = (0.2, 3.0)  # the same where both are predicted well: [px], standard deviations
-NEAR_DOUBT = (0.6, 1.0)  # of that, from where on such outlines count less, and not at all
+WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
+NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
-MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
-MAX_LONE_OFFSET, MAX_LONE_RATIO = 0.5, 0.5  # of a lone outline: of the window, of its partner's
-NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
+NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +156,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
                 continue
             v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
             width = 0.5 * float((v[1] - v[0]).sum())
-            if width < MIN_WIDTH:
+            if width < 5.0:  # px
                 reject(leg, segment.link, Reason.NARROW, f"{width:.1f}")
             elif band.length < least_length(width):
                 reject(leg, segment.link, Reason.SHORT, f"{band.length:.0f} px in the image")
@@ -185,7 +172,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
             reject(leg, segment.link, Reason.HIDDEN, in_front)
         else:
             window = float(search.window[leg.leg])
-            guided = search.guided and window <= MAX_GUIDED_WINDOW * width
+            guided = search.guided and window <= 0.8 * width  # which separates both outlines
             free_parts.append(LegPart(leg, segment, band, v, hidden, window, guided))
     parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
@@ -261,7 +248,8 @@ def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> l
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
     n = [len(of_part) for of_part in points]
     own = np.repeat([part.leg.leg for part in searched], n)
-    margin = np.repeat([MARGIN / part.band.scale for part in searched], n)
+    # Within 4 px beside a leg in front, that hides others
+    margin = np.repeat([4.0 / part.band.scale for part in searched], n)
     front = hidden_by(legs, own, np.concatenate(points), margin)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
@@ -342,9 +330,7 @@ def verdict(
     stands = [
         edge is not None
         and _is_clear_step(edge)
-        and bool(
-            confirmed or (may if window is None else _off(edge, at) <= MAX_LONE_OFFSET * window)
-        )
+        and bool(confirmed or (may if window is None else _off(edge, at) <= 0.5 * window))
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
@@ -360,9 +346,9 @@ def _by_width(
     """Judge two edges that may be trusted but for their distance."""
     widths = two.v - one.v
     sigma_one, sigma_two = one.sigma, two.sigma
-    tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected
-    if near_fit:
-        near = NEAR_TOLERANCE[0] + NEAR_TOLERANCE[1] * math.hypot(sigma_one, sigma_two)
+    tolerance = WIDTH_PX + WIDTH_PART * expected
+    if near_fit:  # both are predicted well
+        near = 0.2 + 3.0 * math.hypot(sigma_one, sigma_two)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
     if near_fit:
@@ -381,7 +367,7 @@ def _by_width(
     if (
         near_fit
         or np.any(widths >= expected)
-        or ratio > MAX_SIGMA_RATIO
+        or ratio > 0.75  # of an outline to the edge of a shade
         or not _is_clear_step(better)
     ):
         return PartVerdict((reason, reason))
@@ -398,9 +384,7 @@ def _by_place(
     """Judge two edges at a wrong distance, one of which is where an outline should be."""
     off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
     near = int(np.argmin(off))
-    if off[near] > min(
-        MAX_LONE_OFFSET * window, MAX_LONE_RATIO * off[1 - near]
-    ) or not _is_clear_step(measured[near]):
+    if off[near] > min(0.5 * window, 0.5 * off[1 - near]) or not _is_clear_step(measured[near]):
         return judged
     return PartVerdict((judged.reasons[0] if near else USED, USED if near else judged.reasons[1]))
 
@@ -412,30 +396,31 @@ def _off(edge: MeasuredEdge, predicted: Array) -> float:
 
 def _is_clear_step(edge: MeasuredEdge) -> bool:
     """Say whether an edge is a step of the picture on most of its length."""
-    return edge.is_step and float(np.mean(edge.line.kept)) >= MIN_LONE_KEPT
+    return edge.is_step and float(np.mean(edge.line.kept)) >= 0.5
 
 
 def _rejection(edge: MeasuredEdge | None, length: float, width: float) -> Rejection:
     """Return why an edge cannot be trusted whatever its partner."""
     if edge is None:
         return Rejection(Reason.FAINT)
-    step = (STEP_END - edge.clipped) * edge.blur
-    if step < MIN_STEP:
+    # The blurred step reaches 1.5 blurs deep; a saturated background must leave a part of it
+    step = (1.5 - edge.clipped) * edge.blur
+    if step < 1.15:
         return Rejection(Reason.OVEREXPOSED, f"{max(step, 0.0):.1f}")
     line = edge.line
     visible = (line.last - line.first) * length
     if visible < least_length(width):
         return Rejection(Reason.SHORT, f"{visible:.0f} px visible")
-    if line.inlier_share < MIN_INLIER_SHARE:
+    if line.inlier_share < INLIER_SHARE:
         return Rejection(Reason.NOT_STRAIGHT, f"{100 * line.inlier_share:.0f}")
     kept = float(np.mean(line.kept))
-    if kept < MIN_KEPT:
+    if kept < 0.25:  # of all unhidden blocks
         return Rejection(Reason.FAINT, f"{100 * kept:.0f}")
-    if edge.contrast < MIN_CONTRAST:
+    if edge.contrast < CONTRAST:
         return Rejection(Reason.CONTRAST, f"{edge.contrast:.1f}")
-    if line.scatter > max(MAX_SCATTER[0], MAX_SCATTER[1] * edge.blur):
+    if line.scatter > SCATTER_PX * max(1.0, 2.0 * edge.blur):
         return Rejection(Reason.ROUGH, f"{line.scatter:.2f}")
     sigma = edge.sigma
-    if sigma > MAX_SIGMA:
+    if sigma > 1.0:  # px
         return Rejection(Reason.UNCERTAIN, f"{sigma:.2f}")
     return USED

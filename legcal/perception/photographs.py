@@ -37,7 +37,6 @@ from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
 from legcal.perception.outline import Method, measure, measure_in_brief
 from legcal.perception.placement import (
-    NEAR_FIT_PX,
     Joined,
     Load,
     Placement,
@@ -46,6 +45,7 @@ from legcal.perception.placement import (
 )
 from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import PlacedViews, place_views
+from legcal.perception.tuning import WINDOW_PX
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
@@ -67,7 +67,7 @@ MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 def detection_settings() -> dict[str, object]:
     """Return what detected outlines depend on besides the dataset."""
-    return {"near_fit_px": NEAR_FIT_PX, "detector": DETECTOR_VERSION}
+    return {"near_fit_px": WINDOW_PX, "detector": DETECTOR_VERSION}
 
 
 @dataclass(frozen=True, eq=False)

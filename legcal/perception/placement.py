@@ -23,6 +23,7 @@ from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
+from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -30,10 +31,8 @@ from legcal.vision.visibility import PredictedLeg, predict_legs
 Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
-# Of predicted joint centres, of the mean leg length: the nominal model's joints and platform pose.
-PREDICTED_JOINT_ERROR = 0.01
-PIXEL_ERROR = 3.0  # added to every window [px]
-NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit [px]
+# Of joint centres that the nominal model and its platform pose predict, of the mean leg length
+PREDICTED_JOINT_ERROR = JOINT_ERROR / 1.5
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 
@@ -159,7 +158,7 @@ class Placement:
     T_base_camera: tuple[RigidTransform | None, ...]  # of each view; None: not known
     # (n_views, n_legs), of the mean leg length
     joint_error: float | Array = PREDICTED_JOINT_ERROR
-    pixel_error: float = PIXEL_ERROR  # [px]
+    pixel_error: float = WINDOW_PX  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
@@ -191,7 +190,7 @@ class Placement:
     ) -> "Placement":
         """Return the placement of a joint fit, with the usual blur of each view [px]."""
         cameras = tuple(T_base_camera)
-        return cls(A_base, B_base, cameras, 0.0, NEAR_FIT_PX, blur=tuple(blur), arms=arms)
+        return cls(A_base, B_base, cameras, 0.0, blur=tuple(blur), arms=arms)
 
     def shifted(self, search: Search, shift: Array) -> "Placement":
         """Return joint centres where views see them, (n_views, n_legs, 2, 3) from the model [m]."""

@@ -12,18 +12,18 @@ import numpy as np
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
-    WIDTH_ERROR,
+    MAX_WIDTH_SIGMAS,
     CameraPoses,
     LegSegments,
     Picture,
     pair_widths,
 )
+from legcal.perception.tuning import WIDTH_ERROR
 
 N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
 LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
 MAX_LENGTH_RATIO = 1.25, 3.0  # of a pair to the segment that it shows: factor, radii
 CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
-MAX_WIDTH_SIGMAS = 2.5  # standard deviations of the width of the second pair
 PLACE_TOLERANCE = 0.2  # of the place along a segment, in its lengths
 HALF = 0.5 + 0.5 * PLACE_TOLERANCE  # of a segment, with half of that
 MAX_COSINE = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine

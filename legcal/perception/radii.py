@@ -22,10 +22,11 @@ from legcal.perception.pair_matching import (
     gauss_newton_step,
     match_pairs,
 )
+from legcal.perception.tuning import SEARCHING
 from legcal.vision.visibility import look_alike
 
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
-TOLERANCES = (0.044, 0.044, 0.03, 0.03)  # of an axis from its pair, of the mean leg length
+TOLERANCES = (*2 * (SEARCHING[3],), *2 * (SEARCHING[4],))  # of an axis from its pair
 MIN_MATCH_SCORE = 0.25  # score of a segment with its pair that counts
 PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
 MIN_CHANGE = 0.08  # from the model, as a logarithm: less does no harm

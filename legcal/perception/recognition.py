@@ -40,6 +40,7 @@ from legcal.perception.radii import (
     RadiusFactors,
     estimate_radii,
 )
+from legcal.perception.tuning import EVIDENCE_RATIO, JOINT_ERROR
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
@@ -47,16 +48,13 @@ MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must exp
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
-UNOBSERVED_ERROR = 0.015  # of the joint centres of a leg that a view did not show
-MIN_ERROR, ERROR_SIGMAS = 0.004, 2.5  # of those of a leg that it did: length, standard deviations
+MIN_ERROR = JOINT_ERROR / 3.75  # of the joint centres of a leg that a view shows
 
 N_POSES, N_REFINED = 4, 3  # at which outlines are measured, and at the best missing legs sought
-# Evidence for a pose: its ratio to that for any other one, and what it exceeds the least by.
-RATIO, MARGIN = 1.6, 3.0
-RATIO_AGREED, MARGIN_AGREED = 1.5, 0.0  # the same where edge pairs are convincing by themselves
-RATIO_WITHOUT_RIVAL = 4.0  # ratio from which on no margin is needed either
-RATIO_ALONE, MARGIN_ALONE = 2.5, 6.0  # the same of a single image
-POSE_JOINT_ERROR = 0.0075  # of the legs as a pose has them
+MARGIN = 3.0  # of the evidence for a pose over the least
+# Of the evidence for a pose to that for any other one: where edge pairs are convincing by
+# themselves, of a single image, and from which on no margin is needed.
+RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = (EVIDENCE_RATIO / 1.6 * x for x in (1.5, 2.5, 4.0))
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 
@@ -303,7 +301,7 @@ def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int
     T: list[RigidTransform | None] = [None] * n_views
     for v in group.views:
         T[v] = candidates.pose(i) * group.T_group_camera[v]
-    placement = Placement(search.A_base, search.B_base, tuple(T), POSE_JOINT_ERROR)
+    placement = Placement(search.A_base, search.B_base, tuple(T), 0.5 * JOINT_ERROR)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
@@ -324,14 +322,15 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
         for i, trial in enumerate(trials)
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
-    margin, ratio = (MARGIN, RATIO) if len(group.rows) > 1 else (MARGIN_ALONE, RATIO_ALONE)
+    alone = len(group.rows) == 1
+    margin, ratio = (2.0 * MARGIN, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
-    if best == 0 and candidates.is_convincing:
-        margin, ratio = MARGIN_AGREED, RATIO_AGREED
-    elif len(group.rows) > 1 and fit.evidence >= RATIO_WITHOUT_RIVAL * other:
-        margin = MARGIN_AGREED
+    if best == 0 and candidates.is_convincing:  # by edge pairs already
+        margin, ratio = 0.0, RATIO_AGREED
+    elif not alone and fit.evidence >= RATIO_WITHOUT_RIVAL * other:
+        margin = 0.0
     return fit.evidence >= max(min_evidence(group) + margin, ratio * other)
 
 
@@ -365,7 +364,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
     views = search.measurements.views
     T, unplaced = list(found.hints), dict[str, str]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
-    error: Array = np.full((len(views), search.n_legs), UNOBSERVED_ERROR)
+    error: Array = np.full((len(views), search.n_legs), JOINT_ERROR)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
     flipped = []
     for g in unclear:  # those pictures by which it was placed, with left and right exchanged
@@ -385,7 +384,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
         for v in group.views:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, UNOBSERVED_ERROR)
+            error[v] = np.where(seen, MIN_ERROR + 2.5 * one.leg_error, JOINT_ERROR)
     placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 

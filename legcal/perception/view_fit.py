@@ -43,33 +43,25 @@ from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
+from legcal.perception.tuning import (
+    EVIDENCE,
+    JOINT_ERROR,
+    OUTLIER_SIGMAS,
+    OUTLINE_SIGMA_PX,
+    WINDOW_PX,
+)
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
-WINDOW_PX, WINDOW_SIGMAS, MAX_WINDOW_PX = 2.0, 3.0, 40.0  # around a fit
-CLEAR = 0.7  # of the evidence that an ambiguous pose must have, where edge pairs are clear
-
 # Lengths are parts of the mean leg length.
-JOINT_SIGMA = 0.015  # of the joint centres of the nominal model in all images, at first
-JOINT_SIGMA_BOUNDS = 0.0038, 0.03  # between which legs may show it
-IMAGE_SIGMA = 0.005  # of the platform joints in an image besides, at first
-IMAGE_SIGMA_BOUNDS = 0.0018, 0.03  # between which images may show it
+IMAGE_SIGMA = JOINT_ERROR / 3.0  # of the platform joints in an image besides, at first
+# Between which legs and images may show that and the errors of joints in all images
+JOINT_SIGMA_BOUNDS, IMAGE_SIGMA_BOUNDS = ((least, 2.0 * JOINT_ERROR) for least in (0.0038, 0.0018))
 TURN_SIGMA, DISTANCE_SIGMA = 0.3, 0.15  # prior of the pose: angle, displacement by its distance
 MAX_TURN, MAX_DISPLACEMENT = 0.2, 0.1  # of a step: angle, part of the distance
 ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas are estimated
-CAUCHY_WIDTH = 2.0  # standard deviations from which on a leg of an image counts less
 OUTLINE_EVIDENCE, MAX_OUTLINES = 2.0, 4  # of an outline, half a square; of a leg in an image
-MAX_DISTANCE = 3.5  # standard deviations from the fit, of a leg in an image
-MAX_SHIFT = 4.0  # of a leg, in standard deviations
-MAX_LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
-MAX_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
-GOOD_FIT = 0.85  # share of the evidence that outlines can give at most
-SHIFT_COST = (
-    0.25  # evidence that a squared shift costs [standard deviations^-2]: some are the pose's
-)
-MIN_EVIDENCE, MIN_EVIDENCE_OF_IMAGE = 8.0, 1.2  # of a group, and for each of its images
-EDGE_SIGMA = 0.3  # of an outline: what its covariance leaves out, as a wrong gamma [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +87,7 @@ class ViewFit:
     def is_good(self) -> bool:
         """Whether nearly all outlines agree with the fit as well as they can."""
         most = OUTLINE_EVIDENCE * np.minimum(self.n_outlines, MAX_OUTLINES).sum()
-        return self.evidence >= GOOD_FIT * float(most)
+        return self.evidence >= 0.85 * float(most)
 
     @property
     def outliers(self) -> BoolArray:
@@ -103,8 +95,9 @@ class ViewFit:
         shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
         alone = np.ones(len(self.shift), dtype=np.bool_)
         alone[self.leg[self.n_outlines > 1]] = False
-        far = shift > np.where(alone, MAX_LONE_SHIFT, MAX_SHIFT)
-        return np.asarray((self.distance > MAX_DISTANCE) | far[self.leg])
+        # A leg of which only single outlines were found may be another one
+        far = shift > np.where(alone, OUTLIER_SIGMAS / 1.4, OUTLIER_SIGMAS / 0.875)
+        return np.asarray((self.distance > OUTLIER_SIGMAS) | far[self.leg])
 
     def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
         """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
@@ -114,8 +107,8 @@ class ViewFit:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the outlines determine the pose: else legs may be others."""
-        return bool(self.turn_sigma <= MAX_TURN_SIGMA)
+        """Whether outlines determine the pose, to 10 degrees: else legs may be others."""
+        return bool(self.turn_sigma <= np.deg2rad(10.0))
 
     @property
     def turn_sigma(self) -> float:
@@ -154,7 +147,7 @@ def fit_view(
     problem = _problem(group, lines, state, middle)
     weight = np.ones(lines.n_items)
     size = search.size
-    joint_sigma, image_sigma = JOINT_SIGMA * size, IMAGE_SIGMA * size
+    joint_sigma, image_sigma = JOINT_ERROR * size, IMAGE_SIGMA * size
     try:
         linear = linearize(problem, state)
         for iteration in range(ITERATIONS):
@@ -170,7 +163,7 @@ def fit_view(
             linear = linearize(problem, state)
             rows = linear["outlines"]
             square, offset_square = _squared_distances(lines, rows, state.offset, image_sigma)
-            weight = 1.0 / (1.0 + square / (lines.size * CAUCHY_WIDTH**2))
+            weight = 1.0 / (1.0 + square / (lines.size * 2.0**2))  # Cauchy
             if iteration >= FIXED_ITERATIONS:  # most legs and images are alike
                 variance = np.diag(normal.kept_covariance())[6:].reshape(state.shift.shape)
                 of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
@@ -314,13 +307,14 @@ def _evidence(
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
-    joint = max(JOINT_SIGMA * size, joint_sigma)
-    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
+    joint = max(JOINT_ERROR * size, joint_sigma)
+    # Half of half a square: some shifts are those of the pose
+    return float(of_legs - 0.25 * np.sum(state.shift**2) / joint**2)
 
 
 def min_evidence(group: Group) -> float:
     """Return how much evidence outlines must give: more images agree more by chance."""
-    return MIN_EVIDENCE + MIN_EVIDENCE_OF_IMAGE * len(group.rows)
+    return EVIDENCE * (1.0 + 0.15 * len(group.rows))
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
@@ -413,7 +407,7 @@ def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None
         own, camera = view == v, search.measurements.views[v].camera
         ends[own] = camera.undistort(outlines.ends[used[own]])
         metric[own] = _metric_of(camera, ends[own])
-    covariance = outlines.covariance[used] + EDGE_SIGMA**2 * np.eye(2)
+    covariance = outlines.covariance[used] + OUTLINE_SIGMA_PX**2 * np.eye(2)
     begins = (np.diff(row, prepend=-1) != 0) | (np.diff(leg, prepend=-1) != 0)
     first = np.flatnonzero(begins)
     return _Lines(
@@ -592,7 +586,7 @@ def _without_weak_views(
     """Return cameras without those for which hardly an outline speaks, near no rough pose."""
     T, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for group, fit in zip(groups, fits, strict=True):
-        least = CLEAR * min_evidence(group)
+        least = 0.7 * min_evidence(group)
         is_sure = fit is not None and fit.is_determined and fit.evidence >= least
         if group.hint is not None or T[group.views[0]] is None or is_sure:
             continue
@@ -625,7 +619,7 @@ def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outl
     for group, fit in zip(groups, fits, strict=True):
         if fit is not None and missing[group.rows].any():
             sigma = sideways_sigmas(search, group, fit)[group.rows]
-            near = np.minimum(WINDOW_PX + WINDOW_SIGMAS * sigma, MAX_WINDOW_PX)
+            near = np.minimum(WINDOW_PX / 1.5 + 3.0 * sigma, 40.0)
             window[group.rows] = np.where(missing[group.rows], near, np.nan)
     return window
 

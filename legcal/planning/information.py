@@ -44,7 +44,8 @@ from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
-_WEAK = 1.0  # [m] and [rad] that is known of what has no other prior
+# What is known of all that has no other prior: [rad] and [px], mean leg lengths
+_WEAK, _WEAK_LENGTH = 1.0, 2.5
 _RANK = 1e-7  # of the largest singular value
 
 
@@ -150,7 +151,7 @@ class Predictor:
     def _known(self) -> Choices:
         """The choices, with lines of arms unknown in all images, also in those that show none."""
         seen = [j for j, leg in enumerate(self.legs.nominal) if leg.arm is not None]
-        sigmas = arm_sigmas(self.legs.parametrization, seen)
+        sigmas = arm_sigmas(self.legs.parametrization, self.legs.nominal, seen)
         arms = {name: Prior(0.0, sigma) for name, sigma in sigmas.items()}
         return replace(self.choices, priors=arms | dict(self.choices.priors))
 
@@ -238,7 +239,8 @@ class Predictor:
         names = _names(problem, views)
         prior = linear.prior_J.T @ linear.prior_J
         weak = np.array([prior[i, i] == 0.0 for i in range(len(prior))])
-        prior[weak, weak] = 1.0 / _WEAK**2
+        known = np.where(_are_lengths(problem), _WEAK_LENGTH * self.machine.size, _WEAK)
+        prior[weak, weak] = 1.0 / known[weak] ** 2
         k, untied = problem.n_kinematic, np.eye(problem.n_kinematic)
         if problem.parameters.n_tied:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
@@ -315,6 +317,19 @@ def _by_element(rows: Array, element: IntArray, n: int) -> Array:
     found = np.zeros((n, int(count.max(initial=0)), q, c))
     found[element[order], np.arange(m) - first[element[order]]] = rows[order]
     return found.reshape(n, -1, c)
+
+
+def _are_lengths(problem: FitProblem) -> BoolArray:
+    """Return which kept unknowns count in metres, (n_kept,)."""
+    found = np.zeros(problem.n_kept, dtype=np.bool_)
+    for block in problem.variables:
+        where = problem.where(block.name)
+        if block.units:
+            found[where] = [unit == "m" for unit in block.units]
+        elif block.unknown.shape[1] == 6:  # motions: turns before displacements
+            displaced = block.unknown[:, 3:]
+            found[where[displaced[displaced >= 0]]] = True
+    return found
 
 
 def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:

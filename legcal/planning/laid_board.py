@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.model import Machine
-from legcal.planning.sight import NEAREST, Bodies, behind_plate
+from legcal.planning.sight import Bodies, behind_plate
 from legcal.vision.board import Board, dictionary, facing_board
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import in_picture, rays_past_axes
@@ -67,7 +67,8 @@ class LaidBoard:
         P = T_base_camera.inv().apply(outer)
         sight = eye - outer
         cosine = sight @ self.normal / np.linalg.norm(sight, axis=1)
-        if cosine.min() < _MIN_COSINE or not in_picture(camera, P, NEAREST, margin_px).all():
+        is_in_picture = in_picture(camera, P, bodies.nearest, margin_px).all()
+        if cosine.min() < _MIN_COSINE or not is_in_picture:
             return np.zeros(n, dtype=np.bool_)
         if is_read and self._narrowest(camera.project(P)) < _MODULE_PX:
             return np.zeros(n, dtype=np.bool_)

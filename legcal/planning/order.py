@@ -15,7 +15,7 @@ from legcal.machine.model import Machine, platform_pose, slider_columns
 
 HOME = "home"
 _STOPS = (0.2, 0.4, 0.6, 0.8, 1.0)  # parts of a way that are looked at
-_SAME = 1e-6  # [m], and entries of rotations
+_SAME = 2.5e-6  # mean leg lengths, and entries of rotations
 _ROUNDS = 20  # of exchanges for a shorter way
 
 
@@ -83,4 +83,6 @@ def _is_free(machine: Machine, feasibility: Feasibility, first: Array, last: Arr
     if isinstance(there, tuple):
         return False
     T, wanted = platform_pose(machine, there), platform_pose(machine, last)
-    return bool(np.abs(T.as_matrix() - wanted.as_matrix()).max() < _SAME)  # not a mirrored one
+    off = T.as_matrix() - wanted.as_matrix()
+    off[:3, 3] /= machine.size
+    return bool(np.abs(off).max() < _SAME)  # not a mirrored one

@@ -1,6 +1,6 @@
 """Where cameras may stand: around the machine, at places of a list, within bounds.
 
-A tripod is set to 5 cm and 5 deg, so a place counts with a margin in the picture
+A tripod is set to an eighth of a leg and 5 deg, so a place counts with a margin in the picture
 (:class:`Setting`): from where it stands the joints of all poses are in the picture even if it is
 set that much wrongly, or, nearer, most of them. Pictures are upright where z of the base link
 points up, also of machines that hang: a tripod stands on the ground.
@@ -34,7 +34,8 @@ _CLEARANCE = 0.3  # of the size, between camera and machine, at least
 _ROUNDING = 1e-9
 
 
-MAX_LENGTH, MAX_ANGLE, MAX_DRAWS = 1.0, 0.8, 10_000  # of a setting [m], [rad]
+MAX_LENGTH, MAX_ANGLE, MAX_DRAWS = 2.5, 0.8, 10_000  # of a setting: mean leg lengths, [rad]
+USUAL_SHIFT, USUAL_LENGTH, USUAL_DRAWS = 0.125, 0.005, 20  # mean leg lengths, draws
 
 
 @dataclass(frozen=True)
@@ -43,17 +44,21 @@ class Setting:
 
     Attributes
     ----------
-    shift, turn : float
-        How far a camera may stand from its place [m], and look elsewhere [rad], at most.
-    length, angle : float
-        How far lengths and coordinates [m], and axes [rad], are from the model, at most.
+    shift : float
+        How far a camera may stand from its place [m], at most.
+    length : float
+        How far lengths and coordinates are from the model [m], at most.
+    turn : float
+        How far a camera may look elsewhere [rad], at most.
+    angle : float
+        How far axes are from the model [rad], at most.
     draws : int
         How many such sessions are drawn to judge a plan.
     """
 
-    shift: float = 0.05
+    shift: float
+    length: float
     turn: float = float(np.deg2rad(5.0))
-    length: float = 2e-3
     angle: float = float(np.deg2rad(0.1))
     draws: int = 20
 
@@ -72,7 +77,9 @@ class Setting:
         )
 
 
-USUAL = Setting()
+def usual_setting(size: float) -> Setting:
+    """Return the setting of a machine of a mean leg length [m], where nobody says more."""
+    return Setting(USUAL_SHIFT * size, USUAL_LENGTH * size, draws=USUAL_DRAWS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +115,7 @@ def places_around(
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
         raise NotVisible(
             f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
-            f"of it in the picture, tripods set to {1e2 * setting.shift:g} cm and "
+            f"of it in the picture, tripods set to {1e2 * setting.shift:.2g} cm and "
             f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
             "correct the focal length in its file."
         )

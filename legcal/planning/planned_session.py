@@ -20,7 +20,7 @@ from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
 from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
-from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, MAX_LENGTH, Setting
+from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, Setting
 from legcal.planning.sight import Seen
 from legcal.version import __version__
 from legcal.vision.camera import Camera
@@ -122,8 +122,8 @@ class Plan:
             f"{1e3 * self.error.mean_displacement:.3f} mm / "
             f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace, "
             f"the mean of {self.setting.draws} sessions with tripods up to "
-            f"{1e2 * self.setting.shift:g} cm and {np.degrees(self.setting.turn):g} deg off and "
-            f"the machine {1e3 * self.setting.length:g} mm."
+            f"{1e2 * self.setting.shift:.2g} cm and {np.degrees(self.setting.turn):g} deg off and "
+            f"the machine {1e3 * self.setting.length:.2g} mm."
         )
 
     def document(self) -> dict[str, Any]:
@@ -193,9 +193,9 @@ class ExpectedError(Document):
 class Tolerance(Document):
     """How far a session may be from its plan, and the machine from its model, at most."""
 
-    camera_m: Annotated[Number, Field(ge=0.0, le=MAX_LENGTH)]
+    camera_m: Annotated[Number, Field(ge=0.0)]
     camera_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
-    machine_m: Annotated[Number, Field(ge=0.0, le=MAX_LENGTH)]
+    machine_m: Annotated[Number, Field(ge=0.0)]
     machine_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
     draws: Annotated[int, Field(ge=1, le=MAX_DRAWS)]  # sessions that were drawn to judge the plan
 

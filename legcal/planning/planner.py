@@ -30,7 +30,6 @@ from legcal.planning.information import Contributions, Predictor
 from legcal.planning.laid_board import LaidBoard, lying
 from legcal.planning.order import in_short_order, ways
 from legcal.planning.places import (
-    USUAL,
     Place,
     Setting,
     all_points,
@@ -39,7 +38,7 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import NEAREST, Bodies, Seen, what_is_seen
+from legcal.planning.sight import Bodies, Seen, what_is_seen
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
 from legcal.vision.visibility import in_picture, least_length
@@ -55,7 +54,8 @@ ROUNDS = 3  # of polishing, each with half the steps of the one before
 POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
-_LEAST_ERROR = 1e-3  # [m]: a session that leaves more, and more than the model, is refused
+# Mean leg lengths: a session that leaves more, and more than the model, is refused
+_LEAST_ERROR = 0.0025
 _CONTINUED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # times the planned images
 _MOST_NEEDED = 100  # images that are looked at to say how many would do
 
@@ -75,7 +75,7 @@ class Task:
     predictor: Predictor
     n_images: int
     n_views: int
-    setting: Setting = USUAL
+    setting: Setting
     bounds: Array | None = None  # (3, 2) of cameras in the base link [m]
     places: tuple[Place, ...] = ()  # in place of those around the machine
     given: tuple[Candidates, ...] = ()  # what was shot already
@@ -360,7 +360,7 @@ def _unseen(
     return (
         f"{scene.task.machine.yaml_path}: no session could be planned: found "
         f"{n_places - len(blind)} of {n_places} camera places that see legs{board} wherever the "
-        f"tripod is set within {1e2 * setting.shift:g} cm and {np.degrees(setting.turn):g} deg, "
+        f"tripod is set within {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg, "
         f"needed {needed}; {remedy.format(names or 'the places')}."
     )
 
@@ -373,15 +373,15 @@ def _why_unseen(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]
         return "small" if is_in_view else "board"
     bodies = Bodies.at(scene.task.machine, scene.legs, poses).before(T)
     points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
-    if not in_picture(camera, points, NEAREST).any():
+    if not in_picture(camera, points, bodies.nearest).any():
         return "elsewhere"
     nearest = float(points[:, 2].min())
-    if nearest > NEAREST:
+    if nearest > bodies.nearest:
         stretch = camera.project(bodies.A) - camera.project(bodies.B)
         if np.linalg.norm(stretch, axis=-1).max() < least_length(0.0):
             return "far"
-    margin = scene.task.setting.margin(camera, max(nearest, NEAREST))
-    return "hidden" if in_picture(camera, points, NEAREST, margin).all() else "near"
+    margin = scene.task.setting.margin(camera, max(nearest, bodies.nearest))
+    return "hidden" if in_picture(camera, points, bodies.nearest, margin).all() else "near"
 
 
 def choose_places(
@@ -511,7 +511,7 @@ class _Search:
     def _refuse_undetermined(self, session: Session) -> None:
         """Refuse a session that leaves a direction open that matters; say how many images do."""
         task, work, basis = self.task, self.work, self.basis
-        most = max(task.setting.length, _LEAST_ERROR)
+        most = max(task.setting.length, _LEAST_ERROR * task.machine.size)
 
         def off(S: Array) -> Array:
             """Return the error of the platform, or the criterion where readings give no pose."""

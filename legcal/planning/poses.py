@@ -19,7 +19,7 @@ from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, slider_columns
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, moved_legs
-from legcal.planning.places import USUAL, Setting
+from legcal.planning.places import USUAL_LENGTH, Setting
 from legcal.progress import Report, no_progress
 
 N_REACHING = 10  # machines that must reach a pose,
@@ -27,7 +27,7 @@ _WIDER = 1.5  # times as far off as machines may be
 N_NEAR = 3  # poses that are tried near each
 _MIN_SHARE = 0.2  # of the poses that are drawn, to be of use
 _MOST_MOVED = 0.1  # of the length of a leg, by which errors of the machine move a pose
-_CLOSED = 1e-7  # [m]
+_CLOSED = 2.5e-7  # mean leg lengths
 _HALF_WAY = 0.5  # least step to a pose nearby
 
 
@@ -53,12 +53,12 @@ def candidate_poses(
             "check legcal.home and the limits of the joints",
             "plan with a smaller length in Setting (in Python), if it is known better",
         ]
-        if setting.length > USUAL.length:
+        if setting.length > USUAL_LENGTH * machine.size:
             remedies.reverse()
         raise DidNotConverge(
             f"{machine.yaml_path}: no session could be planned: found {len(found)} of {n} poses "
             "that the machine still reaches at the same readings if its joints are "
-            f"{1e3 * setting.length:g} mm off, needed {_MIN_SHARE * n:.0f}; "
+            f"{1e3 * setting.length:.2g} mm off, needed {_MIN_SHARE * n:.0f}; "
             f"{', or '.join(remedies)}."
         )
     return poses_at(machine, found)
@@ -86,7 +86,7 @@ def surely_reached(
         length = np.linalg.norm(ends - A, axis=2)
         off = np.abs(length - wanted)[:, measured].max(axis=1)
         moved = np.linalg.norm(t - t_nearby, axis=1)
-        reached &= (off < _CLOSED) & (moved < _MOST_MOVED * length.mean())
+        reached &= (off < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
     return reached
 
 

@@ -15,6 +15,7 @@ from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.feasibility import poses_at
 from legcal.machine.kinematics import follow_each
+from legcal.machine.leg import SIGMA_LENGTH, SIGMA_READING
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
@@ -23,9 +24,9 @@ from legcal.planning.places import (
     MAX_ANGLE,
     MAX_DRAWS,
     MAX_LENGTH,
-    USUAL,
     Place,
     Setting,
+    usual_setting,
 )
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
@@ -36,11 +37,9 @@ from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 from legcal.workers import Run, Workers, worker_pool
 
-SIGMA_Q = 2e-6  # [m] of a reading, where nobody says
-LENGTH_SIGMA = 5e-5  # [m] of a rod that somebody measures, where readings carry no length
 IMAGES_PER_VIEW = 15
 MOST_IMAGES, MOST_VIEWS = 400, 12
-SAME_MACHINE = 0.01  # [m] between joints of the model and of a dataset that was shot of it
+SAME_MACHINE = 0.025  # mean leg lengths between joints of the model and of a dataset shot of it
 SAME_AXES = 5.0  # [deg] the same between their axes
 _ROUNDS = 5  # plans, until the fewest images are found that reach a target
 _BEGIN = 24  # images of the first of them
@@ -62,7 +61,7 @@ def plan(
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
     hand_held: bool = False,
-    setting: Setting = USUAL,
+    setting: Setting | None = None,
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress = False,
@@ -130,21 +129,23 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
+    setting = usual_setting(machine.size) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
-    _check(target, bounds, listed, board, hand_held, setting, seed)
+    _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
     shot = given if isinstance(given, Dataset) or given is None else _shot(Path(given))
     before = () if shot is None else _given(machine, shot)
     if camera is None:
         chosen = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         chosen = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-    sigma_q, sigma_by_joint = SIGMA_Q, dict[str, float]()
+    usual_q = SIGMA_READING * machine.size
+    sigma_q, sigma_by_joint = usual_q, dict[str, float]()
     if encoder_sigma is not None:
         sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
         sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
-        sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=SIGMA_Q)
+        sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=usual_q)
     elif shot is not None:
         sigma_q = shot.measurements.sigma_q
         sigma_by_joint = dict(shot.measurements.sigma_by_joint)
@@ -178,10 +179,11 @@ def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[s
     if found is None:
         return NO_CHOICES, ()
     rod, ends = found
-    return Choices(priors={f"{rod.name}.length": Prior(rod.q0, LENGTH_SIGMA)}), (
+    sigma = SIGMA_LENGTH * machine.size
+    return Choices(priors={f"{rod.name}.length": Prior(rod.q0, sigma)}), (
         f"Readings of motors that turn carry no length: the plan counts on the rod of {rod.name} "
-        f"measured to {1e3 * LENGTH_SIGMA:g} mm (legcal calibrate --length "
-        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * LENGTH_SIGMA:g}mm, with what you measure).",
+        f"measured to {1e3 * sigma:.2g} mm (legcal calibrate --length "
+        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * sigma:.2g}mm, with what you measure).",
     )
 
 
@@ -305,6 +307,7 @@ def _check(
     hand_held: bool,
     setting: Setting,
     seed: int,
+    size: float,  # of the machine [m]
 ) -> None:
     """Refuse what contradicts itself."""
     start, problems = "The plan could not be made: found", []
@@ -324,15 +327,16 @@ def _check(
             f"{start} a camera in the hand without a board, needed a calibration board on the base "
             "in every image, which alone tells where it was; describe it with --board."
         )
-    for what, size, most, unit in (
-        ("a model error of", setting.length, MAX_LENGTH, "m"),
+    for what, off, most, unit in (
+        ("a model error of", setting.length, MAX_LENGTH * size, "m"),
         ("axes off by", setting.angle, MAX_ANGLE, "rad"),
-        ("cameras off by", setting.shift, MAX_LENGTH, "m"),
+        ("cameras off by", setting.shift, MAX_LENGTH * size, "m"),
         ("cameras turned by", setting.turn, MAX_ANGLE, "rad"),
     ):
-        if not 0.0 <= size <= most:
+        if not 0.0 <= off <= most:
             problems.append(
-                f"{start} {what} {size:g} {unit}, needed 0 to {most:g} {unit}; correct the setting."
+                f"{start} {what} {off:g} {unit}, needed 0 to {most:.3g} {unit}; correct the "
+                "setting."
             )
     if not 1 <= setting.draws <= MAX_DRAWS:
         problems.append(
@@ -382,7 +386,7 @@ def difference(machine: Machine, other: Machine) -> str:
         return f"other legs ({other.name})"
     both = list(zip(machine.legs, other.legs, strict=True))
     off = max(max(np.abs(a.A - b.A).max(), np.abs(a.B - b.B).max()) for a, b in both)
-    if off > SAME_MACHINE:
+    if off > SAME_MACHINE * machine.size:
         return f"joints up to {1e3 * off:.0f} mm from those of the model"
     aligned = [
         abs(float(x @ y))

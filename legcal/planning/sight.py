@@ -34,7 +34,7 @@ from legcal.vision.visibility import (
 )
 
 N_SAMPLES = 24  # points along a part that are tested
-NEAREST = 0.1  # [m] before the camera
+NEAREST = 0.25  # mean leg lengths before the camera
 _OUTSIDE = 1.2  # radii between the camera and an axis, at least
 _PLATE = 1.1  # size of a plate, over that of its joints
 _ROUND = 1.3  # radius of a plate of unknown shape, over that of the circle around its joints
@@ -51,6 +51,7 @@ class Bodies:
     cylinders: tuple[Sequence[Cylinder], ...]  # of each
     leg: IntArray  # (n,) of an arm the leg that has it as a part
     is_moved: BoolArray  # (n_legs,) whether a motor moves A
+    size: float  # mean leg length of the machine [m]
 
     @property
     def n_legs(self) -> int:
@@ -71,6 +72,7 @@ class Bodies:
             (*(leg.cylinders for leg in machine.legs), *([arm.cylinder] for arm in arms.values())),
             np.array([*range(len(legs)), *arms], dtype=np.intp),
             np.array([leg.actuator is not None for leg in legs], dtype=np.bool_),
+            machine.size,
         )
 
     def before(self, T_base_camera: RigidTransform) -> Bodies:
@@ -78,6 +80,11 @@ class Bodies:
         T = T_base_camera.as_matrix()
         A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (self.A, self.B))
         return replace(self, A=A, B=B)
+
+    @property
+    def nearest(self) -> float:
+        """How far points are before a camera at least [m]."""
+        return NEAREST * self.size
 
     @property
     def radius(self) -> Array:
@@ -157,7 +164,7 @@ def what_is_seen(
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, body]
     P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
-    seen = (end > start)[..., None] & in_picture(camera, P, NEAREST, margin_px)
+    seen = (end > start)[..., None] & in_picture(camera, P, bodies.nearest, margin_px)
     foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
     seen &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
     of_body = np.zeros(len(bodies.leg))

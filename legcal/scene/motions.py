@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
-_HELD = 1e-3  # [m]
+_HELD = 0.0025  # of the leg length
 
 
 class PlacedModel(NamedTuple):
@@ -74,8 +74,8 @@ def directions(
 ) -> list[tuple[str, Array]]:
     """Return steps of the parameters (p,) along weak and held directions, with words.
 
-    Weak ones are as long as their standard deviation, held ones 1 mm; *length* is that of a leg
-    [m], by which turns count.
+    Weak ones are as long as their standard deviation, held ones a small part of a leg;
+    *length* is that of a leg [m], by which turns count.
     """
     names = list(parameters.names)
     found = []
@@ -90,5 +90,6 @@ def directions(
             found.append((f"1 sigma along: {weak.in_words}", step))
     order = [result.kinematic.names.index(name) for name in names]
     for words, row in zip(result.held, result.kinematic.held, strict=False):
-        found.append((f"1 mm along what is held: {words}", _HELD * np.array(row)[order]))
+        step = _HELD * length * np.array(row)[order]
+        found.append((f"{1e3 * _HELD * length:.2g} mm along what is held: {words}", step))
     return found

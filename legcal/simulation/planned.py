@@ -104,7 +104,8 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
             f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
             "needed the folder that legcal plan wrote; correct --plan."
         ) from error
-    setting = Setting(plan.tolerance.camera_m, plan.tolerance.camera_rad)
+    of = plan.tolerance
+    setting = Setting(of.camera_m, of.machine_m, of.camera_rad, of.machine_rad)
     dataset = load_dataset(folder, check_images=False)
     if other := difference(nominal, dataset.machine):
         raise UsageError(

@@ -137,7 +137,8 @@ def _outside_travel(machine: Machine, row: Array) -> str | None:
     for j, q in zip(machine.motors, row, strict=True):
         leg = machine.legs[j]
         lower, upper = leg.travel
-        if not lower - TRAVEL_TOLERANCE <= q <= upper + TRAVEL_TOLERANCE:
+        slack = TRAVEL_TOLERANCE * max(abs(lower), abs(upper))
+        if not lower - slack <= q <= upper + slack:
             travel = f"{lower:.9g} to {upper:.9g} m"
             return f"{leg.prismatic} at {q:.9g} m, outside its travel of {travel},"
     return None

@@ -17,11 +17,10 @@ from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.coordinates import coordinates_of, own_coordinates, poses_at_coordinates
 from legcal.machine.kinematics import Follower, followed_poses
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine, joint_values, readings_at, readings_at_poses
 from legcal.machine.redundancy import consistent_readings
 
-_AT_END = 1e-6  # [m] from the end of a travel
+_AT_END = 2.5e-6  # mean leg lengths from the end of a travel
 _TICKS = 40  # by which the range of a coordinate is looked for, on either side of home
 _TURN = 0.5 * np.pi  # [rad], and
 _WAY = 1.0  # of a leg length: as far as a coordinate goes where no travel ends it
@@ -75,8 +74,8 @@ class Motion:
     def at_end(self) -> BoolArray:
         """Which legs are at an end of their travel or beyond it, (n_legs,)."""
         lower, upper = self.travel.T
-        q = self.posture.q
-        return np.asarray(((q <= lower + _AT_END) | (q >= upper - _AT_END)) & self._slides)
+        q, near = self.posture.q, _AT_END * self.machine.size
+        return np.asarray(((q <= lower + near) | (q >= upper - near)) & self._slides)
 
     @property
     def travel(self) -> Array:
@@ -90,7 +89,7 @@ class Motion:
     def ranges_of_readings(self) -> Array:
         """Return from where to where each leg is moved, (n_legs, 2) [m]."""
         about = readings_at(self.machine, self.machine.home)[:, None]
-        stroke = _STROKE * leg_scale(self.machine, self.machine.home)
+        stroke = _STROKE * self.machine.size
         travel = self.travel
         free = ~np.isfinite(travel) | (np.ptp(travel, axis=1) <= 0.0)[:, None]
         return np.where(free, about + stroke * np.array([-1.0, 1.0]), travel)
@@ -102,7 +101,7 @@ class Motion:
         """
         machine, home = self.machine, self.machine.home.as_matrix()[:3]
         centre = coordinates_of(home[None])[0][0, self.own]
-        scale = leg_scale(machine, machine.home)
+        scale = machine.size
         lower, upper = self.travel.T
         found = np.zeros((len(self.own), 2))
         for k, which in enumerate(self.own.tolist()):

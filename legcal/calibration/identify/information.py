@@ -42,7 +42,6 @@ from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, parametrize
 
-SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
 _WHOLE = slice(None)  # all numbers of a variable are touched
@@ -84,7 +83,7 @@ def whitened_leg_equations(predicted: PredictedObservations) -> WhitenedEquation
     equations = pose_equations(predicted.legs, predicted.R, predicted.t, q=q)
     # The readings that move rods are rows of their own
     read = equations.measured & (predicted.carried_by < 0)[equations.leg]
-    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], SIGMA_EXACT)[:, None]
+    sigma = np.where(read, predicted.sigma_of_legs[equations.leg], predicted.sigma_exact)[:, None]
     columns = list(freedoms(predicted.frame_legs))
     by_pose = (equations.by_pose / sigma * pose_unit(predicted))[:, :, columns]
     by_parameters = equations.by_parameters(predicted.parametrization) / sigma * predicted.unit
@@ -157,7 +156,7 @@ def prior_of(predicted: PredictedObservations, choices: Choices) -> GaussianPrio
         if name in choices.priors and not is_arm:
             sigma[i] = choices.priors[name].sigma
         elif is_arm or choices.holds(name, by_default=is_held_by_default(name)):
-            sigma[i] = SIGMA_EXACT * predicted.unit[i]
+            sigma[i] = predicted.sigma_exact * predicted.unit[i]
     known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
     return GaussianPrior(known, np.zeros(len(sigma)), values)
 
@@ -167,13 +166,13 @@ def prior_of_arms(
 ) -> GaussianPrior:
     """Return what is known of the lines of arms, four numbers each; *stated*: by somebody."""
     named = parametrize(predicted.leg_names, predicted.legs, predicted.frame_legs, twists=True)
-    sigmas, unit = arm_sigmas(named, predicted.arms), _line_unit(predicted)
+    sigmas, unit = arm_sigmas(named, predicted.legs, predicted.arms), _line_unit(predicted)
     known = {}
     for i, (name, sigma) in enumerate(sigmas.items()):
         if name in choices.priors:
             known[i] = choices.priors[name].sigma / unit[i % 4]
         elif name in choices.fixed:
-            known[i] = SIGMA_EXACT
+            known[i] = predicted.sigma_exact
         elif name not in choices.free and not stated:
             known[i] = sigma / unit[i % 4]
     of = np.array(list(known), dtype=np.intp)
@@ -274,7 +273,7 @@ def _legs(equations: WhitenedEquations, n_poses: int) -> Factor[_Nominal]:
 
 def _ties(predicted: PredictedObservations, lengths: Array | None) -> Factor[_Nominal]:
     """Return the factor of what ties parameters to each other, and of measured lengths."""
-    ties = predicted.ties[None] / SIGMA_EXACT
+    ties = predicted.ties[None] / predicted.sigma_exact
     if lengths is not None:
         ties = np.concatenate([ties, lengths[None]], axis=1)
     tied = Residuals.of(np.zeros(ties.shape[:2]), ties)
@@ -432,7 +431,7 @@ def intrinsics_changes(
     lateral = across.gradient[:, :, 0] @ R
     lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
     focal = predicted.focal[predicted.view][:, None, None]
-    depth = np.maximum(at[..., 2:], 1e-6)
+    depth = np.maximum(at[..., 2:], 1e-6 * predicted.mean_length)
     xy = at[..., :2] / depth
     u = predicted.body_u[predicted.pose] @ R
     along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m

@@ -26,7 +26,7 @@ from legcal.machine.actuator import Actuator, ActuatorColumns, Arm, JointMotion
 from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.directions import leg_labels, list_in_words
 from legcal.machine.equations import freedoms
-from legcal.machine.leg import Leg, LegColumns, LegKind, main_cylinders
+from legcal.machine.leg import SIGMA_READING, Leg, LegColumns, LegKind, main_cylinders
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -54,8 +54,8 @@ _ALONG = 1e-6  # a leg that points at the camera shows no lateral direction: lea
 FOCAL_PX = 1290.0  # 1024 x 768 pixels, 43 degrees wide
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
-SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
+_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what the mechanism itself demands
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -304,6 +304,11 @@ class PredictedObservations:
         """Mean leg length, by which angles become lengths [m]."""
         return float(self.length.mean())
 
+    @property
+    def sigma_exact(self) -> float:
+        """Standard deviation of what the mechanism itself demands [m]."""
+        return _EXACT * self.mean_length
+
     @cached_property
     def unit(self) -> Array:
         """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
@@ -419,7 +424,7 @@ def planned_observations(
         seen=seen,
         camera=default_cameras(A, B, views, machine.spatial, rng),
         focal=np.full(len(views), FOCAL_PX),
-        sigma_q=SIGMA_Q,
+        sigma_q=SIGMA_READING * machine.size,
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,7 +28,7 @@ from legcal.machine.equations import pose_sensitivity
 from legcal.vision.board import Link
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
-_ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
+_ERROR = 0.0025  # mean leg lengths: the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move
 
 
@@ -38,28 +38,31 @@ class Analysis:
 
     predicted: PredictedObservations
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
+    # From an analysis of the same machine; None: computed here
+    same_motion: PlatformMotion | None = None
+    same_equations: WhitenedEquations | None = None
+    same_images: Array | None = None
 
     def elsewhere(self, predicted: PredictedObservations, poses: IntArray) -> Analysis:
         """Return the analysis of other images of the same machine, at some of the same poses."""
-        other = Analysis(predicted, self.choices)
-        other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
-        return other
+        return Analysis(predicted, self.choices, self.motion, self.equations.at(poses))
 
     def with_board(self, *, board: bool = True, link: Link = "base") -> Analysis:
         """Return the analysis of the same images with a board on a link in all or in none."""
         predicted = self.predicted.with_board(board=board, link=link)
         other = self.elsewhere(predicted, np.arange(len(predicted.t)))
-        other.__dict__.update(images=self.images)
-        return other
+        return replace(other, same_images=self.images)
 
     @cached_property
     def images(self) -> Array:
         """Whitened derivatives of what images show."""
-        return image_rows(self.predicted)
+        return image_rows(self.predicted) if self.same_images is None else self.same_images
 
     @cached_property
     def equations(self) -> WhitenedEquations:
         """The equations of readings and legs."""
+        if self.same_equations is not None:
+            return self.same_equations
         return whitened_leg_equations(self.predicted)
 
     @cached_property
@@ -94,7 +97,7 @@ class Analysis:
     @cached_property
     def motion(self) -> PlatformMotion:
         """How the platform follows the parameters."""
-        return PlatformMotion(self.predicted)
+        return PlatformMotion(self.predicted) if self.same_motion is None else self.same_motion
 
     @cached_property
     def full(self) -> Ranks:
@@ -182,10 +185,11 @@ def weak_directions(
 def _direction(
     predicted: PredictedObservations, motion: PlatformMotion, row: Array, harmless: bool
 ) -> WeakDirection:
-    """Return a direction with its largest component at 1 mm."""
-    row = row * (_ERROR / row[np.argmax(np.abs(row))])
-    shown = np.flatnonzero(np.abs(row) > SHOWN * _ERROR)
-    shown = shown[np.argsort(-np.abs(row[shown] / _ERROR).round(3), kind="stable")]
+    """Return a direction with its largest component at a small part of the leg length."""
+    row = row / row[np.argmax(np.abs(row))]
+    shown = np.flatnonzero(np.abs(row) > SHOWN)
+    shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
+    row = row * (_ERROR * predicted.mean_length)
     names = tuple(predicted.parametrization.names[i] for i in shown)
     effect = motion.effect(row)
     return WeakDirection(

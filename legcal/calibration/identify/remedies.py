@@ -47,7 +47,7 @@ _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
 ENOUGH_IMAGES = 15  # a view
-_KNOWN = 1e12  # 1/m
+_KNOWN = 4e11  # 1 / mean leg length
 _ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 
 
@@ -256,7 +256,7 @@ def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     """Return what is open when some parameters are known."""
     predicted, motion = analysis.predicted, analysis.motion
     extra = np.zeros((len(known), len(predicted.unit)))
-    extra[np.arange(len(known)), list(known)] = _KNOWN
+    extra[np.arange(len(known)), list(known)] = _KNOWN / predicted.mean_length
     rows = np.concatenate([analysis.information, extra])
     return _Score(len(undetermined(predicted, rows)), missing(predicted, rows, motion))
 

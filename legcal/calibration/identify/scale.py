@@ -24,12 +24,11 @@ from legcal.data.dataset import Dataset
 from legcal.estimation.problem import GaussianPrior, Variables, all_free
 from legcal.estimation.square_root import information_rows, marginal_rows
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import LegColumns, radius_name
+from legcal.machine.leg import SIGMA_LENGTH, LegColumns, radius_name
 from legcal.vision.board import Link
 
-LENGTH_SIGMA = 5e-5  # [m] of a length that somebody measures
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
-_KNOWN = 1e-9  # [m] of a radius that is known
+_KNOWN = 2.5e-9  # mean leg lengths: of a radius that is known
 _VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
 _LINKS: tuple[Link, ...] = ("base", "platform")
 
@@ -40,12 +39,13 @@ def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
         return ()
     names = analysis.predicted.parametrization.names
     measured = analysis.predicted.columns(LegColumns.LENGTH)[:1]
-    length, radius = LENGTH_SIGMA, RefinementSettings.radius_sigma
+    length = SIGMA_LENGTH * analysis.predicted.mean_length
+    radius = RefinementSettings.radius_sigma
     row = np.zeros((1, len(names)))
     row[0, measured] = 1.0 / length
     with_length = np.concatenate([_information(analysis), row])
     tried = (
-        ("length", f"{names[measured[0]]} measured to {1e3 * length:g} mm", with_length),
+        ("length", f"{names[measured[0]]} measured to {1e3 * length:.2g} mm", with_length),
         *(
             (
                 f"{link}_board",
@@ -130,7 +130,7 @@ def _information(
             relative,
         )
     else:
-        sigma = np.maximum(np.broadcast_to(sigma_radius, n), _KNOWN)
+        sigma = np.maximum(np.broadcast_to(sigma_radius, n), _KNOWN * predicted.mean_length)
         which = np.flatnonzero(np.isfinite(sigma))
         prior = GaussianPrior(which, np.zeros(len(which)), sigma[which])
         body = np.broadcast_to(np.arange(n), shape)
@@ -157,7 +157,7 @@ def _stated_radii(analysis: Analysis) -> Array:
         names = [radius_name(predicted.leg_names[j], link) for link in links]
         stated = [choices.priors[name].sigma for name in names if name in choices.priors]
         if choices.fixed.intersection(names):
-            stated.append(_KNOWN)
+            stated.append(_KNOWN * predicted.mean_length)
         return min(stated, default=np.inf)
 
     return np.array([sigma(*part) for part in predicted.parts])

@@ -27,7 +27,7 @@ _HELD_SIGMA = 0.01  # of it, where the platform does not move
 _HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
 _MAX_OTHERS = 0.05  # of a direction that is not kinematic: more, and it is not a matter of the legs
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"
-_MIN_SPREAD = 1e-12  # [m] a spread that counts as none
+_MIN_SPREAD = 2.5e-12  # mean leg lengths: a spread that counts as none
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Arra
     for kind in (is_length, ~is_length):
         found = float(np.sum(kind) - np.sum(H[:, kind] ** 2))  # the rest is held: no change
         sigma[kind] = np.sqrt(np.sum(change[kind] ** 2) / max(found, 1.0))
-    weighted = H / np.maximum(sigma, _MIN_SPREAD)
+    weighted = H / np.maximum(sigma, _MIN_SPREAD * state.mean_length)
     spread = H.T @ np.linalg.solve(weighted @ weighted.T, H)
     back = np.linalg.inv(problem.jacobian(state))[:n, :n] * unit
     return np.asarray(back @ spread @ back.T)

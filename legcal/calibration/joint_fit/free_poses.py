@@ -25,7 +25,7 @@ _SEED, _DRAWN = 1965, 16  # places from which every pose is looked for, beside w
 _TURN, _SHIFT = 0.4, 0.3  # of these from there [rad, mean leg lengths], one standard deviation
 _STEPS = 25  # of a pose
 _DAMPING, _SLOW = 1e-3, 0.999  # at first; part of its cost that a step must leave to go on
-_MODEL_PX, _MODEL_LENGTH = 2.0, 2e-3  # errors of the nominal model [px], [m] and mean leg lengths
+_MODEL_PX, _MODEL_LENGTH = 2.0, 0.005  # errors of the nominal model [px], mean leg lengths
 _WIDTH = 3.0  # of the loss, in medians
 _RANK = 1e-6  # of the largest singular value
 _OUTLYING = 10.0  # medians of what the measurements of a pose cost
@@ -64,11 +64,11 @@ def _are_determined(problem: FitProblem, state: State) -> BoolArray:
 
 def with_free_poses(problem: FitProblem, state: State) -> State:
     """Return a start with the best poses near it, and cameras that suit them, by the legs there."""
-    soft = _softened(problem, 1.0)
     n, length = problem.n_kinematic, state.mean_length
-    metre = np.array([1.0 if unit == "m" else 1.0 / length for unit in problem.units[:n]])
+    soft = _softened(problem, 1.0, length)
+    unit = np.array([length if unit == "m" else 1.0 for unit in problem.units[:n]])
     legs = problem.block("legs")
-    near = GaussianPrior(np.arange(n, dtype=np.intp), legs.read(state.legs), _MODEL_LENGTH * metre)
+    near = GaussianPrior(np.arange(n, dtype=np.intp), legs.read(state.legs), _MODEL_LENGTH * unit)
     soft = soft.with_parts((replace(legs, prior=legs.prior + near),), ())
     for seed in range(2):
         state = with_better_poses(soft, state, seed=seed)
@@ -82,7 +82,7 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
 
     All else is held. *part* of the errors of a nominal model counts as noise.
     """
-    problem = _softened(problem, part) if part else problem
+    problem = _softened(problem, part, state.mean_length) if part else problem
     loss = PseudoHuber(_width(problem, state))
     rng, n = np.random.default_rng((_SEED, seed)), len(state.platform_pose.t)
     size = np.zeros(problem.d_element)  # the readings of a posture follow its pose
@@ -107,13 +107,17 @@ def have_outliers(problem: FitProblem, state: State) -> bool:
     return bool(np.any(judged > _OUTLYING * np.median(cost)))
 
 
-def _softened(problem: FitProblem, part: float) -> FitProblem:
-    """Return the problem with a part of the errors of a nominal model added to the noise."""
+def _softened(problem: FitProblem, part: float, length: float) -> FitProblem:
+    """Return the problem with a part of the errors of a nominal model added to the noise.
+
+    The mean leg length is *length* [m].
+    """
+    off_m = part * _MODEL_LENGTH * length
     noise = NoiseModel(1.0, part * _MODEL_PX, part * _MODEL_PX)
     readings, of_actuators = problem.factor("readings"), problem.factor("actuator_readings")
-    sigma = np.hypot(problem.readings.sigma, part * _MODEL_LENGTH)
+    sigma = np.hypot(problem.readings.sigma, off_m)
     read, legs = problem.observed.actuator_readings, problem.legs.nominal
-    off = np.array([legs[j].reading_of(part * _MODEL_LENGTH) for j in first_rods(legs)])
+    off = np.array([legs[j].reading_of(off_m) for j in first_rods(legs)])
     own = np.hypot(read.sigma, off[read.actuator] if len(read) else 0.0)
     softer = (
         replace(readings, whitening=1.0 / sigma[:, None, None]),

@@ -99,7 +99,7 @@ _MAX_SIGMA = 0.03  # [rad], or of a leg's length: a pose known worse is none
 _MAX_STEP = 0.1  # [rad], or of a leg's length, in one step
 _MAX_DISTANCE = 0.3  # the same from where the search began
 _STEP_TOLERANCE = 1e-4  # squared length of the last step, in standard deviations
-_MIN_INFORMATION = 1.0  # [1/rad^2, 1/m^2]: better than a metre or radian
+_MIN_INFORMATION = 1.0  # [1/rad^2], 1 / squared leg lengths: better than a radian or a leg
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> PosesByOutlines
     problem, begin = predicted.problem, predicted.state
     linear = linearize(problem, begin)
     length = begin.mean_length
-    state, known = begin, _is_known(_by_outlines(problem, begin, linear), length)
+    state, known = begin, _is_known(_by_outlines(problem, begin, linear), begin)
     converged = np.zeros(len(known), dtype=np.bool_)
     weight = np.ones(len(problem.outlines))
     for step in range(_ROBUST_STEPS + _MAX_STEPS):
@@ -142,7 +142,7 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> PosesByOutlines
         linear = linearize(problem, state)
     outlines = _by_outlines(problem, state, linear, weight)
     readings = information(problem, state, linear, only=_READINGS)
-    which = np.flatnonzero(known & converged & _is_known(outlines, length))
+    which = np.flatnonzero(known & converged & _is_known(outlines, state))
     covariance = _covariance(outlines, readings, predicted.covariance)[which]
     return PosesByOutlines(state.platform_pose.motions, which, covariance)
 
@@ -190,11 +190,12 @@ def _with_poses(state: State, first: Postures, chosen: BoolArray, poses: Posture
     return replace(state, platform_pose=first.where(chosen, poses))
 
 
-def _is_known(normal: NormalEquations, length: float) -> BoolArray:
+def _is_known(normal: NormalEquations, state: State) -> BoolArray:
     """Return which poses are determined well enough to mean anything."""
-    Z = _motions(normal)
+    Z, length = _motions(normal), state.mean_length
     covariance = Z @ normal.V_inverse @ np.swapaxes(Z, 1, 2)
-    has_rank = np.linalg.eigvalsh(normal.V)[:, 0] > _MIN_INFORMATION
+    scale = state.posture_scale if normal.tangent is None else np.ones(normal.V.shape[1])
+    has_rank = np.linalg.eigvalsh(scale[:, None] * normal.V * scale)[:, 0] > _MIN_INFORMATION
     turn, shift = (
         np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2))
         for part in (slice(0, 3), slice(3, 6))

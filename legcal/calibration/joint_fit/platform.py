@@ -96,8 +96,9 @@ def _root_of_sum(squares: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))
 
 
-_REACHED = 1e-8  # [m]
-_REACHED_BY_ALL = 0.03  # of the length of a leg: how far readings of redundant motors may disagree
+# Of the length of a leg
+_REACHED = 2.5e-8
+_REACHED_BY_ALL = 0.03  # how far readings of redundant motors may disagree
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +188,8 @@ def reach_readings(
         else:
             continue
         length = np.linalg.norm(R @ leg.B + t - A, axis=1)
-        most = _REACHED_BY_ALL * length if machine.is_redundant else _REACHED
-        reached &= np.abs(length - wanted) < most
+        most = _REACHED_BY_ALL if machine.is_redundant else _REACHED
+        reached &= np.abs(length - wanted) < most * length
     return reached
 
 

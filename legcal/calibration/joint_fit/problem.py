@@ -359,9 +359,9 @@ def _built(given: _Given, choices: Choices) -> FitProblem:
         factors=(*observed.factors(keys), measured_lengths(legs.names, choices).factor()),
         constraint=LegConstraints(parameters),
         name="joint fit",
-        remedy="start nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check "
-        "the camera poses, the readings and that outlines or axes are those of the right legs and "
-        "edges",
+        remedy="start nearer to the truth (joints to 1 % of a leg length, cameras to 2 % and 2 "
+        "deg) and check the camera poses, the readings and that outlines or axes are those of the "
+        "right legs and edges",
         parameters=parameters,
         choices=choices,
         observed=observed,
@@ -416,21 +416,24 @@ def _arm_priors(
     """
     seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
     chosen = {*choices.fixed, *choices.free, *choices.priors}
-    known = arm_sigmas(legs.parametrization, seen, settings)
+    known = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
     return {name: sigma for name, sigma in known.items() if name not in chosen}
 
 
 def arm_sigmas(
     parametrization: Parametrization,
-    legs: Iterable[int],  # that have arms as parts
+    legs: Sequence[Leg],
+    seen: Iterable[int],  # those that have arms as parts
     settings: RefinementSettings = DEFAULT_SETTINGS,
 ) -> dict[str, float]:
     """Return how well the lines of arms are known before a fit [rad, m], by parameter."""
-    sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma,) * 2
+    lengths = [leg.q0 for leg in legs if leg.actuator is not None]
+    length = float(np.mean(lengths)) if lengths else 0.0
+    sigmas = (settings.arm_axis_sigma,) * 2 + (settings.arm_point_sigma * length,) * 2
     names, place = parametrization.names, parametrization.place[:, ActuatorColumns.ARM]
     return {
         names[i]: sigma
-        for leg in legs
+        for leg in seen
         for i, sigma in zip(place[leg].tolist(), sigmas, strict=True)
     }
 

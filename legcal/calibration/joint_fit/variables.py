@@ -22,7 +22,7 @@ from legcal.geometry.axes import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.equations import PoseEquations, freedoms, posture_constraints
-from legcal.machine.leg import Leg, LegColumns
+from legcal.machine.leg import Leg, LegColumns, mean_length
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -41,9 +41,9 @@ from legcal.machine.ties import Ties, independent, ties_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
-_TIED, _TIE_STEPS = 1e-13, 20  # [m], and steps towards it
-_MET = 1e-12  # [m, rad]
-_STEP_TOLERANCE = 1e-6  # [m, rad], last step where constraints cannot all be met to rounding
+_TIED, _TIE_STEPS = 2.5e-13, 20  # mean leg lengths, and steps towards it
+_MET = 2.5e-12  # mean leg lengths by which constraints are missed that are met
+_STEP_TOLERANCE = 1e-6  # mean leg lengths, [rad]: last step where they cannot all be met
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class RefinementSettings:
 
     radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
     arm_axis_sigma: float = 0.02  # of that on the line of an arm where the model draws it [rad],
-    arm_point_sigma: float = 4e-3  # and across it [m]
+    arm_point_sigma: float = 0.01  # and across it, of the mean length of the rods
     board_scale_sigma: float = 0.001  # of the dimensions of a board: what printers and paper do
     loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
     rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
@@ -225,6 +225,11 @@ class FittedLegs:
         return is_spatial(self.frame_legs)
 
     @cached_property
+    def length_at_home(self) -> float:
+        """Mean length of the legs where ties are taken [m]; 0 without a home."""
+        return 0.0 if self.home is None else mean_length(self.nominal, self.home.as_matrix()[:3])
+
+    @cached_property
     def sign(self) -> IntArray:
         """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
         return np.array([leg.sign for leg in self.nominal], dtype=np.intp)
@@ -370,7 +375,7 @@ class LegParameters:
         """Return legs moved, as little as possible, to where all ties hold."""
         for _ in range(_TIE_STEPS if self.n_tied else 0):
             left, rows = self.tie_rows(geometry)
-            if np.abs(left).max() < _TIED:
+            if np.abs(left).max() < _TIED * self.legs.length_at_home:
                 break
             step = np.append(-rows.T @ left, 0.0)
             geometry = self.retract(geometry, step[self.unknown])
@@ -473,8 +478,8 @@ class LegConstraints:
             return there
         raise DidNotConverge(
             "The joint fit could not keep the platform on what its joints allow: found a pose that "
-            f"still moves by {size:.2g} m or rad, needed rest; start nearer to the truth (joints "
-            "to 5 mm, axes to 3 deg)."
+            f"still moves by {size:.2g} leg lengths or rad, needed rest; start nearer to the truth "
+            "(joints to 1 % of a leg length, axes to 3 deg)."
         )
 
     def with_poses(self, state: State, poses: Postures) -> State:
@@ -490,12 +495,13 @@ class LegConstraints:
             return state, np.zeros(len(state.platform_pose.t))
         state = replace(state, legs=self.parameters.on_ties(state.legs))
         frame_legs, (R, t, q) = self.legs.frame_legs, state.platform_pose
+        scale = state.posture_scale
         if self.legs.n_actuators:
-            found, q = solve_postures(state.legs, frame_legs, R, t, q)
+            found, q = solve_postures(state.legs, frame_legs, R, t, q, scale)
         else:
-            found = solve_poses(state.legs, frame_legs, R, t)
+            found = solve_poses(state.legs, frame_legs, R, t, scale=scale)
         # The last step to where they hold may be long.
-        step = np.where(found.missed < _MET, 0.0, found.size)
+        step = np.where(found.missed < _MET * state.mean_length, 0.0, found.size)
         return replace(state, platform_pose=Postures(found.R, found.t, q)), step
 
     @cached_property
@@ -505,26 +511,31 @@ class LegConstraints:
         return [*freedoms(self.legs.frame_legs), *range(6, d)]
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
-        """Return the motions of poses that the constraints leave; None where all are free."""
+        """Return the motions of poses that the constraints leave; None where all are free.
+
+        One radian of them, or the mean leg length, counts as one.
+        """
         if self.legs.spatial and not self.binds:
             return None
         free, d = self._free, problem.d_element
+        scale = state.posture_scale[free]
         n_poses, n_kept = problem.n_elements, problem.n_kept
         rows, by_posture = _binding(state.legs, state.platform_pose)
         Q = np.zeros((n_kept + 1, n_poses, d))
         if len(rows.leg) == 0:
-            Z = np.broadcast_to(np.eye(d)[:, free], (n_poses, d, len(free))).copy()
+            Z = np.broadcast_to(np.eye(d)[:, free] * scale, (n_poses, d, len(free))).copy()
             return Tangent(Z, Q[:-1])
-        _, s, vt = np.linalg.svd(by_posture[:, :, free])
+        slopes = by_posture[:, :, free] * scale
+        _, s, vt = np.linalg.svd(slopes)
         n = s.shape[1]
         binding = s > _RANK * s[:, :1]
         least = int(binding.sum(axis=1).min(initial=n))
         basis = np.swapaxes(vt, -1, -2)[:, :, least:].copy()
         basis[:, :, : n - least] *= ~binding[:, None, least:]
         Z = np.zeros((n_poses, d, basis.shape[2]))
-        Z[:, free] = basis
+        Z[:, free] = scale[:, None] * basis
         inverse = np.zeros((n_poses, d, len(rows.leg)))
-        inverse[:, free] = np.linalg.pinv(by_posture[:, :, free], rcond=_RANK)
+        inverse[:, free] = scale[:, None] * np.linalg.pinv(slopes, rcond=_RANK)
         for i, leg in enumerate(rows.leg):
             place = problem.place["legs"][leg]
             by_local = rows.by_local[:, i]
@@ -541,9 +552,9 @@ class LegConstraints:
 
     def following(self, state: State, leg: int, column: int) -> Array:
         """Return how postures (n_poses, 6 + n) follow a number of a leg, all else at rest."""
-        free = self._free
+        free, scale = self._free, state.posture_scale[self._free]
         rows, by_posture = _binding(state.legs, state.platform_pose)
-        inverse = np.linalg.pinv(by_posture[:, :, free], rcond=_RANK)
+        inverse = scale[:, None] * np.linalg.pinv(by_posture[:, :, free] * scale, rcond=_RANK)
         by_number = np.where(rows.leg == leg, rows.by_local[:, :, column], 0.0)
         motion = np.zeros((len(state.platform_pose.t), by_posture.shape[2]))
         motion[:, free] = -np.einsum("kfm,km->kf", inverse, by_number)

@@ -41,14 +41,13 @@ _MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
 _LARGE_RESIDUAL = 0.05  # residuals in parts of the spread of positions, and [rad]
 _MAX_RESIDUAL = 0.2  # the same
 _MIN_DOF = 1.0  # for a scatter
-_MAX_SIGMA = 1.0  # [m]
-_MAX_TOOL = 100.0  # [m]
+_MAX_SIGMA, _MAX_TOOL = 2.5, 250.0  # mean leg lengths
 _SAME_CHI2 = 30.0  # two answers that explain the poses alike
 _SAME_COST = 25.0  # times the cost of the best
 _ROUNDING = 1e-20
 _SAME_FRAMES = 0.02  # [rad], and of the length
 _MIN_P, _MAX_P = 1e-3, 1.0 - 1e-4  # probabilities of residuals as large as these
-_FIXED_TOLERANCE = 1e-12  # [m, rad]
+_FIXED_TOLERANCE = 2.5e-12  # mean leg lengths, [rad]
 _KINDS = ("positions", "orientations")
 
 
@@ -94,8 +93,8 @@ def locate(
     NotIdentifiable
         If the poses leave open what other poses of the machine would determine.
     """
-    _check_numbers(position_sigma, angle_sigma, tool_position)
     machine = model if isinstance(model, Machine) else load_mechanism(model)
+    _check_numbers(position_sigma, angle_sigma, tool_position, machine.size)
     sigma_q = _sigmas_of_readings(encoder_sigma, machine)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
@@ -131,23 +130,25 @@ def _check_numbers(
     position_sigma: float | None,
     angle_sigma: float | None,
     tool_position: Sequence[float] | None,
+    size: float,  # of the machine [m]
 ) -> None:
     """Refuse numbers that cannot be meant."""
+    most_sigma, most_tool = _MAX_SIGMA * size, _MAX_TOOL * size
     for what, value, least, most, unit in (
-        ("position sigma", position_sigma, MIN_SIGMA, _MAX_SIGMA, "m"),
+        ("position sigma", position_sigma, MIN_SIGMA, most_sigma, "m"),
         ("angle sigma", angle_sigma, MIN_SIGMA, MAX_ANGLE_SIGMA, "rad"),
     ):
         if value is not None and not least <= value <= most:
             raise UsageError(
                 f"The {what} could not be used: found {value:g} {unit}, needed {least:g} to "
-                f"{most:g} {unit}; correct it."
+                f"{most:.3g} {unit}; correct it."
             )
     if tool_position is not None and not (
-        len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= _MAX_TOOL))
+        len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= most_tool))
     ):
         raise UsageError(
             f"The tool position could not be used: found {describe(list(tool_position))}, needed "
-            f"three numbers within {_MAX_TOOL:g} m; give x, y, z in the platform."
+            f"three numbers within {most_tool:.3g} m; give x, y, z in the platform."
         )
 
 
@@ -393,7 +394,7 @@ def _sentence(
     size = np.linalg.norm(sigma, axis=1)
     base = f"{1e3 * size[0]:.2g} mm and {np.degrees(size[1]):.2g} deg"
     known = [
-        f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _FIXED_TOLERANCE),
+        f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _FIXED_TOLERANCE * measurements.machine.size),
         f"{np.degrees(size[3]):.2g} deg"
         * bool(measurements.is_oriented and size[3] > _FIXED_TOLERANCE),
     ]

@@ -35,7 +35,6 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import freedoms, pose_equations, pose_sensitivity
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base
-from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import first_rods, readings_of_rods
@@ -310,7 +309,7 @@ def tool_measurements(
         M=poses.rotation,
         p=poses.position,
         oriented=poses.oriented,
-        length=_RADIAN * leg_scale(machine, machine.home),
+        length=_RADIAN * machine.size,
     )
     by_model = _motions_by_model(machine, T)
     return ToolMeasurements(

@@ -24,7 +24,7 @@ from legcal.machine.urdf import Urdf, UrdfPatch
 
 WORLD = "world"
 TOOL = "tool"
-_TOLERANCE = 1e-12  # [m, rad]: rounding of the analysis
+_TOLERANCE = 2.5e-12  # mean leg lengths: rounding of the analysis
 
 
 def write_located_model(
@@ -158,7 +158,7 @@ def check_same(before: Machine, after: Machine) -> None:
         and before.mobility == after.mobility
         and before.frame_legs == after.frame_legs
         and all(
-            np.abs(one - other).max() <= _TOLERANCE
+            np.abs(one - other).max() <= _TOLERANCE * before.size
             for one, other in (
                 (before.A_base, after.A_base),
                 (before.B_platform, after.B_platform),

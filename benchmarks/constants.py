@@ -1,0 +1,262 @@
+"""How much the result depends on each number of a room's ``tuning.py``.
+
+    OMP_NUM_THREADS=1 python benchmarks/constants.py [--room perception] [--only NAME ...]
+        [--independent FOLDER] [--factors 0.5 0.7 1.4 2] [-o benchmarks/constants.jsonl]
+
+Small sessions are calibrated with one number times a factor, the others as they are: nine
+photographs of the example at half their size, a simulated 3-RPS and, with ``--independent``, nine
+photographs of a session with a truth by another renderer. All are without rough camera poses, so
+that recognition counts. A line of JSON for each number, factor and session has the outlines used,
+the error of the platform against the truth [leg lengths], and what the calibration states of it;
+lines that the file has are not measured again. ``--table`` prints them, with the plateau of each
+number: the factors about 1 at which no session loses 5 % of its outlines, gets half again as wrong
+as before (and wronger than it states), or fails.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from csv_rows import read_rows, write_rows
+
+from legcal.machine.loader import load_mechanism
+
+ROOT = Path(__file__).parents[1]
+RECORDED = Path(__file__).with_suffix(".jsonl")
+FACTORS = (0.5, 0.7, 1.4, 2.0)
+IMAGES = 3  # of each view
+FEWER, WORSE = 0.95, 1.5  # outlines used, and error, against those at factor 1
+TRIAL = """
+import json, sys
+import legcal.{room}.tuning as tuning
+name, factor = sys.argv[1], float(sys.argv[2])
+if name:
+    source = open(tuning.__file__, encoding="utf-8").read()
+    before = "\\n" + name + " = "
+    number = source.split(before)[1].split("\\n")[0]
+    exec(compile(source.replace(before + number, before + repr(factor * float(number))),
+                 tuning.__file__, "exec"), tuning.__dict__)
+from legcal import calibrate, evaluate
+from legcal.errors import LegcalError
+try:
+    found = calibrate(sys.argv[3], use_cache=False, output=sys.argv[5])
+except LegcalError as error:
+    print(json.dumps({{"said": str(error)[:200]}}))
+else:
+    result = found.result
+    off = evaluate(sys.argv[5] + "/calibrated.yaml", sys.argv[4], dataset=sys.argv[3])
+    print(json.dumps({{
+        "used": int(result.observations.used), "off": float(off.displacement.mean()),
+        "stated": result.platform.sigma_dX_m,
+    }}))
+"""
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a session came to with one number times a factor."""
+
+    room: str
+    number: str  # "" where nothing is changed
+    factor: float
+    session: str
+    used: int = 0
+    off: float = float("nan")  # error of the platform [leg lengths]
+    stated: float = float("nan")  # one standard deviation of it
+    said: str = ""  # why it failed
+
+
+@dataclass(frozen=True)
+class Session:
+    """A small dataset, and the true model of its machine."""
+
+    name: str
+    dataset: Path
+    truth: Path
+
+
+def numbers(room: str) -> list[str]:
+    """Return the names of the numbers of a room that are not made from others."""
+    text = (ROOT / f"legcal/{room}/tuning.py").read_text(encoding="utf-8")
+    pairs = [line.split(" = ") for line in text.splitlines() if " = " in line]
+    return [name for name, value in pairs if name.isupper() and _is_number(value)]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def small(source: Path, folder: Path, *, half: bool) -> Path:
+    """Copy the first images of each view of a dataset, without rough camera poses."""
+    shutil.copytree(source, folder, ignore=shutil.ignore_patterns(".legcal*", "images", "truth"))
+    rows, n_of_view = [], dict[str, int]()
+    (folder / "images").mkdir(exist_ok=True)
+    for row in read_rows(source / "measurements.csv"):
+        n_of_view[row["view"]] = n_of_view.get(row["view"], 0) + 1
+        if n_of_view[row["view"]] > IMAGES:
+            continue
+        picture = cv2.imread(str(source / row["image"]), cv2.IMREAD_UNCHANGED)
+        if picture is None:
+            raise OSError(f"{source / row['image']} is no image")
+        row["image"] = f"images/{row['view']}_{n_of_view[row['view']]}.png"
+        if half:
+            picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(folder / row["image"]), picture)
+        rows.append(row)
+    write_rows(folder / "measurements.csv", rows)
+    entry = yaml.safe_load((folder / "dataset.yaml").read_text(encoding="utf-8"))
+    cameras = set[str]()
+    for view in entry["views"].values():
+        view.pop("T_base_camera", None)
+        view.pop("legs", None)
+        cameras.add(view["camera"])
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry, sort_keys=False), encoding="utf-8")
+    for name in cameras if half else ():
+        camera = yaml.safe_load((folder / name).read_text(encoding="utf-8"))
+        camera["image_width"] //= 2
+        camera["image_height"] //= 2
+        K = np.array(camera["camera_matrix"]["data"]).reshape(3, 3)
+        K[:2] *= 0.5
+        K[:2, 2] -= 0.25
+        camera["camera_matrix"]["data"] = K.ravel().tolist()
+        camera.pop("projection_matrix", None)
+        (folder / name).write_text(yaml.safe_dump(camera), encoding="utf-8")
+    return folder
+
+
+def sessions(folder: Path, independent: Path | None) -> list[Session]:
+    """Make the sessions in a folder that may have them already."""
+    truth = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"
+    sources = {"example": (ROOT / "examples/hexapod", truth, True)}
+    if independent is not None:
+        of_truth = next(independent.with_name(f"{independent.name}-truth").glob("models/*.yaml"))
+        sources[independent.name] = independent, of_truth, True
+    shot = folder / "3-rps-shot"
+    if not shot.exists():
+        words = ["simulate", ROOT / "models/3-rps.yaml", "-o", shot, "--poses", IMAGES]
+        words += ["--seed", 4, "-q"]
+        subprocess.run([sys.executable, "-m", "legcal", *map(str, words)], check=True,
+                       capture_output=True)  # fmt: skip
+    sources["3-rps"] = shot, shot / "truth/models/3-rps.yaml", True
+    found = []
+    for name, (source, model, half) in sources.items():
+        dataset = folder / name
+        if not dataset.exists():
+            small(source, dataset, half=half)
+        found.append(Session(name, dataset, model))
+    return found
+
+
+def trial(room: str, number: str, factor: float, session: Session, size: float) -> Line:
+    """Calibrate a session with a number times a factor, in a process of its own."""
+    with TemporaryDirectory() as scratch:
+        words = [number, str(factor), str(session.dataset), str(session.truth), f"{scratch}/out"]
+        code = TRIAL.format(room=room)
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
+        )
+    if done.returncode:
+        why = done.stderr.strip().splitlines()[-1][:200]
+        return Line(room, number, factor, session.name, said=why)
+    line = Line(room, number, factor, session.name, **json.loads(done.stdout.splitlines()[-1]))
+    return replace(line, off=line.off / size, stated=line.stated / size)
+
+
+def recorded(path: Path) -> list[Line]:
+    """Return the lines of a file; none if there is no file."""
+    if not path.exists():
+        return []
+    return [Line(**json.loads(text)) for text in path.read_text(encoding="utf-8").splitlines()]
+
+
+def is_worse(line: Line, usual: Line) -> bool:
+    """Say whether a trial is clearly worse than with the number as it is."""
+    if line.said:
+        return not usual.said
+    few = line.used < FEWER * usual.used
+    return few or line.off > max(WORSE * usual.off, 2.0 * line.stated)
+
+
+def plateaus(lines: list[Line], room: str) -> Iterator[tuple[str, float, float, list[Line]]]:
+    """Return each number with the least and greatest factor about 1 at which nothing is worse."""
+    usual = {line.session: line for line in lines if line.room == room and not line.number}
+    for number in dict.fromkeys(one.number for one in lines if one.room == room and one.number):
+        own = [line for line in lines if line.number == number and line.session in usual]
+        bad = {line.factor for line in own if is_worse(line, usual[line.session])}
+        tried = sorted({line.factor for line in own} | {1.0})
+        low = max((f for f in bad if f < 1.0), default=0.0)
+        high = min((f for f in bad if f > 1.0), default=float("inf"))
+        within = [factor for factor in tried if low < factor < high]
+        yield number, within[0], within[-1], own
+
+
+def table(lines: list[Line], room: str) -> None:
+    """Print the plateau of each number, and what each session came to."""
+    usual = {line.session: line for line in lines if line.room == room and not line.number}
+    for one in usual.values():
+        print(f"{one.session:>10}: {one.used} outlines used, off {1e4 * one.off:.2f} e-4 of a leg "
+              f"({1e4 * one.stated:.2f} stated)")  # fmt: skip
+    print(f"{'':18}plateau      outlines used and error against factor 1")
+    for number, low, high, own in plateaus(lines, room):
+        words = []
+        for factor in sorted({line.factor for line in own}):
+            each = [
+                "failed"
+                if line.said
+                else f"{100 * (line.used / usual[line.session].used - 1):+.0f}% "
+                f"x{line.off / usual[line.session].off:.2f}"
+                for line in own
+                if line.factor == factor
+            ]
+            words.append(f"{factor:g}: {', '.join(each)}")
+        print(f"{number:18}{low:g} to {high:g}   {'; '.join(words)}")
+
+
+def main() -> None:
+    """Measure what is missing, then print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--room", default="perception")
+    parser.add_argument("--only", nargs="+", help="these numbers alone")
+    parser.add_argument("--independent", type=Path, help="a dataset, its truth in NAME-truth")
+    parser.add_argument("--factors", type=float, nargs="+", default=FACTORS)
+    parser.add_argument("--keep", type=Path, help="folder for the sessions")
+    parser.add_argument("--table", action="store_true", help="measure nothing")
+    parser.add_argument("-o", "--output", type=Path, default=RECORDED)
+    chosen = parser.parse_args()
+    lines = recorded(chosen.output)
+    if not chosen.table:
+        done = {(line.room, line.number, line.factor, line.session) for line in lines}
+        tried = [("", 1.0)]
+        tried += [(n, f) for n in chosen.only or numbers(chosen.room) for f in chosen.factors]
+        with TemporaryDirectory() as scratch, chosen.output.open("a", encoding="utf-8") as file:
+            every = sessions(chosen.keep or Path(scratch), chosen.independent)
+            for number, factor in tried:
+                for session in every:
+                    if (chosen.room, number, factor, session.name) in done:
+                        continue
+                    size = load_mechanism(session.truth).size
+                    line = trial(chosen.room, number, factor, session, size)
+                    lines.append(line)
+                    file.write(json.dumps(asdict(line)) + "\n")
+                    file.flush()
+    table(lines, chosen.room)
+
+
+if __name__ == "__main__":
+    main()
