@@ -2,10 +2,12 @@
 
     OMP_NUM_THREADS=1 python benchmarks/fuzz.py [--inputs 100000] [--seed 0] [--workers N]
                                                 [--keep FOLDER] [--deep SHARE] [--only NAME]
+                                                [--claims 4]
 
 Every input is a valid file with one to three changes (bytes, tokens, lines, structure), which a
 command reads in a child process with limits. Printed are the exit codes, the slowest and the
-largest, and every fault; FOLDER gets the damaged files of the faults.
+largest, and every fault; FOLDER gets the damaged files of the faults. A few more are valid tables
+of outlines whose covariances are most unequal: they must not be refused.
 """
 
 import argparse
@@ -16,7 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from fuzzing.running import DEEP_SHARE, Count, count_cases, drawn_cases
+from fuzzing.running import DEEP_SHARE, Count, cases_of_unequal_claims, count_cases, drawn_cases
 
 from legcal.workers import worker_pool
 
@@ -30,9 +32,11 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder for the damaged files of the faults")
     parser.add_argument("--deep", type=float, default=DEEP_SHARE, help="share of slow commands")
     parser.add_argument("--only", default="", help="subjects whose name holds this")
+    parser.add_argument("--claims", type=int, default=4, help="tables of most unequal outlines")
     asked = parser.parse_args()
     begin = time.perf_counter()
     cases = drawn_cases(asked.inputs, asked.seed, asked.deep)
+    cases += cases_of_unequal_claims(asked.claims, asked.seed)
     cases = [case for case in cases if asked.only in case.subject.name]
     parts = [cases[k :: asked.workers] for k in range(asked.workers)]
     total = Count()

@@ -15,9 +15,11 @@ import cv2
 import numpy as np
 import yaml
 from command_outcomes import run
+from model_formats import write_format
 from scipy.spatial.transform import Rotation
 from simulated import simulated as before_cameras
 
+from legcal.machine.loader import load_mechanism
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
@@ -258,6 +260,15 @@ def _planar_mjcf() -> str:
     )
 
 
+def _written(style: str) -> Callable[[Path], None]:
+    """Write the shipped hexapod in the format of another program."""
+
+    def write(folder: Path) -> None:
+        write_format(load_mechanism("hexapod"), style, folder)
+
+    return write
+
+
 MAKERS: dict[str, Callable[[Path], None]] = {
     "plain": _plain,
     "model": _model,
@@ -267,4 +278,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "tool-poses": _tool_poses,
     "result": _result,
     "formats": _formats,
+    **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "constraint", "gepetto")},
 }

@@ -13,18 +13,23 @@ import re
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import yaml
 from command_outcomes import run, words_of
-from made_inputs import JOINTS, copy_of
+from dataset_folder import SERVOS, dataset_of_readings
+from machines import TRIPOD
+from made_inputs import JOINTS, ROOT, copy_of
+from outside_machines import OUTSIDE, serial_arm
 
 Edit = Callable[[Path], None]
 GONE = object()  # of a key: take it out
+CORNER_COLUMNS = "view,image,corner,u,v,sigma,verdict,reason,source"
 
 
 @dataclass(frozen=True)
@@ -478,6 +483,7 @@ def _datasets() -> Iterable[Refusal]:
         ("few", {**chess, "squares_x": 3}, ("3 x 6", "4")),
         ("fraction", {**chess, "squares_x": 9.5}, ("board.squares_x",)),
         ("negative", {**chess, "squares_x": -1}, ("board.squares_x", "-1")),
+        ("true", {**chess, "squares_x": True}, ("board.squares_x",)),
         ("key", {**chess, "columns": 9}, ("board.columns",)),
         ("pose", {**chess, "T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
         ("marker", {**char, "marker": 0.05}, ("0.05 m", "0.04 m")),
@@ -495,6 +501,45 @@ def _datasets() -> Iterable[Refusal]:
         yield from _spoiled(
             "board", "calibrate {in} -o {out}", "plain", [(name, entry(board=board), named)]
         )
+
+
+def _in_hand() -> Iterable[Refusal]:
+    """Views of a camera in the hand that no board places."""
+    board = {
+        "kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,
+        "dictionary": "DICT_4X4_50",
+    }  # fmt: skip
+
+    def entry(**values: Any) -> Edit:
+        return keyed("dataset.yaml", **values)
+
+    def corners(*places: tuple[str, int]) -> Edit:
+        lines = [
+            f"{place},{k},{5 + k},6,0.1,used,,detected\n" for place, n in places for k in range(n)
+        ]
+        return text("corners.csv", f"{CORNER_COLUMNS}\n{''.join(lines)}")
+
+    held = entry(board=board, views__c1__hand_held=True, views__c1__T_base_camera=GONE)
+    first, second = "c1-1,images/c1_1.png", "c1-2,images/c1_2.png"
+    rows: Rows = [
+        ("pose", entry(board=board, views__c1__hand_held=True),
+         ("views.c1.T_base_camera", "one pose")),
+        ("name", (held, entry(**{"views__c1-2": {"camera": "camera_info.yaml"}}),
+                  cell("measurements.csv", 3, view="c1-2")), ("views.c1-2", "hand-held")),
+        ("3-corners", (held, corners((first, 6), ("c2,images/c2_1.png", 6), (second, 3))),
+         ("row 2", "found 3 corners")),
+        ("0-corners", (held, corners((first, 6), ("c2,images/c2_1.png", 6))),
+         ("row 2", "found no corners")),
+        ("no-image", (held, cell("measurements.csv", 2, image="")),
+         ("row 2, column image", "neither an image")),
+        ("corners-alone", corners(("c1,images/c1_1.png", 6)), ("corners.csv", "no board")),
+        ("no-legs", entry(views__c1__legs=[], views__c2__legs=[]),
+         ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
+        ("number", entry(board=board, views__c1__hand_held=3),
+         ("views.c1.hand_held", "found 3", "true or false")),
+        ("word", (held, entry(board="charuco")), ("dataset.yaml", "board", "'charuco'", "mapping")),
+    ]  # fmt: skip
+    yield from _spoiled("in-hand", "calibrate {in} -o {out}", "plain", rows)
 
 
 def _measurements() -> Iterable[Refusal]:
@@ -621,10 +666,63 @@ def _cameras() -> Iterable[Refusal]:
         ("broken", text(file, "a: [1, 2"), ("line 1",)),
         ("repeated", text(file, "a: 1\nb: 2\na: 3"), ("line 3", "'a'")),
         ("python", text(file, "a: !!python/object/apply:os.system [ls]"), (file,)),
+        ("infinite", matrix((0, float("inf"))), ("camera_matrix", "inf")),
+        ("centre-negative", matrix((2, -1.0)), ("cx = -1", "64 x 48")),
+        ("kalibr-none", kalibr(distortion_model="none", distortion_coeffs=[0.1, 0.0, 0.0, 0.0]),
+         ("4", "0 for none")),
+        ("kalibr-centre", kalibr(intrinsics=[80.0, 80.0, 200.0, 23.5]), ("cx = 200", "64 x 48")),
+        ("kalibr-two", (kalibr(), _two_cameras), ("2 cameras", "cam0, cam1")),
+        ("storage-xml", text(file, "<?xml version='1.0'?><opencv_storage><a>"), ("OpenCV",)),
+        ("storage-no-matrix", text(file, "%YAML:1.0\n---\nimage_width: 5\n"), ("camera_matrix",)),
+        ("storage-bytes", text(file, b"%YAML:1.0\n# \xff"), ("UTF-8",)),
         ("storage", text(file, "%YAML:1.0\n---\nimage_width: [[["), ("OpenCV",)),
         ("bytes", text(file, b"a: \xff\xfe\xfd"), ("UTF-8",)),
     ]  # fmt: skip
     yield from _spoiled("lens", "calibrate {in} -o {out}", "plain", rows)
+
+
+def _units() -> Iterable[Refusal]:
+    """Readings of servos in a unit that is not the stated one."""
+    angles = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
+    both_ways = np.concatenate([angles, -angles])
+    pulses, late = (1500.0 + 11.1 * np.degrees(x) for x in (angles, angles + 0.4))
+    sigma = {"encoder_sigma": dict.fromkeys(SERVOS, 1e-4)}
+    degrees = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
+    servo = {"unit": "us", "centre_us": 1500, "us_per_deg": 11.1}
+    in_us = {"readings": dict.fromkeys(SERVOS, servo)}
+    rows: list[tuple[str, np.ndarray, dict[str, Any], tuple[str, ...]]] = [
+        ("degrees", np.degrees(angles), sigma, ("look like degrees", "pi/180", "readings: deg")),
+        ("radians", both_ways, degrees,
+         ("% of the travel in deg", "in rad", "write readings: rad")),
+        ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),
+        ("pulses-as-deg", pulses, degrees, ("look like pulses", "centre_us: 1500")),
+        ("no-pulses", angles, in_us, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
+        ("deg-as-us", np.degrees(angles), in_us, ("look like degrees: write readings: deg",)),
+        ("out-of-travel", late, in_us, ("us in row",)),
+        ("no-centre", pulses, sigma | {"readings": "us"},
+         ("readings.servo1", "neither centre nor us")),
+        ("mm", angles, sigma | {"readings": "mm"}, ("found mm and no motor that slides",)),
+        ("motor", angles, sigma | {"readings": {"servo9": "deg"}},
+         ("readings.servo9", "servo1, servo2")),
+        ("mm-of-one", angles, sigma | {"readings": {"servo1": "mm"}},
+         ("readings.servo1", "which turns")),
+        ("unknown", angles, sigma | {"readings": "turns"}, ("readings", "'turns'")),
+        ("no-sigma", angles, {"readings": "rad"},
+         ("encoder_sigma is incomplete", "servo1, servo2")),
+        ("large-sigma", angles, {"encoder_sigma": dict.fromkeys(SERVOS, 0.5)},
+         ("28.6 deg", "0.5deg")),
+        ("sigma-unit", angles, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
+        ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
+    ]  # fmt: skip
+    for name, readings, entry, named in rows:
+        edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
+        yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
+
+
+def _two_cameras(folder: Path) -> None:
+    path = folder / "camera_info.yaml"
+    text = path.read_text()
+    path.write_text(text + text.replace("cam0", "cam1"))
 
 
 def _tables() -> Iterable[Refusal]:
@@ -646,6 +744,20 @@ def _tables() -> Iterable[Refusal]:
         ("point", cell(o, 1, u0="5", u1="5", v0="7", v1="7"), ("u0", "v1")),
         ("negative", cell(o, 1, s00="-1"), ("columns s00, s01, s11",)),
         ("indefinite", cell(o, 1, s00="1", s01="2", s11="1"), ("(1, 2, 1)",)),
+        (
+            "large",
+            cell(o, 1, s00="1", s01="0", s11="18446744073709551616"),
+            ("columns s00, s01, s11", "4.29e+09 px", "1e-05 to 100 px"),
+        ),
+        (
+            "small",
+            cell(o, 1, s00="1e-20", s01="0", s11="1"),
+            ("columns s00, s01, s11", "1e-10 and 1 px", "1e-05 to 100 px"),
+        ),
+        ("residual", cell(o, 1, residual="-1"), ("column residual", "'-1'")),
+        ("contrast", cell(o, 1, contrast="inf"), ("column contrast", "'inf'")),
+        ("by-gamma", cell(o, 1, by_gamma="nan"), ("column by_gamma", "'nan'")),
+        ("rejected", cell(o, 1, verdict="rejected", a="left"), ("column a", "'left'")),
         ("far", cell(o, 1, u0="-400", v0="-300"), ("px", "(a, b, c)")),
         ("twice", doubled(o), ("row 1",)),
         ("one-gamma", cell(o, 2, gamma="2.2"), ("row 2", "gamma", "by_gamma")),
@@ -674,6 +786,10 @@ def _tables() -> Iterable[Refusal]:
         ("degrees", cell(a, 5, theta="-12"), ("-12", "3.1416", "rad")),
         ("tilt", cell(a, 5, psi="1.7"), ("1.7", "1.5708", "rad")),
         ("far", cell(a, 5, x="1e9"), ("column x", "1e9", "1000 m")),
+        ("farther", cell(a, 5, z="-1e300"), ("column z", "-1000 to 1000 m")),
+        ("level", cell(a, 5, psi="1.5707963"), ("columns psi, theta", "(x, 0, z)")),
+        ("endless", cell(a, 5, theta="-inf"), ("column theta", "'-inf'")),
+        ("sigma-rad", cell(a, 5, sigma_theta="3"), ("column sigma_theta", "1e-09 to 1 rad")),
         ("sigma-0", cell(a, 5, sigma_psi="0"), ("sigma_psi", "0")),
         ("sigma-negative", cell(a, 5, sigma_x="-1e-3"), ("sigma_x", "-1e-3", "1e-09")),
         ("sigma-large", cell(a, 5, sigma_z="50"), ("sigma_z", "1", "m")),
@@ -699,7 +815,7 @@ def _tables() -> Iterable[Refusal]:
     yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
 
     c = "corners.csv"
-    line = "view,image,corner,u,v,sigma,verdict,reason,source\n"
+    line = f"{CORNER_COLUMNS}\n"
     good = "c1,images/c1_1.png,0,5.0,5.0,0.1,used,,detected\n"
     board = keyed("dataset.yaml", board={
         "kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03,
@@ -716,6 +832,8 @@ def _tables() -> Iterable[Refusal]:
         ("short", "c1,images/c1_2.png,3,1,2,0.1,used", ("7", "9")),
         ("view", "c8,images/c1_2.png,3,1,2,0.1,used,,detected", ("view", "'c8'")),
         ("twice", good.strip(), ("row 2", "row 1")),
+        ("image", "c2,images/c1_2.png,3,1,2,0.1,used,,detected", ("column image", "c1_2.png")),
+        ("nan", "c1,images/c1_2.png,3,1,nan,0.1,used,,detected", ("column v", "'nan'")),
     ]
     for name, row, said in corners:
         edits = (board, text(c, f"{line}{good}{row}\n"))
@@ -785,6 +903,15 @@ def _overrides() -> Iterable[Refusal]:
 def _models() -> Iterable[Refusal]:
     y, u = "models/hexapod.yaml", "urdf/hexapod.urdf"
     limit = '<limit lower="-0.004" upper="0.144" effort="1000" velocity="1"/>'
+    end, free = "</robot>", 'name="platform_free" type="floating">'
+    seat = '<parent link="base"/><child link="leg1_seat"/>'
+    b2_at = '<child link="leg3_b2_link"/><origin xyz="0.0 0.0 0.0"'
+    b2 = b2_at + ' rpy="0.0 0.0 0.0"/><axis xyz="{}"/>'
+    cycle = (
+        '<robot name="r"><link name="base"/><link name="a"/><link name="b"/>'
+        '<joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>'
+        '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+    )
     rows: Rows = [
         ("frame", swap(y, "- - leg1_end", "- - leg1_ned"), ("closed_loop.0.0", "'leg1_end'")),
         ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
@@ -819,7 +946,7 @@ def _models() -> Iterable[Refusal]:
         ("list", text(y, "- 1\n"), (y,)),
         ("broken", text(y, "a: [1\n"), (y,)),
         ("nothing", text(y, ""), (y,)),
-        ("python", swap(y, "type:", "x: !!python/object/apply:os.system [ls]\ntype:"),
+        ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
         ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
         ("xyz-nan", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 nan 0.0"'), ("line", "nan")),
@@ -849,13 +976,96 @@ def _models() -> Iterable[Refusal]:
         ("no-robot", text(u, "<a/>"), (u,)),
         ("no-name", swap(u, ' name="hexapod"', ""), ("<robot>",)),
         ("moved-axis", swap(u, 'xyz="0.0 0.0 0.345"', 'xyz="0.0 0.002 0.345"'), ("leg1", "2 mm")),
+        ("frame-legs-four", swap(y, "  - leg1\n", "  - leg1\n  - leg2\n"),
+         ("legcal.base_frame",)),
+        ("version-true", swap(y, "version: 1", "version: true"),
+         ("legcal.version", "true", "needed 1")),
+        ("no-version", swap(y, "  version: 1\n", ""), ("legcal.version",)),
+        ("key-twice", swap(y, "joint_name: []", "name_mot: []"), ("name_mot",)),
+        ("no-leg-name", swap(y, "    leg6: leg6_prismatic\n", ""),
+         ("no name", "'leg6_prismatic'")),
+        ("named-twice", swap(y, "leg2: leg2_prismatic", "leg2: leg1_b1"),
+         ("already named 'leg1'",)),
+        ("named-off-legs", swap(y, "leg2: leg2_prismatic", "leg2: platform_free"),
+         ("on no leg between base and platform",)),
+        ("no-free-joint", swap(y, "  platform_joint: platform_free\n", ""),
+         ("floating joint 'platform_free'",)),
+        ("open-leg", swap(y, "- - leg6_end\n  - leg6_seat\ntype:\n- 3d\n", "type:\n"),
+         ("on no chain from base to platform",)),
+        ("home-1e308", swap(y, "- 0.38274", "- 1.0e+308"), ("needed a number less than",)),
+        *((f"leg-named-{k}", swap(y, "leg2: leg2", f'"{name}": leg2'),
+           ("legs", "the first a letter or digit", "rename it"))
+          for k, name in enumerate(("leg1,", "../xleg1", "a" * 101, "-leg"))),
+        ("xyz-overflow", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 1e999 0.0"'),
+         ("line", "3 finite numbers")),
+        ("upper-nan", swap(u, 'upper="0.144"', 'upper="NaN"'), ("line", 'upper="NaN"')),
+        ("no-travel", swap(u, 'upper="0.144"', 'upper="-0.004"'),
+         ("line", "'leg1_prismatic'", "-0.004")),
+        ("long-travel", swap(u, 'upper="0.144"', 'upper="144"'), ("travel", "'leg1'", "144 m")),
+        ("no-lower", swap(u, 'lower="-0.004" ', ""), ("line", "lacks lower")),
+        ("axis-nan", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0.0 nan 1.0"'),
+         ("line", "'leg1_prismatic'")),
+        ("radius-huge", swap(u, 'radius="0.01"', 'radius="1e11"'),
+         ("<visual> cylinder", "1e+14 mm", "0.0002 to 0.5")),
+        ("radius-thick", swap(u, 'radius="0.01"', 'radius="0.25"'),
+         ("<visual> cylinder", "250 mm", "along leg")),
+        ("two-parents", swap(u, limit, f'{limit}<parent link="base"/>'),
+         ("line", "more than one <parent>")),
+        ("no-child", swap(u, '<child link="leg1_tube"/>', ""), ("line", "no <child link=...>")),
+        ("link-without-name", swap(u, '<link name="leg1_seat"/>', "<link/>"), ("line", "no name")),
+        ("loop-joint", swap(u, end, f'<loop_joint name="l" type="fixed"><link1 link="base"/>'
+         f"</loop_joint>{end}"), ("line", "<loop_joint>")),
+        ("constraint", swap(u, end, f'<constraint name="l"/>{end}'), ("line", "<constraint>")),
+        ("lost-entity", swap(u, '<link name="base"/>', '<link name="base">&lost;</link>'),
+         ("could not be read",)),
+        ("said-utf-16", swap(u, 'encoding="utf-8"', 'encoding="utf-16"'), ("could not be read",)),
+        ("apart", swap(u, b2_at, b2_at.replace('0.0"', '0.002"')), ("leg3_b1", "leg3_b2", "2 mm")),
+        ("not-square", swap(u, b2.format("0.0 1.0 0.0"), b2.format("0.1 1.0 0.0")),
+         ("leg3_b1", "leg3_b2", "from perpendicular")),
+        ("parallel", swap(u, b2.format("0.0 1.0 0.0"),
+                          b2.format("1.0 0.0 0.0").replace("0.0 0.0 0.0", "0.0 0.002 0.0", 1)),
+         ("leg3_b1", "leg3_b2", "parallel")),
+        ("branches", swap(u, seat, seat.replace("base", "leg2_tube")),
+         ("another leg or branches",)),
+        ("planar-free", swap(u, free, free.replace("floating", "planar")),
+         ("platform_free", "axis (1, 0, 0)")),
+        ("planar-free-z", swap(u, free, free.replace("floating", "planar") + '<axis xyz="0 0 1"/>'),
+         ("platform_free", "a planar joint, needed a floating one")),
+        ("fixed-platform",
+         (swap(u, 'type="floating"', 'type="fixed"'),
+          swap(y, "  platform_joint: platform_free\n", "")), ("fixed to the base",)),
+        ("both-files",
+         (swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 nan 0.0"'),
+          swap(u, 'type="floating"', 'type="ball"')), (", line 35: joint 'platform_free'",)),
+        ("yaml-twice", (swap(y, "0.38274", ".nan"), swap(y, "version: 1", "version: 3")),
+         ("legcal.home", "legcal.version")),
+        *((f"doctype-{name}-{k}",
+           (swap(u, '<link name="base"/>', link),
+            swap(u, "<robot", f"<!DOCTYPE robot {kind}><robot")), (u,))
+          for name, kind in (("system", 'SYSTEM "http://localhost:9/robot.dtd"'),
+                             ("file", '[<!ENTITY a SYSTEM "file:///etc/hostname">]'),
+                             ("many", '[<!ENTITY a "1"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]'))
+          for k, link in enumerate(('<link name="base"/>', '<link name="base">&a;</link>'))),
+        ("cycle", text(u, cycle), ("in a cycle",)),
+        ("xacro", text(u, '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro">'
+                          "<xacro:include/></robot>"), ("xacro",)),
+        ("urdf-empty", text(u, ""), ("could not be read",)),
+        ("urdf-text", text(u, "not xml"), ("could not be read",)),
+        ("utf-16", _in_utf_16, ("UTF-8",)),
     ]  # fmt: skip
-    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", rows)
+    placed = [(name, edits, ("{in}", *named)) for name, edits, named in rows]
+    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", placed)
     yield Refusal("model-urdf-alone", "inspect {in}/arm.urdf", ("arm.urdf",), "model",
                   (_alone,))  # fmt: skip
     yield Refusal("model-table", "inspect {in}/3-rps.yaml", ("3-rps.yaml", "legcal new"), "tables")
-    yield Refusal("model-csv", "inspect {in}/tripod.csv", ("tripod.csv", "legcal new"), "tables")
-    yield Refusal("model-dataset", "inspect {in}", ("dataset", "legcal calibrate"), "plain")
+    yield Refusal(
+        "model-csv", "inspect {in}/tripod.csv", ("tripod.csv", "legcal new", "-o DIR"), "tables"
+    )
+    yield Refusal(
+        "model-dataset", "inspect {in}", ("dataset", "legcal calibrate {in} -o OUT"), "plain"
+    )
+    yield Refusal("model-dataset-file", "inspect {in}/dataset.yaml",
+                  ("a dataset", "legcal identify {in},"), "plain")  # fmt: skip
     yield Refusal(
         "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
     )
@@ -866,6 +1076,164 @@ def _models() -> Iterable[Refusal]:
     }.items():  # fmt: skip
         edits = (text("machine.xml", content),)
         yield Refusal(f"mjcf-{name}", "inspect {in}/machine.xml", ("machine.xml",), "", edits)
+
+
+def _outside() -> Iterable[Refusal]:
+    """Machines that the method does not cover."""
+    for name, (write, named) in OUTSIDE.items():
+        edits = (cast(Edit, write),)
+        yield Refusal(f"outside-{name}", "inspect {in}/machine.yaml", ("{in}", *named), "", edits)
+    yield Refusal(
+        "outside-serial", "inspect {in}/machine.urdf",
+        ("not a parallel mechanism: found a URDF",), "", (cast(Edit, serial_arm),),
+    )  # fmt: skip
+
+
+def _formats() -> Iterable[Refusal]:
+    """What another format cannot mean."""
+    connect = '<connect body1="leg1_end" body2="leg1_seat" anchor="0 0 0"/>'
+    joint = '<freejoint name="platform_free"/>'
+    slide = '<joint name="leg1_prismatic" type="slide"'
+    motor, world = '<position joint="leg1_prismatic"/>', "<worldbody>"
+    body_2, size = '<body name="leg2_end"', 'type="capsule" size="0.01"'
+
+    def tied(old: str, new: str) -> tuple[str, str]:
+        return connect, connect.replace(old, new)
+
+    def added(text: str) -> tuple[str, str]:
+        return world, f"{world}{text}"
+
+    mjcf: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
+        ("include", added('<include file="x.xml"/>'), ("include could not be used",)),
+        ("composite", added('<body><composite type="cable"/></body>'), ("composite could not",)),
+        ("replicate", added('<replicate count="2"/>'), ("replicate could not be used",)),
+        ("body1", tied("1_end", "1_en"), ("'leg1_en' as body1", "mean 'leg1_end'?")),
+        ("no-body1", tied('body1="leg1_end"', ""), ("no body1",)),
+        ("no-anchor", tied('anchor="0 0 0"', ""), ("no anchor",)),
+        ("anchor", tied("0 0 0", "0 0"), ("anchor='0 0'", "3 finite numbers")),
+        ("anchor-nan", tied("0 0 0", "0 nan 0"), ("anchor='0 nan 0'",)),
+        ("itself", tied("seat", "end"), ("to itself",)),
+        ("sites", (connect, '<connect site1="a" site2="b"/>'), ("the site 'a' as site1",)),
+        ("coupled", (connect, connect + '<joint joint1="leg1_prismatic" joint2="leg2_prismatic"/>'),
+         ("couples <joint> coordinates",)),
+        ("constraint", (connect, connect + '<conect body1="leg1_end"/>'), ("no constraint",)),
+        ("element", added('<bdy name="x"/>'), ("no element of a body",)),
+        ("geom", added('<geom type="cilinder"/>'), ("'cilinder'",)),
+        ("motor", (motor, motor + "<motor/>"), ("names no joint",)),
+        ("motor-joint", (motor, '<position joint="leg1"/>'), ("'leg1'", "not in the file")),
+        ("motor-tendon", (motor, '<motor tendon="t"/>'), ("tendon",)),
+        ("motor-free", (motor, '<motor joint="platform_free"/>'), ("free joint 'platform_free'",)),
+        ("joint", (slide, slide.replace("slide", "screw")), ("'screw'", "needed free")),
+        ("joint-twice", (slide, slide.replace("leg1", "leg2")), ("which another joint has",)),
+        ("axis", (slide + ' axis="0.0 0.0 1.0"', slide + ' axis="0 0 0"'), ("zero axis",)),
+        ("body-twice", (body_2, body_2.replace("2", "1")), ("which another body has",)),
+        ("two-turns", (body_2, body_2 + ' euler="0 0 1"'), ("one orientation",)),
+        ("quat", ('quat="1.0 0.0 0.0 0.0"', 'quat="0 0 0 0"'), ("no orientation",)),
+        ("pos", ('pos="0.0 0.0 0.0"', 'pos="1e400 0 0"'), ("pos='1e400 0 0'", "3 finite numbers")),
+        ("range", ('range="-0.004 0.144"', 'range="1 -1"'),
+         (", line 9: joint 'leg1_prismatic'", "1 to -1")),
+        ("grad", (world, f'<compiler angle="grad"/>{world}'), ("angle='grad'", "degree")),
+        ("global", (world, f'<compiler coordinate="global"/>{world}'), ("coordinate='global'",)),
+        ("eulerseq", (world, f'<compiler eulerseq="xyw"/>{world}'), ("eulerseq='xyw'",)),
+        ("class", added('<body childclass="no"/>'), ("default class 'no'",)),
+        ("no-class", (world, f"<default><default/></default>{world}"),
+         ("default class without a",)),
+        ("two-joints", (joint, joint + '<joint name="x"/>'), ("a body that has other joints",)),
+        ("size", (size, size.replace("0.01", "0")), ("without a radius",)),
+        ("two-roots", ("</mujoco>", "</mujoco><mujoco/>"), ("well-formed XML",)),
+        ("comment", ("<mujoco", "<sdf/><!--"), ("well-formed XML",)),
+        ("bodies-6000", ("</worldbody>", "<body/>" * 6000 + "</worldbody>"), ("at most 5000",)),
+        ("outside", tied("leg1_seat", "leg2_tube"),
+         ("check <equality>", "root of the tree is the base")),
+        ("elbow", ("</worldbody>", '<body name="arm"><joint name="elbow"/></body></worldbody>'),
+         ("joints of something else", "'elbow'")),
+    ]  # fmt: skip
+    yield from _of_file("mjcf", "machine.xml", "mjcf bodies", mjcf)
+    rest: Rows = [
+        ("all-at-once",
+         (swap("machine.xml", motor, '<position joint="leg1"/>'),
+          swap("machine.xml", connect, '<connect body1="x" body2="y" anchor="0 0 0"/>')),
+         ("'leg1'", "'x'", "'y'")),
+        ("no-equality", _without_equality, ("without <connect> or <weld>",)),
+        ("inactive", swap("machine.xml", "<connect ", '<connect active="false" ', -1),
+         ("without <connect> or <weld>",)),
+        ("two-mechanisms", _second_mechanism,
+         ("found 2 mechanisms, which have no moving body in common",)),
+    ]  # fmt: skip
+    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf bodies", rest)
+    link1 = '<link1 link="leg1_tube"'
+    loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
+        ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
+        ("no-type", ('type="spherical"', ""), ("line", "the type ''")),
+        ("twice", ('name="loop1"', 'name="loop0"'), ("line", "a name that another one has")),
+        ("link", (link1, link1.replace("tube", "tub")), ("line", "mean 'leg1_tube'")),
+        ("base", (link1, link1.replace("leg1_tube", "base")), ("line", "joins the link 'base' to")),
+        ("one-link", (link1, link1.replace("link1", "link9")), ("line", "names 1 links")),
+        ("xyz", (link1[1:] + ' xyz="0.0 0.0 0.0"', link1[1:] + ' xyz="0 0"'),
+         ("line", "xyz='0 0'")),
+        ("motor", ('<joint name="leg1_prismatic"/>', '<joint name="leg"/>'),
+         ("line", "is a motor of no")),
+    ]  # fmt: skip
+    yield from _of_file("loops", "machine.urdf", "loop_joint", loops)
+    beside = text("machine.yaml", (ROOT / "models/hexapod.yaml").read_text().replace(
+        "../urdf/hexapod.urdf", "machine.urdf"
+    ))  # fmt: skip
+    yield Refusal(
+        "loops-and-yaml", "inspect {in}/machine.urdf",
+        ("which is not read beside a mechanism YAML",), "loop_joint", (beside,),
+    )  # fmt: skip
+    spherical = 'type="spherical"'
+    constraints: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
+        ("universal", (spherical, 'type="universal"'), ("line", "two axes")),
+        ("planar", (spherical, 'type="planar"'), ("line", "'planar'", "needed one of")),
+        ("one-link", ('<child link="base"/>', ""), ("line", "names 1 links, needed two")),
+        ("axis", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 0"/>'), ("line", "zero axis")),
+        ("frame", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 1" frame="parent"/>'),
+         ("line", "frame 'parent' alone")),
+    ]  # fmt: skip
+    yield from _of_file("constraints", "machine.urdf", "constraint", constraints)
+    gepetto: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
+        ("axes", ("joint_type:\n- UJOINT_XY", "joint_type:\n- UJOINT_XX"),
+         ("'UJOINT_XX'", "SPHERICAL")),
+        ("type", ("joint_type:\n- UJOINT_XY", "joint_type:\n- BALL"), ("'BALL'", "SPHERICAL")),
+        ("joint", ("joint_name:\n- leg1_b1", "joint_name:\n- leg1_b"), ("mean 'leg1_b1'",)),
+        ("twice", ("joint_name:\n- leg1_b1", "joint_name:\n- leg2_b1"), ("'leg2_b1' twice",)),
+        ("motor", ("name_mot:\n- leg1_prismatic", "name_mot:\n- leg1_b1"),
+         ("stands for UJOINT_XY",)),
+        ("closure", ("type:\n- 3D", "type:\n- 4D"), ("'4d'", "'3d'")),
+        ("outside", ("- leg1_seat\n", "- leg2_tube\n"), ("add a block legcal with",)),
+    ]  # fmt: skip
+    yield from _of_file("gepetto", "machine/robot.yaml", "gepetto", gepetto)
+
+
+def _of_file(
+    group: str, file: str, given: str, rows: Iterable[tuple[str, tuple[str, str], tuple[str, ...]]]
+) -> Iterable[Refusal]:
+    """Put something in the place of a text of a file, which is read and must be named."""
+    spoiled = [(name, swap(file, *change), ("{in}", *named)) for name, change, named in rows]
+    yield from _spoiled(group, f"inspect {{in}}/{file}", given, spoiled)
+
+
+def _in_utf_16(folder: Path) -> None:
+    path = folder / "urdf/hexapod.urdf"
+    path.write_bytes(path.read_text().replace("utf-8", "utf-16").encode("utf-16"))
+
+
+def _without_equality(folder: Path) -> None:
+    path = folder / "machine.xml"
+    text = path.read_text()
+    path.write_text(text[: text.index("<equality>")] + "</mujoco>")
+
+
+def _second_mechanism(folder: Path) -> None:
+    path = folder / "machine.xml"
+    text = path.read_text()
+    second = text.replace('="leg', '="second_leg').replace('"platform', '"second_platform')
+    second = second.replace('"base"', '"second_base"')
+    body = second[second.index("<body") : second.index("</worldbody>")]
+    tail = second[second.index("<equality>") : second.index("</mujoco>")]
+    text = text.replace("</worldbody>", f"{body}</worldbody>")
+    path.write_text(text.replace("</mujoco>", f"{tail}</mujoco>"))
 
 
 def _new() -> Iterable[Refusal]:
@@ -926,6 +1294,11 @@ def _new() -> Iterable[Refusal]:
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
+        ("no-type", f"{head}\n{row}\n,1,2,3,4\n", "--unit mm", ("types.1",)),
+        ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
+        ("nan", f"{head}\nRPS,nan,2,3,4\n{row}\n", "--unit mm", ("line 2", "base_x", "'nan'")),
+        ("tabs", "type\tbase_x\nRPS\t1,5\n", "--unit mm", ("'base_y'",)),
+        ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
         ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
         (
             "semicolons",
@@ -939,12 +1312,134 @@ def _new() -> Iterable[Refusal]:
             f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
             (text("m.csv", content),),
         )  # fmt: skip
+    families: list[tuple[str, str, tuple[str, ...]]] = [
+        ("6-sps", "6-SPS", ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
+        ("3-upu", "3-UPU", ("--family 3-UPU", "hexapod or delta", "--template")),
+        ("nan", "hexapod --platform-radius nan", ("--platform-radius nan", "positive")),
+        ("arm-length", "hexapod --arm-length 20", ("--arm-length", "--base-radius")),
+        ("rss", "hexapod --type RSS", ("--type RSS", "with a slider")),
+        ("upx", "hexapod --type UPX", ("--type UPX", "with a slider")),
+        ("min-length", "hexapod --min-length 600", ("--family hexapod", "min_length 600")),
+        ("name", "hexapod --name ../up", ("'../up'",)),
+        ("rods", "delta --rod-length 100", ("rods of 100 mm", "--rod-length")),
+        ("height", "delta --height 374", ("--height 374", "negative")),
+        ("thick", "delta --leg-radius 40", ("60 mm apart", "80 mm thick", "--leg-radius")),
+        ("delta-type", "delta --type UPS", ("--type", "--arm-length")),
+    ]
+    for name, words, named in families:
+        command = f"new --family {words} --unit mm -o {{out}}"
+        yield Refusal(f"family-{name}", command, named)
+    for name, words, named in (
+        ("unit", "--unit inch", ("'inch'", "mm or m")),
+        ("no-unit", "--rod-length 400", ("--rod-length", "--unit mm")),
+    ):
+        yield Refusal(f"family-{name}", f"new --family delta {words} -o {{out}}", named)
     for name, words, named in (
         ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
         ("missing", "{in}/none.yaml", ("none.yaml",)),
         ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
     ):
         yield Refusal(f"new-{name}", f"new {words} -o {{out}}", named, "tables")
+
+
+def _described() -> Iterable[Refusal]:
+    """Tables of machines that cannot be."""
+    command = "new {in}/table.yaml -o {out}"
+    sps: dict[str, Any] = {"type": "SPS"}
+    rod: dict[str, Any] = {"type": None, "types": ["SPU", "SPU", "SS"]}
+    planar: dict[str, Any] = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
+    turned = {"xyz": [0, 0, 0], "rpy_deg": [0, 10, 0]}
+    pairs: dict[str, Any] = {
+        "base_joints": [[300, 0, 0], [300, 0, 0], [0, 300, 0]],
+        "platform_joints": [[180, 0, 0], [180, 0, 0], [0, 180, 0]],
+    }
+    changes: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+        ("no-version", {"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
+        ("version-key", {"legcal_table": None, "version": 1},
+         ("version: 1", "write 'legcal_table: 1'")),
+        ("version-true", {"legcal_table": True}, ("legcal_table", "true", "needed 1")),
+        ("type-number", {"type": 3}, ("type", "found 3", "6-UPS")),
+        ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
+        ("long-name", {"name": "x" * 101}, ("name", "at most 100")),
+        ("types-numbers", {"types": [3, 4, 5], "type": None}, ("types.0",)),
+        ("types-one", {"type": None, "types": ["RPS", "S", "RPS"]}, ("types.1", "'S'")),
+        ("one-leg", {"base_joints": [[1, 2, 3]]}, ("found 1 leg", "2 to 32")),
+        ("four-coordinates", {"base_joints": [[1, 2, 3, 4]] * 3},
+         ("base_joints", "row 1", "three")),
+        ("joints-number", {"base_joints": 7}, ("base_joints", "found 7", "row 1")),
+        ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]}, ("base_frame", "twice")),
+        ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
+        ("leg-name", {"legs": ["a", "b b", "c"]}, ("legs.1", "'b b'")),
+        ("travel-number", {"travel": 150}, ("travel", "found 150")),
+        ("travel-two", {"travel": [[0, 1], [0, 1]]}, ("travel", "2", "3")),
+        ("no-xyz", {"home": {"rpy_deg": [0, 0, 0]}}, ("home.xyz",)),
+        ("norm-0", {"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 0]}},
+         ("quaternion", "norm 0")),
+        ("fixed-axis", {"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
+        ("two-points", pairs, ("'leg1' and 'leg2'", "same two points")),
+        ("rod-length", rod | {"lengths": [None, 455, 455]}, ("lengths", "'leg2'")),
+        ("rod-offset", rod | {"offsets": [380, 380, 380]}, ("offsets", "'leg3'")),
+        ("rod-apart", rod | {"lengths": [None, None, 600]}, ("'leg3'", "456.", "600 mm")),
+        # what does not fit together, once the machine is put together
+        ("length-negative", {"offsets": -380}, ("length of -0.38 m", "offset")),
+        ("radius-large", {"radius": {"rod": 1e4}}, ("radius of 1e+04 mm",)),
+        ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "middle")),
+        ("open-at-home", sps | {"offsets": 100}, ("'leg1'", "close at home", "100 to 250 mm")),
+        ("passive-metres", sps | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None},
+         ("base joints",)),
+        ("one-line", sps | {"base_joints": [[300, 0, 0], [0, 0, 0], [-300, 0, 0]]}, ("one line",)),
+        ("length-0", sps | {"home": {"xyz": [120, 0, 0], "rpy_deg": [0, 0, 0]}},
+         ("'leg1'", "length of 0 m")),
+        ("axis-along", {"type": "UPS", "base_axes": [[-120, 0, 440], None, None]},
+         ("'leg1'", "along the leg")),
+        ("plane-turned", planar, ("'leg1'", "instead of 90 deg")),
+        ("plane-home", planar | {"home": turned, "offsets": 50}, ("home",)),
+    ]  # fmt: skip
+    for name, changed, named in changes:
+        edits = (text("table.yaml", yaml.safe_dump(_without_none(TRIPOD | changed))),)
+        yield Refusal(f"tripod-{name}", command, ("{in}/table.yaml", *named), "", edits)
+    arms: dict[str, Any] = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
+    below = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
+
+    def arm1(**changes: Any) -> dict[str, Any]:
+        motors = arms["actuators"]
+        return {"actuators": motors | {"arm1": _without_none(motors["arm1"] | changes)}}
+
+    of_motors: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+        ("no-axis", arm1(axis=None), ("actuators.arm1", "found point", "direction of a carriage")),
+        ("travel-of-carriage", arm1(travel_deg=None, travel=[0, 1]),
+         ("actuators.arm1", "found travel", "travel_deg")),
+        ("travel-reversed", arm1(travel_deg=[70, -30]), ("arm1", "lower reading first")),
+        ("arm-radius-0", arm1(arm_radius=0), ("actuators.arm1", "arm_radius", "0")),
+        ("radius-of-carriage",
+         arm1(axis=None, point=None, travel_deg=None, direction=[1, 0, 0], travel=[0, 1],
+              arm_radius=8),
+         ("actuators.arm1", "arm_radius of a carriage")),
+        ("axis-0", arm1(axis=[0, 0, 0]), ("arm1", "direction of three numbers")),
+        ("slides", {"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
+        ("no-motor-type", {"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
+        ("hangs-on", {"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]},
+         ("'leg6'", "'arm9'", "mean 'arm3'")),
+        ("arm-alone", {"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),
+        ("no-motors", {"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
+        ("no-length", {"lengths": None}, ("'leg1'", "no length")),
+        ("leg-travel", {"travel": [0, 1]}, ("travel", "'leg1'", "with P only")),
+        ("point-on-axis", arm1(point=[320, 0, 0]),
+         ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
+        ("home-below", {"home": below}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
+        ("rods-short", {"lengths": 200}, ("'arm1'", "82.6898 and 118.505 deg", "-30 to 70 deg")),
+        ("rod-long", {"lengths": [400, 420, *[400] * 4]},
+         ("home", "'leg2'", "400 mm long instead of 420 mm")),
+        ("travel-at-home", arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
+        ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
+    ]  # fmt: skip
+    for name, changed, named in of_motors:
+        edits = (text("table.yaml", yaml.safe_dump(_without_none(arms | changed))),)
+        yield Refusal(f"arms-{name}", command, named, "", edits)
+
+
+def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if value is not None}
 
 
 def _poses() -> Iterable[Refusal]:
@@ -1048,12 +1543,17 @@ REFUSALS: tuple[Refusal, ...] = (
     *_use(),
     *_options(),
     *_datasets(),
+    *_in_hand(),
     *_measurements(),
+    *_units(),
     *_cameras(),
     *_tables(),
     *_overrides(),
     *_models(),
+    *_outside(),
+    *_formats(),
     *_new(),
+    *_described(),
     *_poses(),
     *_results(),
     *_scenes(),

@@ -256,60 +256,6 @@ def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> 
 
 
 ARMS: dict[str, Any] = yaml.safe_load((TABLES / "delta.yaml").read_text())
-ARM1 = ARMS["actuators"]["arm1"]
-HOME_BELOW = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
-
-
-def _arm1(**changes: Any) -> dict[str, Any]:
-    """Return the table's motors with another first one."""
-    entry = {key: value for key, value in (ARM1 | changes).items() if value is not None}
-    return {"actuators": ARMS["actuators"] | {"arm1": entry}}
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        (_arm1(axis=None), ("actuators.arm1", "found point", "direction of a carriage")),
-        (_arm1(travel_deg=None, travel=[0, 1]), ("actuators.arm1", "found travel", "travel_deg")),
-        (_arm1(travel_deg=[70, -30]), ("arm1", "lower reading first")),
-        (_arm1(arm_radius=0), ("actuators.arm1", "arm_radius", "0")),
-        (
-            _arm1(
-                axis=None,
-                point=None,
-                travel_deg=None,
-                direction=[1, 0, 0],
-                travel=[0, 1],
-                arm_radius=8,
-            ),
-            ("actuators.arm1", "arm_radius of a carriage"),
-        ),
-        (_arm1(axis=[0, 0, 0]), ("arm1", "direction of three numbers")),
-        ({"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
-        ({"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
-        ({"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]}, ("'leg6'", "'arm9'", "mean 'arm3'")),
-        ({"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),
-        ({"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
-        ({"lengths": None}, ("'leg1'", "no length")),
-        ({"travel": [0, 1]}, ("travel", "'leg1'", "with P only")),
-        (_arm1(point=[320, 0, 0]), ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
-        ({"home": HOME_BELOW}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
-        ({"lengths": 200}, ("'arm1'", "82.6898 and 118.505 deg", "-30 to 70 deg")),
-        ({"lengths": [400, 420, *[400] * 4]}, ("home", "'leg2'", "400 mm long instead of 420 mm")),
-        (_arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
-        (_arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
-    ],
-)
-def test_what_a_table_of_motors_cannot_say(
-    tmp_path: Path, changes: dict[str, Any], named: tuple[str, ...]
-) -> None:
-    path = tmp_path / "table.yaml"
-    table = {key: value for key, value in (ARMS | changes).items() if value is not None}
-    path.write_text(yaml.safe_dump(table))
-    with pytest.raises(ModelError) as caught:
-        create_model(read_table(path), tmp_path)
-    assert all(word in str(caught.value) for word in named), str(caught.value)
-    assert [p.name for p in tmp_path.iterdir()] == ["table.yaml"]
 
 
 # --- files that are outside the method -----------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -63,59 +62,6 @@ def test_hand_held_views_count_in_the_order_of_the_table(folder: Folder) -> None
     m = load_dataset(folder.write()).measurements
     assert [m.views[v].name for v in m.view] == ["c2-1", "c2-2", "c1", "c1"]
     assert m.image[0].endswith("c2_2.png")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ("no board", ("views.c1.hand_held", "no board")),
-        ("a pose", ("views.c1.T_base_camera", "one pose")),
-        ("a name", ("views.c1-2", "hand-held")),
-        ("3 corners", ("row 2", "found 3 corners")),
-        ("0 corners", ("row 2", "found no corners")),
-        ("no image", ("row 2, column image", "neither an image")),
-        ("corners alone", ("corners.csv", "no board")),
-        ("no legs", ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
-        ("a number", ("views.c1.hand_held", "found 3", "true or false")),
-        ("a wrong board", ("dataset.yaml", "board.square", "30 m")),
-        ("a word", ("dataset.yaml", "board", "'charuco'", "mapping")),
-    ],
-)
-def test_what_no_board_can_place_is_refused(
-    folder: Folder, change: str, words: tuple[str, ...]
-) -> None:
-    entry, views = folder.entry, folder.entry["views"]
-    pose = views["c1"]["T_base_camera"]
-    if change not in ("corners alone", "no legs"):
-        _hold(folder, "c1")
-    if change == "no board":
-        del entry["board"]
-    elif change == "a pose":
-        views["c1"]["T_base_camera"] = pose
-    elif change == "a name":
-        views["c1-2"] = views.pop("c2")
-        for row in folder.rows[2:]:
-            row["view"] = "c1-2"
-    elif change.endswith("corners"):
-        n = int(change[0])
-        lines = [*_lines(IN_HAND[0]), *_lines("c2,images/c2_1.png"), *_lines(IN_HAND[1], n)]
-        _write(folder.path / "corners.csv", lines)
-    elif change == "no image":
-        folder.rows[1]["image"] = ""
-    elif change == "no legs":
-        for view in views.values():
-            view["legs"] = []
-    elif change == "corners alone":
-        _write(folder.path / "corners.csv", _lines("c1,images/c1_1.png"))
-    else:
-        wrong: dict[str, Any] = {
-            "a number": BOARD, "a wrong board": BOARD | {"square": 30}, "a word": "charuco"
-        }  # fmt: skip
-        entry["board"] = wrong[change]
-        views["c1"]["hand_held"] = 3 if change == "a number" else True
-    with pytest.raises(DatasetError) as caught:
-        load_dataset(folder.write())
-    assert [word for word in words if word not in str(caught.value)] == []
 
 
 # The table of corners.
@@ -186,38 +132,8 @@ def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path)
     assert "c2,a.png,5,,,,rejected,hidden,edited" in (tmp_path / "again.csv").read_text()
 
 
-FIRST = "c1,c.png,0,5.0,5.0,0.1,used,,detected"
-
-
 def test_corners_of_a_board_that_is_gone_are_refused_once(tmp_path: Path) -> None:
     lines = [f"c1,c.png,{k},{5 + k},5.0,0.1,used,,detected" for k in range(30)]
     with pytest.raises(DatasetError, match=r"corners up to 29, .*15 on the base") as caught:
         _read(tmp_path, *lines)
     assert len(caught.value.problems) == 1
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("c9,a.png,3,1,2,0.1,used,,detected", ("column view", "'c9'")),
-        ("c2,c.png,3,1,2,0.1,used,,detected", ("column image", "'c.png'")),
-        ("c2,a.png,15,1,2,0.1,used,,detected", ("column corner", "'15'", "0 to 14")),
-        ("c2,a.png,1.0,1,2,0.1,used,,detected", ("column corner", "'1.0'")),
-        ("c2,a.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
-        ("c2,a.png,3,1,,0.1,used,,detected", ("column v", "empty cell")),
-        ("c2,a.png,3,1,nan,0.1,used,,detected", ("column v", "'nan'")),
-        ("c2,a.png,3,470,2,0.1,used,,detected", ("column u", "470 px", "inside the image")),
-        ("c2,a.png,3,1,2,0,used,,detected", ("column sigma", "'0'")),
-        ("c2,a.png,3,1,2,0.1,good,,detected", ("column verdict", "used or rejected")),
-        ("c2,a.png,3,1,2,0.1,used,,me", ("column source", "detected or edited")),
-        ("c2,a.png,3,1,2,0.1,used", ("7 cells", "needed 9")),
-        (FIRST, ("the same image and corner in row 1",)),
-    ],
-)
-def test_a_wrong_cell_is_named(tmp_path: Path, line: str, words: tuple[str, ...]) -> None:
-    with pytest.raises(DatasetError) as caught:
-        _read(tmp_path, FIRST, line)
-    (problem,) = caught.value.problems
-    assert [word for word in ("row 2 (line 3)", *words) if word not in problem] == []
-    with pytest.raises(DatasetError, match="found a header and no row"):
-        _read(tmp_path)

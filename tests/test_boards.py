@@ -109,42 +109,6 @@ def test_a_board_is_read_as_it_was_written(
     assert T.rotation.as_quat() == pytest.approx([0.0, 0.0, 0.6, 0.8])
 
 
-@pytest.mark.parametrize(
-    ("board", "changes", "words"),
-    [
-        (CHESSBOARD, {"square": 30}, ("square", "30 m", "0.03 for 30 mm")),
-        (CHESSBOARD, {"square": 0.0}, ("square", "0 m")),
-        (CHESSBOARD, {"square": float("nan")}, ("square",)),
-        (CHESSBOARD, {"kind": "chess"}, ("kind", "'chess'", "chessboard")),
-        (CHESSBOARD, {"kind": None}, ("kind",)),
-        (CHESSBOARD, {"squares_x": 8}, ("8 x 6 squares", "half a turn")),
-        (CHESSBOARD, {"squares_x": 3}, ("3 x 6 squares", "4 or more")),
-        (CHESSBOARD, {"squares_x": 9.5}, ("squares_x",)),
-        (CHESSBOARD, {"squares_x": -1}, ("squares_x", "-1")),
-        (CHESSBOARD, {"squares_x": True}, ("squares_x",)),
-        (CHESSBOARD, {"columns": 9}, ("columns", "unknown key")),
-        (CHESSBOARD, {"T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
-        (CHARUCO, {"marker": 0.05}, ("0.05 m", "0.04 m", "smaller")),
-        (CHARUCO, {"marker": 30}, ("marker", "30 m")),
-        (CHARUCO, {"marker": None}, ("marker",)),
-        (CHARUCO, {"dictionary": "4X4"}, ("dictionary", "'4X4'", "DICT_4X4")),
-        (CHARUCO, {"squares_x": 20, "squares_y": 20}, ("200 markers", "the 50 of")),
-        (CHARUCO, {"squares_x": 2, "squares_y": 3}, ("2 x 3 squares", "four or more")),
-        (APRILGRID, {"tag_size": 88}, ("tag_size", "88 m")),
-        (APRILGRID, {"tag_spacing": 0.026}, ("tag_spacing", "0.026", "0.05 to 2")),
-        (APRILGRID, {"tags_x": 60, "tags_y": 60}, ("60 x 60 tags", "587")),
-        (APRILGRID, {"family": "25h9"}, ("family", "'25h9'", "36h11")),
-    ],
-)
-def test_a_board_that_cannot_be_is_refused(
-    board: Board, changes: dict[str, Any], words: tuple[str, ...]
-) -> None:
-    with pytest.raises(DatasetError) as caught:
-        parse_board({**board_document(board), **changes}, PATH)
-    (problem,) = caught.value.problems
-    assert [word for word in (str(PATH), *words) if word not in problem] == []
-
-
 # What is printed.
 
 

@@ -294,54 +294,6 @@ def test_kalibr_files_are_read(
     assert_camera(read_camera(path), model, D, skew=0.0)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (ros(distortion_model="thin_prism"), ("distortion_model", "'thin_prism'")),
-        (ros(distortion_model="equidistant"), ("5 coefficients", "4 for equidistant")),
-        (ros(distortion_model="rational_polynomial"), ("5 coefficients", "needed 8")),
-        (ros(D=PLUMB_BOB[:3]), ("3 coefficients", "0 or 4 or 5 for plumb_bob")),
-        (ros(image_height=-768), ("image_height", "-768")),
-        (ros(image_width=...), ("image_width",)),
-        (ros(K=K[:2].tolist()), ("camera_matrix", "6 numbers", "needed 9")),
-        (ros(D=["a", 0, 0, 0, 0]), ("distortion_coefficients.data.0", "'a'")),
-        (ros(D=[float("nan"), 0, 0, 0, 0]), ("nan", "finite")),
-        (ros(K=[[float("inf"), 0, 5], *K[1:].tolist()]), ("inf", "finite")),
-        (ros(K=[*K[:2].tolist(), [0.0, 0.0, 2.0]]), ("[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",)),
-        (ros(K=[[-1290.0, 0, 500], *K[1:].tolist()]), ("fx = -1290", "above 0 px")),
-        (ros(K=[[1290.0, 0, -1], *K[1:].tolist()]), ("cx = -1", "1024 x 768")),
-        (ros(camera_matrix=7), ("camera_matrix", "found 7")),
-        (ros(camera_matrix={"rows": 1, "cols": 2, "data": [1, 2]}), ("1 x 2", "3 x 3")),
-        (kalibr(camera_model="omni"), ("cam0.camera_model", "'omni'", "'pinhole'")),
-        (kalibr(distortion_model="fov"), ("cam0.distortion_model", "'fov'")),
-        (kalibr(distortion_coeffs=[0.1]), ("1 coefficients", "4 for radtan")),
-        (kalibr(distortion_model="none"), ("4 coefficients", "0 for none")),
-        (kalibr(intrinsics=[1, 2, 3]), ("cam0.intrinsics", "3 numbers")),
-        (kalibr(intrinsics=[1290, 1290, 2000, 300]), ("cx = 2000", "1024 x 768")),
-        ({**kalibr(), "cam1": kalibr()["cam0"]}, ("2 cameras", "cam0, cam1", "needed one")),
-        ({"fx": 1, "fy": 2}, ("the keys fx, fy", "ROS camera_info")),
-        ([1, 2], ("a list", "'key: value'")),
-        ("", ("nothing", "'key: value'")),
-        ("a: [1, 2", ("line 1, column 9",)),
-        ("a: 1\nb: 2\na: 3", ("line 3, column 1", "'a' twice")),
-        ("a: !!python/object/apply:os.system [ls]", ("constructor",)),
-        ("%YAML:1.0\n---\nimage_width: [[[", ("storage that OpenCV cannot parse",)),
-        ("<?xml version='1.0'?><opencv_storage><a>", ("storage that OpenCV cannot parse",)),
-        ("%YAML:1.0\n---\nimage_width: 5\n", ("camera_matrix",)),
-        (b"a: \xff\xfe\xfd", ("UTF-8",)),
-        (b"%YAML:1.0\n# \xff", ("UTF-8",)),
-    ],
-)
-def test_files_that_are_not_cameras_are_refused(
-    tmp_path: Path, content: object, words: tuple[str, ...]
-) -> None:
-    path = write(tmp_path, content)
-    with pytest.raises(DatasetError) as caught:
-        read_camera(path)
-    text = "\n".join(caught.value.problems)
-    assert [word for word in (str(path), *words) if word not in text] == []
-
-
 def test_every_problem_is_listed_at_once(tmp_path: Path) -> None:
     singular = [[0.0, 0.0, 518.3], [0.0, -3.0, 900.0], [0.0, 0.0, 1.0]]
     with pytest.raises(DatasetError) as caught:

@@ -163,17 +163,6 @@ def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None
     )
 
 
-def test_a_standard_deviation_of_90_m_and_outlines_beside_axes_are_refused(folder: Folder) -> None:
-    folder.entry["encoder_sigma"] = 90
-    with pytest.raises(DatasetError, match=r"encoder_sigma.*90"):
-        load_dataset(folder.write())
-    folder.entry["encoder_sigma"] = 2e-6
-    for name in ("axes.csv", "observations.csv"):
-        (folder.path / name).write_text("view\n")
-    with pytest.raises(DatasetError, match=r"axes\.csv"):
-        load_dataset(folder.write())
-
-
 @pytest.mark.parametrize("name", ["none", "images", "images/c1_1.png"])
 def test_what_is_no_dataset_is_refused(folder: Folder, name: str) -> None:
     with pytest.raises(DatasetError, match="the dataset could not be read: found no"):

@@ -5,6 +5,7 @@ import os
 import re
 from dataclasses import replace
 from functools import cache
+from importlib.metadata import PackageNotFoundError, files
 from itertools import product
 from pathlib import Path
 
@@ -172,6 +173,43 @@ def test_a_home_is_level_where_a_file_draws_open_loops_and_no_travel(tmp_path: P
     np.testing.assert_allclose(q, travel.mean(axis=1), atol=1e-9)
     assert np.abs(q).max() < 0.1  # near where the sliders are drawn
     assert len(draw_poses(machine, 2, np.random.default_rng(0)).readings) == 2
+
+
+def test_what_closes_no_loop_is_left_out_of_an_mjcf_scene(tmp_path: Path) -> None:
+    scene = (
+        '<light pos="0 0 1"/><geom type="plane" size="1 1 1"/><geom type="mesh" mesh="m"/>'
+        '<camera name="c"/><!-- x --><body name="ball"><freejoint/><geom size="1"/></body>'
+    )
+
+    motor, world = '<position joint="leg1_prismatic"/>', "<worldbody>"
+    path = write_format(load_mechanism("hexapod"), "mjcf bodies", tmp_path)
+    text = path.read_text()
+    text = text.replace(motor, f'{motor}<adhesion body="platform"/>')
+    text = text.replace('range="-0.004 0.144"', "", 3)  # and the other ranges are no limits
+    text = text.replace(world, f'<compiler autolimits="false"/>{world}')
+    path.write_text(text.replace("</worldbody>", f"{scene}</worldbody>"))
+    machine = load_mechanism(path)
+    assert machine.leg_names == tuple(f"leg{j}" for j in range(1, 7))
+    notes = " ".join(machine.diagnostics)
+    assert "Free bodies that touch no loop were left out: 'ball'" in notes
+    assert "gives no travel for 6 sliders" in notes
+    assert max(leg.travel[1] - leg.travel[0] for leg in machine.legs) < 0.1
+
+
+@pytest.mark.corpus
+def test_every_robot_of_the_corpus_is_refused_in_one_sentence() -> None:
+    try:
+        found = files("example-robot-data") or []
+    except PackageNotFoundError:
+        pytest.skip("example-robot-data is not installed: pip install 'legcal[corpus]'")
+    robots = sorted(Path(str(f.locate())) for f in found if f.suffix == ".urdf")
+    assert robots, "the distribution lists no URDF"
+    for robot in robots:
+        with pytest.raises(LegcalError) as refusal:
+            load_mechanism(robot)
+        for problem in refusal.value.problems:
+            assert "\n" not in problem, robot.name
+            assert robot.name in problem, robot.name
 
 
 @pytest.fixture(scope="module")

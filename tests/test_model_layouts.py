@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
+from outside_machines import missing, scaled
 from thinned import thinned
 
 from legcal.errors import UsageError
@@ -314,6 +315,33 @@ def test_a_universal_joint_that_is_blocked_on_one_axis_is_a_revolute(tmp_path: P
     assert [leg.type for leg in machine.legs] == ["SPU", "SPU", "SPU", "SPR", "SPU", "SPU"]
     assert machine.legs[3].platform_axis is not None
     assert machine.mobility == 5
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        "<visual/>",
+        "<visual><geometry/></visual>",
+        '<visual><geometry><mesh filename="package://lost/lost.stl"/></geometry></visual>',
+        '<visual><material name="m"><color rgba="a b"/></material></visual>',
+    ],
+)
+def test_visuals_that_are_no_cylinder_do_no_harm(tmp_path: Path, part: str) -> None:
+    link, text = '<link name="leg1_tube">', SHIPPED_URDF.read_text()
+    assert link in text
+    (tmp_path / "hexapod.urdf").write_text(text.replace(link, link + part))
+    (tmp_path / "hexapod.yaml").write_text(SHIPPED_YAML.read_text().replace("../urdf/", ""))
+    machine = load_mechanism(tmp_path / "hexapod.yaml")
+    assert [len(leg.cylinders) for leg in machine.legs] == [2] * 6
+
+
+@pytest.mark.parametrize(("types", "scale"), [("US", 1.0), ("RS", 0.1), ("UU", 25.0)])
+def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(
+    types: str, scale: float, tmp_path: Path
+) -> None:
+    """Ten times as much is refused: see ``OUTSIDE``."""
+    path = write_machine(tmp_path, scaled(missing(types, 4e-6), scale), Layout())
+    assert load_mechanism(path).home.translation[2] == pytest.approx(0.6 * scale, rel=1e-4)
 
 
 # --- what a file does not name ------------------------------------------------------------------

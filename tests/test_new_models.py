@@ -324,33 +324,6 @@ def test_the_delta_is_the_shipped_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("family", "dimensions", "named"),
-    [
-        ("6-SPS", {}, ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
-        ("3-UPU", {}, ("--family 3-UPU", "hexapod or delta", "--template")),
-        ("hexapod", {"platform_radius": float("nan")}, ("--platform-radius nan", "positive")),
-        ("hexapod", {"arm_length": 20.0}, ("--arm-length", "--base-radius")),
-        ("hexapod", {"type": "RSS"}, ("--type RSS", "with a slider")),
-        ("hexapod", {"type": "UPX"}, ("--type UPX", "with a slider")),
-        ("hexapod", {"min_length": 600.0}, ("--family hexapod", "min_length 600")),
-        ("hexapod", {"name": "../up"}, ("'../up'",)),
-        ("delta", {"unit": "inch"}, ("'inch'", "mm or m")),
-        ("delta", {"unit": None, "rod_length": 400.0}, ("--rod-length", "--unit mm")),
-        ("delta", {"rod_length": 100.0}, ("rods of 100 mm", "--rod-length")),
-        ("delta", {"height": 374.0}, ("--height 374", "negative")),
-        ("delta", {"leg_radius": 40.0}, ("60 mm apart", "80 mm thick", "--leg-radius")),
-        ("delta", {"type": "UPS"}, ("--type", "--arm-length")),
-    ],
-)
-def test_what_a_family_cannot_be(
-    family: str, dimensions: dict[str, Any], named: tuple[str, ...]
-) -> None:
-    with pytest.raises((UsageError, ModelError)) as caught:
-        description_of(None, Dimensions(**{"family": family, "unit": "mm"} | dimensions))
-    assert all(word in str(caught.value) for word in named), str(caught.value)
-
-
 def test_a_3upu_turns_only_where_its_axes_are_tilted() -> None:
     for name, turns in (("3-upu", False), ("3-upu-tilted", True)):
         machine = load_mechanism(name)
@@ -359,83 +332,9 @@ def test_a_3upu_turns_only_where_its_axes_are_tilted() -> None:
         assert (turned > 0.05) if turns else (turned < 1e-9)
 
 
-# --- refusals beside those of the table ----------------------------------------------
+# --- files ------------------------------------------------------------------------------------
 
-SPS = {"type": "SPS"}
-ROD = {"type": None, "types": ["SPU", "SPU", "SS"]}
-PLANAR = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
-TURNED = {"xyz": [0, 0, 0], "rpy_deg": [0, 10, 0]}
-PAIRS = {
-    "base_joints": [[300, 0, 0], [300, 0, 0], [0, 300, 0]],
-    "platform_joints": [[180, 0, 0], [180, 0, 0], [0, 180, 0]],
-}
-Refused = tuple[dict[str, Any], tuple[str, ...]]  # what is changed, what must be named
-TABLE_REFUSED: list[Refused] = [
-    ({"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
-    ({"legcal_table": None, "version": 1}, ("version: 1", "write 'legcal_table: 1'")),
-    ({"legcal_table": True}, ("legcal_table", "true", "needed 1")),
-    ({"type": 3}, ("type", "found 3", "6-UPS")),
-    ({"type": "²-RPS"}, ("type", "'²-RPS'")),
-    ({"name": "x" * 101}, ("name", "at most 100")),
-    ({"types": [3, 4, 5], "type": None}, ("types.0",)),
-    ({"type": None, "types": ["RPS", "S", "RPS"]}, ("types.1", "'S'")),
-    ({"base_joints": [[1, 2, 3]]}, ("found 1 leg", "2 to 32")),
-    ({"base_joints": [[1, 2, 3, 4]] * 3}, ("base_joints", "row 1", "three")),
-    ({"base_joints": 7}, ("base_joints", "found 7", "row 1")),
-    ({"base_frame": ["leg1", "leg1", "leg2"]}, ("base_frame", "twice")),
-    ({"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
-    ({"legs": ["a", "b b", "c"]}, ("legs.1", "'b b'")),
-    ({"travel": 150}, ("travel", "found 150")),
-    ({"travel": [[0, 1], [0, 1]]}, ("travel", "2", "3")),
-    ({"home": {"rpy_deg": [0, 0, 0]}}, ("home.xyz",)),
-    ({"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 0]}}, ("quaternion", "norm 0")),
-    ({"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
-    (PAIRS, ("'leg1' and 'leg2'", "same two points")),
-    (ROD | {"lengths": [None, 455, 455]}, ("lengths", "'leg2'")),
-    (ROD | {"offsets": [380, 380, 380]}, ("offsets", "'leg3'")),
-    (ROD | {"lengths": [None, None, 600]}, ("'leg3'", "456.", "600 mm")),
-    # what does not fit together, once the machine is put together
-    ({"offsets": -380}, ("length of -0.38 m", "offset")),
-    ({"radius": {"rod": 1e4}}, ("radius of 1e+04 mm",)),
-    ({"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "middle")),
-    (SPS | {"offsets": 100}, ("'leg1'", "close at home", "100 to 250 mm")),
-    (SPS | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None}, ("base joints",)),
-    (SPS | {"base_joints": [[300, 0, 0], [0, 0, 0], [-300, 0, 0]]}, ("one line",)),
-    (SPS | {"home": {"xyz": [120, 0, 0], "rpy_deg": [0, 0, 0]}}, ("'leg1'", "length of 0 m")),
-    ({"type": "UPS", "base_axes": [[-120, 0, 440], None, None]}, ("'leg1'", "along the leg")),
-    (PLANAR, ("'leg1'", "instead of 90 deg")),
-    (PLANAR | {"home": TURNED, "offsets": 50}, ("home",)),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("changes", "named"), TABLE_REFUSED)
-def test_what_a_table_cannot_say(
-    tmp_path: Path, changes: dict[str, Any], named: tuple[str, ...]
-) -> None:
-    with pytest.raises(ModelError) as caught:
-        made(tmp_path, **changes)
-    assert all(str(tmp_path / "table.yaml") in problem for problem in caught.value.problems)
-    assert all(word in str(caught.value) for word in named), str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["table.yaml"]
-
-
-HEAD, ROW = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
-CSV_REFUSED = [
-    (f"{HEAD}\n{ROW}\n,1,2,3,4\n", ("types.1",)),
-    (f"{HEAD},travel_low\n{ROW},0\n{ROW},0\n", ("travel",)),
-    (f"{HEAD}\nRPS,nan,2,3,4\n{ROW}\n", ("line 2", "base_x", "'nan'")),
-    ("type\tbase_x\nRPS\t1,5\n", ("'base_y'",)),
-    (f"{HEAD},radius,rod\n{ROW},9,8\n", ("line 2", "radius, tube, rod")),
-]
-
-
-@pytest.mark.parametrize(("text", "named"), CSV_REFUSED)
-def test_what_a_csv_cannot_say(tmp_path: Path, text: str, named: tuple[str, ...]) -> None:
-    path = tmp_path / "machine.csv"
-    path.write_text(text)
-    with pytest.raises(ModelError) as caught:
-        read_table(path, "mm")
-    assert all(word in str(caught.value) for word in (str(path), *named)), str(caught.value)
+HEAD = "type,base_x,base_y,platform_x,platform_y"
 
 
 def test_a_csv_whose_file_name_is_no_name_needs_one(tmp_path: Path) -> None:

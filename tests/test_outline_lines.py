@@ -9,7 +9,6 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array
-from legcal.perception import pooled_fit as pool
 from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
@@ -104,66 +103,10 @@ def test_distances_are_those_of_the_pixels_that_are_read(
     assert shallow.d[shallow.window >= 0.5].min() < -3.0
 
 
-def test_gain_is_how_far_an_outline_moves_in_the_image() -> None:
-    one = edge_at(0.8)
-    h = np.stack([one.band.line(*(V + move)) for move in (0.0, 1.0)])
-    found = read([one])
-    on_line = one.band.points(found.position * one.band.length, V[0] + np.diff(V) * found.position)
-    moved = [LENS.line_offset(np.broadcast_to(line, (len(on_line), 3)), on_line) for line in h]
-    np.testing.assert_allclose(found.gain, moved[0] - moved[1], atol=5e-3)
-
-
-def test_outlines_are_read_together_as_they_are_alone() -> None:
-    edges = [edge_at(0.3), edge_at(1.2, -1.0, 120.0), edge_at(2.0)]
-    together = read(edges)
-    for k, one in enumerate(edges):
-        alone, own = read([one]), slice(together.bounds[k], together.bounds[k + 1])
-        seen, of_one = together.window[own] > 0.0, alone.window > 0.0
-        np.testing.assert_allclose(together.position[own], alone.position, atol=1e-3)
-        np.testing.assert_array_equal(seen.sum(axis=1), of_one.sum(axis=1))
-        np.testing.assert_allclose(together.d[own][seen], alone.d[of_one], atol=5e-3)
-        np.testing.assert_array_equal(together.grey[own][seen], alone.grey[of_one])
-
-
-def test_hidden_stretches_and_other_blocks_are_left_out() -> None:
-    one = edge_at(1.3)
-    one.hidden[2:5] = True
-    every, found = read([edge_at(1.3)]), read([one])
-    assert not np.any((found.position > 0.2) & (found.position < 0.5))
-    assert len(found.position) == np.count_nonzero(
-        (every.position <= 0.2) | (every.position >= 0.5)
-    )
-    n = len(every.position) // 2
-    np.testing.assert_array_equal(read([edge_at(1.3)], most=n).position, every.position[::2])
-
-
 # Sums over pixels, and their noise.
 
 N_BLOCKS, ROWS, REACH, NOISY_BLUR = 40, 8, 6, 0.6
 BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])
-
-
-def test_sums_over_bins_are_those_over_pixels() -> None:
-    rng = np.random.default_rng(3)
-    d = rng.uniform(-4.0, 4.0, (5, 90)).astype(np.float32)
-    weight = (rng.uniform(0.5, 1.5, d.shape) * (rng.random(d.shape) < 0.8)).astype(np.float32)
-    light = rng.uniform(-50.0, 50.0, d.shape).astype(np.float32)
-    blurs, bounds, square = np.array([0.5, 0.8]), (0, 2, 5), weight.astype(np.float64) ** 2
-    sums = PixelBins.of(d, weight, float(blurs.min())).sums(light)
-    values, slopes = powers(sums.grid / blurs[:, None])
-    at_bins = values, slopes / blurs[:, None, None], bounds
-    products, with_light = sums.products(*at_bins), sums.with_light(*at_bins)
-    at_pixels, _ = powers(d / np.repeat(blurs, [2, 3])[:, None])
-    expected = np.einsum("nm,nmi,nmj->nij", square, at_pixels, at_pixels)
-    scale = np.sqrt(np.einsum("nii->ni", expected))
-    np.testing.assert_array_less(
-        np.abs(products - expected), 0.02 * scale[:, :, None] * scale[:, None]
-    )
-    expected = np.einsum("nm,nm,nmi->ni", square, light, at_pixels)
-    np.testing.assert_array_less(np.abs(with_light - expected), 5.0 * scale)
-    power = np.sum(square * light.astype(np.float64) ** 2, axis=1)
-    np.testing.assert_allclose(sums.power.sum(axis=1), power, rtol=1e-6)
-    np.testing.assert_array_equal(sums.count.sum(axis=1), np.count_nonzero(weight, axis=1))
 
 
 def noisy_sums(sides: Array, rng: np.random.Generator, behind: float = 1.0) -> PixelSums:
@@ -226,70 +169,12 @@ def limb_blocks(
     return d, grey.astype(np.float32)
 
 
-@pytest.mark.parametrize("x", [-1.5, 0.0, 3.0])
-def test_limb_is_a_blurred_square_root(x: float) -> None:
-    blur, half_width = 0.7, 1e6  # so wide that sqrt(rho (2 - rho)) is sqrt(2 rho)
-    values, _ = simple(np.array(x), blur, half_width)
-
-    def integrand(depth: float) -> float:
-        weight = np.exp(-0.5 * ((x - depth) / blur) ** 2) / (blur * np.sqrt(2.0 * np.pi))
-        return float(np.sqrt(2.0 * depth / half_width) * weight)
-
-    expected, _ = quad(integrand, 0.0, 12.0, points=[max(x, 0.0)], limit=200)
-    assert values[3] == pytest.approx(expected, rel=3e-3, abs=1e-6)
-
-
-def test_slopes_are_the_derivatives_of_the_basis() -> None:
-    d, step = np.linspace(-5.0, 5.0, 201), 1e-3
-    before, after = (simple(d + s, 0.6)[0] for s in (-step, step))
-    np.testing.assert_allclose((after - before) / (2 * step), simple(d, 0.6)[1], atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    "amplitude",
-    [
-        [20.0, 0.0, 120.0, 60.0, -30.0],
-        [200.0, 4.0, -150.0, 40.0, 0.0],
-        [60.0, 0.0, -30.0, 200.0, 0.0],
-    ],
-    ids=["bright on dark", "dark on bright", "darker at the limb, then brighter"],
-)
-def test_shift_of_an_outline_is_found_whatever_its_contrast(amplitude: list[float]) -> None:
-    d, grey = limb_blocks(0.15, 0.6, amplitude, noise=0.5)
-    weight = np.ones(d.shape, dtype=np.float32)
-    moved = np.zeros(len(d))
-    for _ in range(5):
-        at = d - moved[:, None].astype(np.float32)
-        fit = block_fit(at, grey, weight)
-        moved += fit.shift
-    assert np.median(moved) == pytest.approx(0.15, abs=0.01)
-
-
 def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
     d, grey = limb_blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
     weight = np.ones(d.shape, dtype=np.float32)
     fit = block_fit(d, grey, weight)
     assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
     assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
-
-
-def test_flat_blocks_say_nothing() -> None:
-    d, grey = limb_blocks(0.0, 0.6, [50.0, 0.0, 0.0, 0.0, 0.0], noise=2.0)
-    weight = np.ones(d.shape, dtype=np.float32)
-    fit = block_fit(d, grey, weight)
-    assert np.median(fit.variance) > 0.2
-    hidden = block_fit(d, grey, np.zeros_like(weight))
-    assert np.all(np.isinf(hidden.variance))
-
-
-@pytest.mark.parametrize("blur", [0.4, 0.7, 1.2])
-def test_blur_is_estimated_from_the_picture(blur: float) -> None:
-    d, grey = limb_blocks(0.1, blur, [20.0, 0.0, 120.0, 60.0, 0.0], noise=1.0, n=60)
-    weight = np.ones(d.shape, dtype=np.float32)
-    position, half_width = np.linspace(0.0, 1.0, len(d)), np.array([HALF_WIDTH_PX])
-    blocks = Blocks.of_pixels(d, grey, weight, np.array([0, len(d)]), position, half_width)
-    blocks.contrast[:] = 1.0
-    assert blocks.estimate_blur(2) == pytest.approx(blur, rel=0.1)
 
 
 def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
@@ -329,12 +214,6 @@ def test_covariance_agrees_with_monte_carlo() -> None:
     assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
 
 
-def test_covariance_never_claims_more_than_the_model_is_good_for() -> None:
-    position = np.linspace(0.0, 1.0, 64)
-    line = fitted(fit_straight(position, np.zeros(64), np.full(64, 1e-8)))
-    assert np.all(np.diag(line.covariance) >= COMMON_BIAS**2)
-
-
 def test_blocks_that_share_their_errors_count_for_fewer() -> None:
     rng = np.random.default_rng(3)
     position = np.linspace(0.0, 1.0, 64)
@@ -343,28 +222,6 @@ def test_blocks_that_share_their_errors_count_for_fewer() -> None:
     independent = fitted(fit_straight(position, white, np.full(64, 0.01))).covariance
     shared = fitted(fit_straight(position, smooth, np.full(64, 0.01))).covariance
     assert np.trace(shared) > 1.5 * np.trace(independent)
-
-
-def test_lines_of_several_outlines_are_those_of_each() -> None:
-    rng = np.random.default_rng(4)
-    counts = [50, 3, 0, 21, 12, 8]
-    position = np.concatenate([np.linspace(0.0, 1.0, n) for n in counts])
-    shift = 0.3 * position + 0.05 * rng.standard_normal(len(position))
-    shift[10:20] += 0.8
-    variance = rng.uniform(1e-4, 4e-3, len(position))
-    variance[rng.random(len(position)) < 0.1] = np.inf
-    variance[-8:-3] = np.inf
-    bounds = np.cumsum([0, *counts])
-    lines = fit_lines(bounds, position, shift, variance)
-    assert [line is None for line in lines] == [False, True, True, False, False, True]
-    for line, first, last in zip(lines, bounds[:-1], bounds[1:], strict=True):
-        own = slice(first, last)
-        alone = fit_straight(position[own], shift[own], variance[own])
-        assert (line is None) == (alone is None)
-        if line is not None and alone is not None:
-            np.testing.assert_allclose(line.ends, alone.ends, atol=1e-12)
-            np.testing.assert_array_equal(line.kept, alone.kept)
-            np.testing.assert_allclose(line.covariance, alone.covariance, rtol=1e-9)
 
 
 # All blocks of outlines together.
@@ -449,10 +306,6 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
     assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
 
 
-def test_surfaces_are_told_apart() -> None:
-    np.testing.assert_allclose(SURFACES @ SURFACES.T, np.eye(5), atol=3e-3)
-
-
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
 @pytest.mark.parametrize(("blur", "change"), [(0.4, 0.6), (0.9, 0.0)])
 def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
@@ -493,26 +346,6 @@ def test_blocks_of_something_else_do_not_move_the_line() -> None:
     np.testing.assert_allclose(one, two, atol=0.02)
 
 
-def test_outlines_without_blocks_stay_where_they_are() -> None:
-    blocks = outline(BRIGHT, (0.1, 0.1), 0.5)
-    found = fit_pooled(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
-    np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
-    assert np.all(np.diag(found.covariance[0]) >= 1.0)
-    assert found.blur == 0.5
-    assert np.isnan(found.by_gamma).all()
-
-
-def test_sums_over_pixels_serve_places_and_blurs_nearby(monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks, every = outline(GLINT, (0.1, -0.05), 0.5, noise=0.2), np.ones(40)
-    found = fit_pooled(blocks, every, 0.54, DEPTH)
-    for name in ("MAX_MOVE_OF_SUMS", "MAX_MOVE"):  # sums anew in every round
-        monkeypatch.setattr(pool, name, (0.0, 0.0))
-    anew = fit_pooled(blocks, every, 0.54, DEPTH)
-    np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
-    np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2, atol=2e-5)
-    assert found.blur == pytest.approx(anew.blur, rel=5e-3)
-
-
 def together(parts: Sequence[Blocks]) -> Blocks:
     """Return the outlines of one image, 40 blocks each."""
     d, light, weight, position = (
@@ -523,12 +356,6 @@ def together(parts: Sequence[Blocks]) -> Blocks:
     both = Blocks.of_pixels(d, light, weight, bounds, position, half_width)
     both.noise[:] = 0.09
     return both
-
-
-def test_outlines_that_have_converged_do_not_depend_on_others() -> None:
-    slow, quick = outline(GLINT, (0.2, -0.2), 0.5, noise=0.3), outline(BRIGHT, (0.0, 0.0), 0.5)
-    found = fit_pooled(together([slow, quick]), np.ones(80), 0.5, DEPTH)
-    np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
 
 
 def test_an_outline_without_blocks_stays_while_others_move_the_blur_of_the_image() -> None:

@@ -17,7 +17,7 @@ from legcal.machine.leg import Cylinder
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
-from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone, _lines
+from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone
 from legcal.perception.photographs import measure_photographs, with_measured_radii
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import MeasuredEdge
@@ -330,30 +330,6 @@ def test_an_edge_stands_alone_only_without_a_rival() -> None:
     both = np.stack([np.arange(len(cases)), other], axis=1)
     least = np.full(len(cases), LONE_SCORE)
     np.testing.assert_array_equal(_alone(shift[both], score[both], least), expected[both])
-
-
-def test_lines_of_patches_are_those_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    n_blocks, halves = np.array([4, 30, 80, 7, 12]), np.array([9, 3, 10, 0, 9])
-    most = int(halves.max())
-    votes = rng.random((n_blocks.sum(), 2 * most + 1)).astype(np.float32)
-    votes[4:34, most + 2] = 2.0  # a line without a tilt in the second patch
-    together = _lines(votes, n_blocks, halves)
-    monkeypatch.setattr("legcal.perception.part_edges.MOST_VOTES", 3)
-    apart = _lines(votes, n_blocks, halves)
-    first = np.cumsum(n_blocks) - n_blocks
-    for k, (n, half) in enumerate(zip(n_blocks.tolist(), halves.tolist(), strict=True)):
-        of_patch = votes[first[k] : first[k] + n, most - half : most + half + 1]
-        alone = _lines(of_patch, n_blocks[k : k + 1], halves[k : k + 1])
-        for one, two, three in zip(together, apart, alone, strict=True):
-            np.testing.assert_allclose(one[k], two[k], rtol=1e-5)
-            np.testing.assert_allclose(one[k], three[0], rtol=1e-5)
-    shift, score = together
-    np.testing.assert_allclose(shift[1, 0], [2.0, 2.0], atol=0.5)
-    assert score[1, 0] == pytest.approx(60.0)
-    assert np.all(score[3, 1:] == 0.0)  # a window of one column has one line
-    assert np.all(np.diff(score, axis=1) <= 0.0)
-    assert np.all(np.abs(shift.mean(axis=2)) <= halves[:, None])
 
 
 # Which part of a leg shows an outline.

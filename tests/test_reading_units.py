@@ -83,39 +83,7 @@ def test_a_model_keeps_the_pulses_of_its_servos(tmp_path: Path) -> None:
         read_table(servo_table(tmp_path, us_per_deg=0))
 
 
-SIGMA = {"encoder_sigma": dict.fromkeys(SERVOS, 1e-4)}
 DEGREES = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
-IN_US = {"readings": {name: {"unit": "us", **PULSES} for name in SERVOS}}
-
-
-@pytest.mark.parametrize(
-    ("readings", "entry", "named"),
-    [
-        (np.degrees(ANGLES), SIGMA, ("look like degrees", "pi/180", "readings: deg")),
-        (BOTH_WAYS, DEGREES, ("% of the travel in deg", "in rad", "write readings: rad")),
-        (pulses(ANGLES), SIGMA, ("look like pulses", "centre_us: 1500")),
-        (pulses(ANGLES), DEGREES, ("look like pulses", "centre_us: 1500")),
-        (ANGLES, IN_US, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
-        (np.degrees(ANGLES), IN_US, ("look like degrees: write readings: deg",)),
-        (pulses(ANGLES + 0.4), IN_US, ("us in row",)),
-        (pulses(ANGLES), SIGMA | {"readings": "us"}, ("readings.servo1", "neither centre nor us")),
-        (ANGLES, SIGMA | {"readings": "mm"}, ("found mm and no motor that slides",)),
-        (ANGLES, SIGMA | {"readings": {"servo9": "deg"}}, ("readings.servo9", "servo1, servo2")),
-        (ANGLES, SIGMA | {"readings": {"servo1": "mm"}}, ("readings.servo1", "which turns")),
-        (ANGLES, SIGMA | {"readings": "turns"}, ("readings", "'turns'")),
-        (ANGLES, {"readings": "rad"}, ("encoder_sigma is incomplete", "servo1, servo2")),
-        (ANGLES, {"encoder_sigma": dict.fromkeys(SERVOS, 0.5)}, ("28.6 deg", "0.5deg")),
-        (ANGLES, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
-        (ANGLES, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
-    ],
-)
-def test_units_that_are_taken_for_others_are_told_before_images_are_looked_at(
-    readings: np.ndarray, entry: dict[str, Any], named: tuple[str, ...], tmp_path: Path
-) -> None:
-    with pytest.raises(LegcalError) as caught:
-        load_dataset(dataset_of_readings(tmp_path, readings, entry))
-    (said, *_) = caught.value.problems
-    assert all(word in said for word in named), said
 
 
 def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_path: Path) -> None:

@@ -39,7 +39,6 @@ from legcal.perception.pair_matching import (
     depth_reversed,
     distances,
     gauss_newton_step,
-    leg_segments,
     match_pairs,
     segment_equations,
 )
@@ -129,21 +128,6 @@ def test_hypotheses_move_with_the_frame_of_the_machine_and_put_two_legs_on_pairs
 # Scores of poses, and steps towards the pairs.
 
 
-def test_segments_lie_on_their_legs_and_make_up_all_that_is_seen_of_them() -> None:
-    rng = np.random.default_rng(0)
-    made = lp.machine(6, rng)
-    A, B = made.A, made.posed(lp.platform(rng))
-    cylinders: list[tuple[Cylinder, ...]] = [lp.CYLINDERS] * 5 + [()]
-    targets = leg_segments(A, B, cylinders, np.arange(1, 6))
-    assert set(targets.leg.tolist()) == {1, 2, 3, 4}
-    np.testing.assert_allclose(np.bincount(targets.leg, targets.share)[1:], 1.0)
-    at = A[targets.leg][:, None] + targets.place[..., None] * (B - A)[targets.leg][:, None]
-    np.testing.assert_allclose(targets.ends, at, atol=1e-12)
-    assert np.all((targets.place[:, 0] > 0.0) & (np.diff(targets.place, axis=1)[:, 0] > 0.0))
-    assert np.all(targets.place[:, 1] < 1.0)
-    assert set(targets.radius.tolist()) == {lp.TUBE, lp.ROD}
-
-
 def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Return the matches of one picture, without those of others."""
     score, pair, visible = match_pairs(Pictures.of([picture]), poses, tolerance)
@@ -207,35 +191,6 @@ def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
     none = Pictures.of([empty])
     still = gauss_newton_step(none, _pose(T), match_pairs(none, _pose(T), 0.025), 0.025, 0.015)
     np.testing.assert_allclose(still.t, _pose(T).t)
-
-
-def test_pictures_together_say_what_each_of_them_says() -> None:
-    pictures, T = _scene(2, 6, 4)
-    pictures[0] = replace(pictures[0], pairs=pictures[0].pairs.take(np.arange(3)))
-    pictures[1] = replace(pictures[1], targets=lp.pieces(*np.zeros((2, 0, 3))))
-    pictures[2] = replace(pictures[2], pairs=pictures[2].pairs.take(np.arange(0)))
-    n = 70
-    poses = CameraPoses.joined([_pose(T)] * n)
-    poses = replace(poses, t=poses.t + np.linspace(-0.02, 0.02, n)[:, None] * [1.0, 0.5, 0.0])
-    every = Pictures.of(pictures)
-    together = match_pairs(every, poses, 0.05)
-    for k, picture in enumerate(pictures):
-        alone, m = _matched(picture, poses, 0.05), len(picture.targets)
-        for one, all_of_them in zip(alone, together, strict=True):
-            np.testing.assert_allclose(all_of_them[k, :, :m], one, atol=1e-6)
-            assert not all_of_them[k, :, m:].any()
-    assert together.score[3].any()
-    # What shows no pair changes no step, nor does what fills arrays up.
-    picture = pictures[3]
-    empty = replace(picture, pairs=picture.pairs.take(np.arange(0)))
-    single, double = Pictures.of([picture]), Pictures.of([empty, picture])
-    for joint_error in (0.0, 0.015):
-        by_one, by_two = (
-            gauss_newton_step(some, poses, match_pairs(some, poses, 0.05), 0.05, joint_error)
-            for some in (single, double)
-        )
-        np.testing.assert_allclose(by_one.t, by_two.t, atol=1e-12)
-        np.testing.assert_allclose(by_one.shift, by_two.shift, atol=1e-12)
 
 
 @pytest.mark.parametrize("joined", [False, True])

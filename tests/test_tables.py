@@ -299,45 +299,6 @@ def test_sentences_of_earlier_versions_are_read_as_reasons(
 # --- refused
 
 
-@pytest.mark.parametrize(
-    ("table", "row", "cells", "named"),
-    [
-        (outlines_of(3, rejected=0.0), 2, {"residual": "-1"}, ("column residual", "'-1'")),
-        (outlines_of(3, rejected=0.0), 2, {"contrast": "inf"}, ("column contrast", "'inf'")),
-        (outlines_of(3, rejected=0.0), 2, {"by_gamma": "nan"}, ("column by_gamma", "'nan'")),
-        (
-            outlines_of(3, rejected=0.0),
-            2,
-            {"s00": "1", "s01": "2", "s11": "1"},
-            ("columns s00, s01, s11", "(1, 2, 1)"),
-        ),
-        (
-            outlines_of(3, rejected=0.0),
-            2,
-            {"s00": "1", "s01": "0", "s11": "18446744073709551616"},
-            ("columns s00, s01, s11", "4.29e+09 px", "1e-05 to 100 px"),
-        ),
-        (
-            outlines_of(3, rejected=0.0),
-            2,
-            {"s00": "1e-20", "s01": "0", "s11": "1"},
-            ("columns s00, s01, s11", "1e-10 and 1 px", "1e-05 to 100 px"),
-        ),
-        (outlines_of(3), 1, {"verdict": "rejected", "a": "left"}, ("column a", "'left'")),
-        (axis_table(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
-        (axis_table(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
-        (axis_table(), 5, {"sigma_theta": "3"}, ("column sigma_theta", "1e-09 to 1 rad")),
-        (axis_table(), 5, {"theta": "-inf"}, ("column theta", "'-inf'", "finite")),
-    ],
-)
-def test_a_wrong_cell_is_one_problem_of_its_row(
-    tmp_path: Path, table: Outlines | AxisTable, row: int, cells: dict[str, str], named: tuple[str]
-) -> None:
-    (problem,) = problems(edited(written(tmp_path, table), row, **cells))
-    assert f"row {row} (line {row + 1})" in problem
-    assert [word for word in named if word not in problem] == []
-
-
 def test_many_problems_are_listed_at_once_and_said_shortly(tmp_path: Path) -> None:
     path = written(tmp_path, outlines_of(10, rejected=0.0))
     edited(path, 1, view="up", leg="none", edge="0")

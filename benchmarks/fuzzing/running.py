@@ -57,7 +57,7 @@ class Case:
 
     subject: Subject
     seed: int = 0
-    made: bytes | None = None  # the content, if it is not drawn
+    made: bytes | None = None  # the content, if it is a valid one
 
     @property
     def name(self) -> str:
@@ -126,6 +126,25 @@ def drawn_cases(count: int, seed: int, deep_share: float = DEEP_SHARE) -> list[C
         shares[chosen] *= part / shares[chosen].sum()
     drawn = chance.choice(len(SUBJECTS), count, p=shares)
     return [Case(SUBJECTS[k], 1_000_000 * seed + n) for n, k in enumerate(drawn.tolist())]
+
+
+def cases_of_unequal_claims(count: int, seed: int) -> list[Case]:
+    """Return tables of outlines that are valid, of covariances twelve powers of ten apart."""
+    (subject,) = (subject for subject in SUBJECTS if subject.file == "observations.csv")
+    valid = (made_input(subject.input) / subject.file).read_text()
+    cases = []
+    for n in range(count):
+        chance = np.random.default_rng([seed, n])
+        header, *rows = [line.split(",") for line in valid.splitlines()]
+        for row in rows:
+            if chance.random() < 0.2:
+                s00, s11 = (10.0 ** chance.uniform(-8.5, 3.9, 2)).tolist()
+                s01 = float(chance.uniform(-0.9, 0.9)) * (s00 * s11) ** 0.5
+                for column, value in (("s00", s00), ("s01", s01), ("s11", s11)):
+                    row[header.index(column)] = repr(value)
+        content = "".join(",".join(line) + "\n" for line in (header, *rows))
+        cases.append(Case(subject, n, made=content.encode()))
+    return cases
 
 
 def run_cases(cases: Sequence[Case], *, lone: bool = False) -> Iterator[Ended]:
@@ -261,6 +280,8 @@ def _run_one(case: Case, folder: Path) -> Ended:
     seconds = time.process_time() - begin
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
     fault, message = _judged(outcome, folder)
+    if case.made is not None and outcome.code == 2:
+        fault = fault or "refused, and it is valid"
     return Ended(case, outcome.code, seconds, grown, fault, message)
 
 

@@ -1,0 +1,505 @@
+"""Machines that the method does not cover, and mistakes in those that it does, as files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import yaml
+from layouts import Layout, LegLayout, MachineSpec, write_machine
+from machines import ROOT, of_types, planar
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+
+Z = np.array([0.0, 0.0, 1.0])
+Joint = tuple[str, Array, Array]  # type, point and axis in the base link
+HEIGHT = 0.5
+
+
+class Drawing:
+    """A URDF with chains that hang from the base and are closed on the platform."""
+
+    def __init__(self) -> None:
+        self.links = ['<link name="base"/>', '<link name="platform"/>']
+        self.joints = [
+            '<joint name="free" type="floating"><parent link="base"/>'
+            '<child link="platform"/></joint>'
+        ]
+        self.loops: list[list[str]] = []
+        self.kinds: list[str] = []
+        self.legs: dict[str, str] = {}  # name and first joint
+        self.motors: list[str] = []  # where they are not those first joints
+
+    def chain(
+        self,
+        name: str,
+        root: str,
+        at: Array,
+        joints: Sequence[Joint],
+        *,
+        end: Array,
+        kind: str,
+        on: tuple[str, Array] = ("platform", HEIGHT * Z),
+    ) -> None:
+        """Hang joints from a link whose origin is at a point; close at ``end``, on the platform."""
+        link, origin = root, at
+        for i, (joint, point, axis) in enumerate(joints):
+            child = f"{name}_{i}"
+            self.add(child, joint, link, point - origin, axis)
+            link, origin = child, point
+        self.add(f"{name}_end", "fixed", link, end - origin)
+        self.add(f"{name}_seat", "fixed", on[0], end - on[1])
+        self.loops.append([f"{name}_end", f"{name}_seat"])
+        self.kinds.append(kind)
+
+    def add(self, name: str, kind: str, parent: str, xyz: Array, axis: Array | None = None) -> None:
+        """Add a link and the joint that carries it."""
+        self.links.append(f'<link name="{name}"/>')
+        moving = ""
+        if axis is not None:
+            words = " ".join(repr(float(x)) for x in axis)
+            moving = (
+                f'<axis xyz="{words}"/><limit lower="-0.3" upper="0.5" effort="1" velocity="1"/>'
+            )
+        words = " ".join(repr(float(x)) for x in xyz)
+        self.joints.append(
+            f'<joint name="j_{name}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{name}"/><origin xyz="{words}"/>{moving}</joint>'
+        )
+
+    def write(self, folder: Path, *, block: bool = True, driven: bool = True) -> Path:
+        """Write the files, with or without a block legcal, and with motors if they are driven."""
+        document: dict[str, object] = {
+            "closed_loop": self.loops, "type": self.kinds,
+            "name_mot": (self.motors or list(self.legs.values())) if driven else [],
+        }  # fmt: skip
+        if block:
+            document["legcal"] = {
+                "version": 1, "base": "base", "platform": "platform", "platform_joint": "free",
+                "home": {"xyz": [0, 0, HEIGHT], "quat_xyzw": [0, 0, 0, 1]}, "legs": self.legs,
+            }  # fmt: skip
+        text = f'<robot name="r">{"".join(self.links)}{"".join(self.joints)}</robot>'
+        (folder / "machine.urdf").write_text(text)
+        (folder / "machine.yaml").write_text(yaml.safe_dump(document))
+        return folder / "machine.yaml"
+
+
+def _around(j: int, radius: float, height: float) -> tuple[Array, Array]:
+    """Return a point of three around z, and the tangent there."""
+    turn = Rotation.from_euler("z", 120.0 * j, degrees=True)
+    return turn.apply([radius, 0.0, height]), turn.apply([0.0, 1.0, 0.0])
+
+
+def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
+    """Return the universal joint of a rod."""
+    inner = np.cross(tangent, end - at)
+    return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
+
+
+def _delta(*, parallelograms: bool, elbows: int = 1) -> Drawing:
+    drawing = Drawing()
+    for j in range(3):
+        (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
+        end = _around(j, 0.05, HEIGHT)[0]
+        if not parallelograms:
+            serial: list[Joint] = [("revolute", 0.9 * elbow, axis)] * (elbows - 1)
+            joints = [("revolute", pivot, axis), *serial, *_rod(elbow, end, axis)]
+            drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=end, kind="3d")
+            drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
+            continue
+        root = "base"
+        for i in range(elbows - 1):
+            drawing.add(f"lower{j}_{i}", "revolute", root, -0.05 * Z, axis)
+            root = f"lower{j}_{i}"
+            drawing.motors.append(f"j_{root}")
+        drawing.add(f"arm{j}", "revolute", root, pivot + 0.05 * (elbows - 1) * Z, axis)
+        drawing.motors.append(f"j_arm{j}")
+        drawing.legs[f"leg{j}"] = f"j_arm{j}"
+        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+            rod = _rod(elbow + out, end + out, axis)
+            drawing.chain(f"rod{j}{k}", f"arm{j}", pivot, rod, end=end + out, kind="3d")
+    return drawing
+
+
+def _couplers() -> Drawing:
+    """Return a Delta whose parallelograms end on bars that turn on the platform."""
+    drawing = Drawing()
+    for j in range(3):
+        (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
+        end = _around(j, 0.05, HEIGHT)[0]
+        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        drawing.add(f"bar{j}", "revolute", "platform", end - HEIGHT * Z, axis)
+        drawing.motors.append(f"j_arm{j}")
+        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+            on = f"bar{j}", end
+            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
+            drawing.legs[name] = f"j_{name}_0"
+    return drawing
+
+
+def _bars(joint: str, n_bars: int) -> Drawing:
+    """Return four arms whose rods end on the platform, or on bars that a joint connects to it.
+
+    With two hinges they are those of an H4, with one guide those of an I4.
+    """
+    drawing = Drawing()
+    for i in range(n_bars):
+        drawing.add(f"bar{i}", joint, "platform", np.array([0.0, 0.1 * i - 0.05, 0.0]), Z)
+    for j in range(4):
+        turn = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True)
+        pivot, elbow, end = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
+        axis = turn.apply([0.0, 1.0, 0.0])
+        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        drawing.motors.append(f"j_arm{j}")
+        i = j // 2
+        on = (f"bar{i}", np.array([0.0, 0.1 * i - 0.05, HEIGHT])) if i < n_bars else None
+        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+            at = ("platform", HEIGHT * Z) if on is None else on
+            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
+            drawing.legs[name] = f"j_{name}_0"
+    return drawing
+
+
+def _prs() -> Drawing:
+    drawing = Drawing()
+    for j in range(3):
+        (foot, axis), (end, _) = _around(j, 0.3, 0.0), _around(j, 0.2, HEIGHT)
+        joints = [("prismatic", foot, Z), ("revolute", foot, axis)]
+        drawing.chain(f"leg{j}", "base", np.zeros(3), joints, end=end, kind="3d")
+        drawing.legs[f"leg{j}"] = f"j_leg{j}_0"
+    return drawing
+
+
+def _planar_arms(n_arms: int) -> Drawing:
+    drawing = Drawing()
+    for j in range(n_arms):
+        points = [_around(j, radius, 0.0)[0] for radius in (0.3, 0.35, 0.1)]
+        joints: list[Joint] = [("revolute", point, Z) for point in points]
+        drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=points[-1], kind="6d")
+        drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
+    return drawing
+
+
+def _hinges() -> Drawing:
+    drawing = Drawing()
+    for j in range(3):
+        point, axis = _around(j, 0.3, HEIGHT)
+        hinge: list[Joint] = [("revolute", point, axis)]
+        drawing.chain(f"leg{j}", "base", np.zeros(3), hinge, end=point, kind="6d")
+        drawing.legs[f"leg{j}"] = f"j_leg{j}_0"
+    return drawing
+
+
+def _with_leg(machine: MachineSpec, j: int, **changes: object) -> MachineSpec:
+    leg = replace(machine.legs[j], **changes)  # type: ignore[arg-type]
+    return replace(machine, legs=(*machine.legs[:j], leg, *machine.legs[j + 1 :]))
+
+
+def missing(types: str, by: float) -> MachineSpec:
+    """Return a machine whose second slider does not point at its joint, by so much [m]."""
+    machine = planar() if types == "RR" else of_types([types] * 3)
+    leg = machine.legs[1]
+    across = np.cross(leg.u, np.array([0.3, 0.4, 0.5]) if leg.base_axis is None else leg.base_axis)
+    moved = leg.B_home + by * across / np.linalg.norm(across)
+    return _with_leg(machine, 1, B_home=moved, slides=leg.u)
+
+
+def _axis_off(types: str, angle: float) -> MachineSpec:
+    """Return a machine whose first leg has a base axis (of R) or inner axis (of U) off square."""
+    machine = of_types([types] * 3)
+    leg = machine.legs[0]
+    assert leg.base_axis is not None
+    if types == "RS":
+        return _with_leg(
+            machine, 0, base_axis=np.cos(angle) * leg.base_axis + np.sin(angle) * leg.u
+        )
+    inner = np.cross(leg.base_axis, leg.u)
+    inner /= np.linalg.norm(inner)
+    towards = leg.base_axis if types == "US" else np.cross(leg.base_axis, inner)
+    return _with_leg(machine, 0, base_inner=np.cos(angle) * inner + np.sin(angle) * towards)
+
+
+def scaled(machine: MachineSpec, scale: float) -> MachineSpec:
+    legs = tuple(replace(leg, A=scale * leg.A, B_home=scale * leg.B_home) for leg in machine.legs)
+    home = RigidTransform.from_components(
+        scale * np.asarray(machine.home.translation), machine.home.rotation
+    )
+    return MachineSpec(legs, home)
+
+
+Machine = Callable[[Path], Path]  # writes machine.yaml and machine.urdf, and returns the former
+
+
+def _drawn(drawing: Callable[[], Drawing], *, block: bool = True, driven: bool = True) -> Machine:
+    return lambda folder: drawing().write(folder, block=block, driven=driven)
+
+
+def _specified(machine: Callable[[], MachineSpec], layout: Layout | None = None) -> Machine:
+    return lambda folder: write_machine(folder, machine(), layout or Layout())
+
+
+def _replaced(written: Machine, *changes: tuple[str, str], yaml: bool = False) -> Machine:
+    """Return a machine in one of whose files something is replaced."""
+
+    def write(folder: Path) -> Path:
+        path = written(folder)
+        target = path if yaml else path.with_suffix(".urdf")
+        text = target.read_text()
+        for old, new in changes:
+            assert old in text, old
+            text = text.replace(old, new, 1)
+        target.write_text(text)
+        return path
+
+    return write
+
+
+def _h4_named_beside_its_middle() -> Machine:
+    free = '<joint name="free" type="floating"><parent link="base"/>'
+    beside = _replaced(
+        _drawn(partial(_bars, "revolute", 2)),
+        (f'{free}<child link="platform"/></joint>', ""),
+        (
+            '<parent link="platform"/><child link="bar1"/>',
+            '<parent link="bar1"/><child link="platform"/>',
+        ),
+        ("</robot>", f'{free}<child link="bar1"/></joint></robot>'),
+    )
+    return _replaced(beside, ("platform: platform\n", "platform: bar1\n"), yaml=True)
+
+
+def serial_arm(folder: Path) -> Path:
+    """Write the URDF of one planar arm, with nothing that says where it is closed."""
+    path = _planar_arms(1).write(folder)
+    path.unlink()
+    return path
+
+
+def _one_loop(folder: Path) -> Path:
+    """Write one closed chain of five hinges."""
+    links = "".join(f'<link name="{name}"/>' for name in ("base", *"abcde", "end"))
+    joints = "".join(
+        f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="0.{i + 1} 0.{i * i} 0"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        for i, (parent, child) in enumerate(pairwise(["base", *"abcde"]))
+    )
+    joints += '<joint name="seat" type="fixed"><parent link="e"/><child link="end"/></joint>'
+    path = folder / "machine.yaml"
+    path.with_suffix(".urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    path.write_text("closed_loop: [[end, base]]\ntype: ['6d']\nname_mot: []\n")
+    return path
+
+
+def _open_across_its_plane(virtual: str) -> Machine:
+    def write(folder: Path) -> Path:
+        path = write_machine(folder, planar(), Layout(virtual=virtual))
+        urdf = path.with_suffix(".urdf")
+        head, tail = urdf.read_text().split('<child link="leg2_seat"/><origin xyz="')
+        xyz, rest = tail.split('"', 1)
+        x, y, z = xyz.split()
+        moved = f"{x} {y} {float(z) + 1e-3}"
+        urdf.write_text(f'{head}<child link="leg2_seat"/><origin xyz="{moved}"{rest}')
+        return path
+
+    return write
+
+
+def _in_another_plane(folder: Path) -> Path:
+    path = write_machine(folder, planar((0.0, 0.6, 0.8)), Layout(virtual="planar"))
+    urdf = path.with_suffix(".urdf")
+    text = urdf.read_text()
+    start = text.index("<origin", text.index('name="platform_free"'))
+    urdf.write_text(text[:start] + '<origin xyz="0 0 0"' + text[text.index("/>", start) :])
+    return path
+
+
+PLATE = (
+    '<link name="plate"/><joint name="p" type="floating"><parent link="base"/>'
+    '<child link="plate"/></joint></robot>'
+)
+TRIPOD = partial(of_types, ["US"] * 3)
+
+
+def _carries_another_link() -> Machine:
+    written = _replaced(_specified(TRIPOD), ("</robot>", PLATE))
+    return _replaced(written, ("platform_joint: platform_free", "platform_joint: p"), yaml=True)
+
+
+def _carried_by_a_leg() -> Machine:
+    extra = PLATE.replace("plate", "platform").replace('<link name="platform"/>', "")
+    extra = extra.replace('<parent link="base"/>', '<parent link="leg1_a1_link"/>')
+    below = '<parent link="base"/><child link="{}"/>'
+    written = _replaced(
+        _specified(TRIPOD),
+        ('name="platform_free" type="floating"', 'name="free" type="fixed"'),
+        (below.format("platform"), below.format("spare")),
+        ("</robot>", f'<link name="spare"/>{extra}'),
+    )
+    return _replaced(written, ("platform_joint: platform_free", "platform_joint: p"), yaml=True)
+
+
+def _two_mechanisms(*, block: bool) -> Machine:
+    def write(folder: Path) -> Path:
+        path = write_machine(folder, TRIPOD(), Layout())
+        urdf = path.with_suffix(".urdf")
+        text = urdf.read_text()
+        body = text[text.index("  <link") : text.index("</robot>")]
+        second = body.replace('"leg', '"other').replace('"platform', '"second')
+        second = second.replace('  <link name="base"></link>\n', "")
+        urdf.write_text(text.replace("</robot>", f"{second}</robot>"))
+        document = yaml.safe_load(path.read_text())
+        for pair in list(document["closed_loop"]):
+            document["closed_loop"].append([name.replace("leg", "other") for name in pair])
+            document["type"].append("3d")
+        if not block:
+            del document["legcal"]
+        path.write_text(yaml.safe_dump(document))
+        return path
+
+    return write
+
+
+def _spherical_in_two_points(folder: Path) -> Path:
+    path = folder / "machine.yaml"
+    text = (ROOT / "models/6-sps.yaml").read_text()
+    path.write_text(text.replace("../urdf/6-sps", "machine"))
+    old = '<child link="leg1_a3_link"/><origin xyz="0.0 0.0 0.0"'
+    text = (ROOT / "urdf/6-sps.urdf").read_text()
+    assert old in text
+    moved = old.replace("0.0 0.0 0.0", "0.0 0.004 0.0")
+    path.with_suffix(".urdf").write_text(text.replace(old, moved))
+    return path
+
+
+def _on_one_line() -> MachineSpec:
+    machine = of_types(["US"] * 6)
+    legs = [replace(leg, A=np.array([0.1 * j, 0.0, 0.0])) for j, leg in enumerate(machine.legs[:3])]
+    return replace(machine, legs=(*legs, *machine.legs[3:]))
+
+
+ARMS = ("no slider and 3 joints in different places", "the joint at A moves")
+RODS = ("carries 2 rods on the moving link 'arm0'", "the joints at A move")
+LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
+SEVERAL = ("a platform of several bodies", "H4 or I4", "legs end on link 'bar", "joint 'j_bar0'")
+OFF_AXIS = "from perpendicular to the leg"
+H4 = partial(_bars, "revolute", 2)
+RODS_ON_ARMS = partial(_delta, parallelograms=False)
+PARALLELOGRAMS = partial(_delta, parallelograms=True)
+
+OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
+    "undriven-delta-rods": (_drawn(RODS_ON_ARMS, driven=False), ARMS),
+    "undriven-delta-rods-bare": (_drawn(RODS_ON_ARMS, block=False, driven=False), ARMS),
+    "undriven-delta": (_drawn(PARALLELOGRAMS, driven=False), RODS),
+    "undriven-delta-bare": (_drawn(PARALLELOGRAMS, block=False, driven=False), RODS),
+    "undriven-prs": (
+        _drawn(_prs, driven=False),
+        ("the slider 'j_leg0_0' on the base itself", "the joint at A moves"),
+    ),
+    "undriven-five-bar": (_drawn(partial(_planar_arms, 2), driven=False), ARMS),
+    "undriven-3-rrr": (_drawn(partial(_planar_arms, 3), driven=False), ARMS),
+    "undriven-hinges": (_drawn(_hinges, driven=False), ("directly between base and platform",)),
+    "h4": (_drawn(H4), SEVERAL),
+    "h4-bare": (_drawn(H4, block=False), SEVERAL),
+    "h4-beside": (_h4_named_beside_its_middle(), ("legs end on link 'bar0'",)),
+    "i4": (_drawn(partial(_bars, "prismatic", 1)), SEVERAL),
+    "delta-of-four": (
+        _drawn(partial(_bars, "revolute", 0)),
+        ("overconstrained (1 of the 4", "joints at A that move"),
+    ),
+    "couplers": (_drawn(_couplers), LOOP),
+    "arm-on-arm": (
+        _drawn(partial(_delta, parallelograms=False, elbows=2)),
+        ("the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of"),
+    ),
+    "parallelograms-on-arms": (
+        _drawn(partial(_delta, parallelograms=True, elbows=2)),
+        ("the motor 'j_arm0' of 2 rods", "'j_lower0_0'", "arms on arms"),
+    ),
+    "3-rrr": (
+        _drawn(partial(_planar_arms, 3)),
+        ("found a planar machine whose joints at A move",),
+    ),
+    "one-loop": (_one_loop, ("one closed chain in which no link is a platform on legs",)),
+    **{
+        f"slider-off-{types}": (
+            _specified(partial(missing, types, 0.002)),
+            ("'leg2_slider'", "by 2 mm", "needed at most 0.01"),
+        )
+        for types in ("US", "RS", "UU", "RR")
+    },
+    **{
+        f"slider-off-{types}-{scale:g}": (
+            _specified(lambda t=types, s=scale: scaled(missing(t, 4e-5), s)),  # type: ignore[misc]
+            (f"by {0.04 * scale:.4g} mm",),
+        )
+        for types, scale in (("US", 1.0), ("RS", 0.1), ("UU", 25.0))
+    },
+    "r-off": (_specified(lambda: _axis_off("RS", 0.1)), ("'leg1_a1'", f"5.73 deg {OFF_AXIS}")),
+    "inner-axis-off": (
+        _specified(lambda: _axis_off("UU", 0.1)),
+        ("'leg1_a2'", OFF_AXIS, "inner axis of a U"),
+    ),
+    "u-off": (_specified(lambda: _axis_off("US", 0.02)), ("'leg1_a1' and 'leg1_a2'", "1.146 deg")),
+    "one-leg": (_specified(lambda: of_types(["US"])), ("1 leg in space", "at least 3")),
+    "two-legs": (_specified(lambda: of_types(["US"] * 2)), ("2 legs in space", "at least 3")),
+    "one-leg-rr": (_specified(lambda: of_types(["RR"])), ("at least 3",)),
+    "one-leg-in-a-plane": (
+        _specified(lambda: planar(kinds=("actuated",))),
+        ("1 leg in a plane", "at least 2"),
+    ),
+    "too-many": (
+        _specified(lambda: replace(TRIPOD(), legs=TRIPOD().legs * 11)),
+        ("33 legs", "at most 32"),
+    ),
+    "fixed-in-a-plane": (
+        _specified(lambda: _with_leg(planar(), 2, type="R", platform_axis=None)),
+        ("'leg3_slider'", "fixed to the platform"),
+    ),
+    "s-in-two-points": (_spherical_in_two_points, ("meet in two points 4 mm apart",)),
+    **{
+        f"spin-{types}": (
+            _specified(partial(of_types, [types] * 3), Layout((LegLayout(spin="base"),))),
+            ("'leg1_spin' along the leg, and no S joint",),
+        )
+        for types in ("RR", "R")
+    },
+    "turning-motor": (
+        _replaced(_specified(planar), ("- leg2_slider\n", "- leg2_a1\n"), yaml=True),
+        ("found the slider 'leg2_slider' beyond the motor 'leg2_a1' on the base",),
+    ),
+    **{
+        f"open-plane-{virtual}": (
+            _open_across_its_plane(virtual),
+            ("'leg2_end' and 'leg2_seat' 1 mm and 0.000 deg apart",),
+        )
+        for virtual in ("floating", "planar")
+    },
+    "another-plane": (_in_another_plane, ("from the plane in which the legs move",)),
+    "another-link": (_carries_another_link(), ("floating joint 'platform_free' inside it",)),
+    "carried-by-a-leg": (
+        _carried_by_a_leg(),
+        ("found it between the parent 'leg1_a1_link'",),
+    ),
+    "two-mechanisms": (
+        _two_mechanisms(block=True),
+        ("second mechanism on the base, with link 'second'",),
+    ),
+    "two-mechanisms-bare": (_two_mechanisms(block=False), ("found 2 mechanisms",)),
+    **{
+        f"scaled-{scale:g}{'' if home else '-no-home'}": (
+            _specified(partial(scaled, of_types(["US"] * 6), scale), Layout(home=home)),
+            ("write all lengths",),
+        )
+        for scale, home in ((1e3, True), (1e3, False), (1e-4, True))
+    },
+    "on-one-line": (_specified(_on_one_line), ("base joints of leg1, leg2, leg3",)),
+}
+"""What each of them must be told: the reason, the joint or leg, and the amount."""
