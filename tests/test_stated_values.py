@@ -212,8 +212,8 @@ def test_two_priors_that_contradict_each_other_are_refused() -> None:
 @pytest.mark.parametrize(
     ("values", "found"),
     [
-        ({"leg1.offset": 0.0042}, "they say about {true:.3g}"),
-        pytest.param({"leg1.offset": -0.15}, "they say about {true:.3g}", marks=pytest.mark.slow),
+        ({"leg1.offset": 0.0042}, "measured about {true:.3g}"),
+        pytest.param({"leg1.offset": -0.15}, "measured about {true:.3g}", marks=pytest.mark.slow),
         ({"leg2.offset": 0.0, "leg3.base.x": 2e-3, "leg4.platform.y": 0.0}, "leg3.base.x"),
     ],
 )
@@ -233,7 +233,7 @@ def test_wrong_fixed_values_are_refused_with_those_of_the_measurements(
     ("choices", "found"),
     [
         (fixed_at({"leg1.radius.leg1_tube": 1.2 * 0.0125}), r"fixed value of leg1\.radius\.leg1_"),
-        (fixed_at({"c1.fx": 1303.0}), r"fixed value of c1\.fx .*they say about 1290 px"),
+        (fixed_at({"c1.fx": 1303.0}), r"fixed value of c1\.fx .*measured about 1290 px"),
         (Choices(priors={"leg1.offset": Prior(0.5, 1e-4)}), r"prior of leg1\.offset contradicts"),
     ],
     ids=["radius", "intrinsic", "prior"],
@@ -285,7 +285,7 @@ def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -
     found = fitted(replace(noisy, outlines=outlines), choices)
     (note,) = found.notes
     assert f"{2 * len(own) // 3} of {len(own)} of leg.2.4" in note
-    assert "what was stated of leg.2.4.offset" in note
+    assert "the stated values of leg.2.4.offset" in note
     assert not {"leg.3", "leg.2.offset"} & set(note.rstrip(".").replace(",", "").split())
 
 
