@@ -187,7 +187,7 @@ def test_the_block_of_a_dataset_says_what_a_call_can_say(folder: Folder) -> None
 def test_a_run_that_says_the_same_needs_no_note(folder: Folder) -> None:
     block = {"priors": {"leg1.offset": "0.35±0.0001"}, "fixed": ["leg2.offset"]}
     assert chosen(folder, block, priors=["leg1.offset=350±0.1mm"]).notes == ()
-    assert "of the dataset for leg2.offset." in chosen(folder, block, free=["*.offset"]).notes[0]
+    assert "leg1.offset, leg2.offset." in chosen(folder, block, free=["*.offset"]).notes[0]
 
 
 def test_a_call_is_refused_before_any_work(folder: Folder, tmp_path: Path) -> None:

@@ -388,8 +388,8 @@ def _no_match(override: Override, known: KnownParameters) -> str:
     ]
     if others:
         return (
-            f"{override.where} could not be used: {others[0]} is not a parameter but "
-            f"{known.others[others[0]]}; leave it out."
+            f"{override.where} could not be used: found {others[0]}, {known.others[others[0]]}, "
+            "needed a parameter; leave it out."
         )
     is_pattern = not set(override.name).isdisjoint("*?[")
     found = "a pattern that no name matches" if is_pattern else "an unknown name"
