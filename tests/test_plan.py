@@ -628,7 +628,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     ):
         refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
-    refused(NotVisible, "wider view, correct the focal length", camera=telephoto)
+    refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
     refused(UsageError, "found 1 place for 2", places=away, cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=around(1.4))  # fmt: skip
