@@ -242,7 +242,7 @@ def test_a_stopped_search_says_that_it_missed_its_target() -> None:
         stop=lambda: True,
     )
     assert found.error is not None
-    missed = f"reach {1e3 * found.error.mean_displacement:.3f} mm, not 0.001 mm"
+    missed = f"error is {1e3 * found.error.mean_displacement:.3f} mm, not 0.001 mm"
     assert any(missed in note for note in found.notes)
 
 
