@@ -398,7 +398,7 @@ def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> N
     outlines = shared_errors(session, rng, 0.0, 0.0, many=0.4)
     found = refine(session.legs, noisy_readings(session, rng), outlines, disturbed_start(session))
     (note,) = found.notes
-    assert "inwards or outwards together by 0." in note
+    assert "common inward or outward bias of 0." in note
     assert found.quality.shared_px["bias of many edges"] == pytest.approx(0.4, rel=0.6)
 
 
@@ -573,7 +573,7 @@ def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:
 def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None:
     clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
     assert clear.startswith(
-        "The gamma of the camera of view c1 is not given: found 2.10 +- 0.43 by"
+        "The gamma of the camera of view c1 is not given: estimated 2.10 +- 0.43 from"
     )
     vague = str(EstimatedGamma(tuple(f"c{k}" for k in range(8)), 1.2, 0.4, 1.0))
     assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
