@@ -185,7 +185,7 @@ def test_a_stated_length_that_is_another_one_is_doubted(factor: float) -> None:
     found = refine(
         session.legs, session.measurements, session.outlines, session.start, choices=choices
     )
-    doubts = [note for note in found.notes if f"{rod.name}.length says how large" in note]
+    doubts = [note for note in found.notes if f"the scale comes from {rod.name}.length" in note]
     assert len(doubts) == (factor > 1.0)
     assert all("1.5 % longer than the model's" in note for note in doubts)
 
