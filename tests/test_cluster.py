@@ -207,8 +207,9 @@ def test_a_worker_with_another_legcal_or_none_is_refused(tmp_path: Path) -> None
 
 
 def _answer(page: socket.socket) -> None:
-    """Answer one connection as a web server does that is asked something else."""
-    with page.accept()[0] as connection:
+    """Answer one connection, if it comes, as a web server does that is asked something else."""
+    page.settimeout(10.0)
+    with suppress(TimeoutError), page.accept()[0] as connection:
         connection.recv(4096)
         connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n")
 
