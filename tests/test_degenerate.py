@@ -199,9 +199,6 @@ def test_views_that_share_no_leg_are_joined_by_the_readings(halves: Path, tmp_pa
     before, after = errors(calibration, halves, tmp_path / "out")
     assert calibration.verdict.trustworthy
     assert after < 0.1 * before
-    assert "share" in calibration.steps.failure or "together" in calibration.steps.failure
-    assert "board" in calibration.steps.failure
-    assert "The four steps alone do not determine" in notes(calibration)
 
 
 def test_a_leg_that_no_view_shows_is_found_from_its_readings(

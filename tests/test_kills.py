@@ -65,5 +65,5 @@ def _removed() -> Iterator[None]:
 @pytest.mark.system
 @pytest.mark.usefixtures("_removed")
 def test_a_kill_by_each_signal_leaves_no_half_result() -> None:
-    kills = drawn_kills(12, 1)  # of each command, and four of each signal
+    kills = drawn_kills(6, 1)  # of each command, and two of each signal
     assert [f"{kill}: {fault}" for kill in kills for fault in faults_of(kill)] == []

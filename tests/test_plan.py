@@ -349,7 +349,8 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
         of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
         planned |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
         row += len(view.poses.poses)
-    assert len(keys & planned) >= 0.75 * max(len(keys), len(planned))
+    assert keys <= planned
+    assert len(keys) >= 0.65 * len(planned)
     found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
     stated = dict(
         zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
