@@ -342,7 +342,7 @@ def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> No
     found = refine(session.legs, wrong, session.outlines, session.start)
     assert found.quality.redundant_readings is not None
     assert any(
-        f"scale of {session.legs.names[2]} that is -1 % off explains most" in why
+        f"scale error of {session.legs.names[2]} of -1 % explains most" in why
         for why in found.quality.redundant_readings.doubts
     )
 
