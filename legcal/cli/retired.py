@@ -40,8 +40,8 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--list": _ONE_MACHINE,
         "--earlier": _ONE_MACHINE,
         "--resume": _ONE_MACHINE,
-        "--transformation": "the four steps solve (18) as printed, whatever the criteria; leave "
-        "it out",
+        "--transformation": "--criteria chooses how the four steps solve (18): literal as "
+        "printed; leave it out",
     },
     "init": {
         "--servo": "write centre_us and us_per_deg of each servo into legcal.motors of the model",
@@ -68,8 +68,8 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "legcal.plan(camera=FILE)",
         "--places": "say with --bounds where cameras may stand, or in Python "
         "legcal.plan(places=[...])",
-        "--model-error": "a plan allows for 2 mm, or in Python "
-        "legcal.plan(setting=legcal.planning.places.Setting(length=METRES))",
+        "--model-error": "a plan allows for 0.5 % of a leg, or in Python "
+        "legcal.plan(setting=legcal.planning.places.Setting(shift=METRES, length=METRES))",
         "--encoder-sigma": "a plan takes the encoder_sigma of --given DATASET, or in Python "
         "legcal.plan(encoder_sigma=SIGMA)",
         "--force": "remove the earlier session, or give another folder",

@@ -169,9 +169,7 @@ class Blocks:
 
     def kept(self) -> BoolArray:
         """Return which blocks lie on the lines of their edges, (n,)."""
-        nothing = [np.zeros(n, dtype=np.bool_) for n in np.diff(self.bounds)]
-        lines = zip(self.lines, nothing, strict=True)
-        return np.concatenate([none if line is None else line.kept for line, none in lines])
+        return np.asarray(self.shares() > 0.0)
 
     def shares(self) -> Array:
         """Return how much blocks count that lie on the lines of their edges, 0 of others, (n,)."""
