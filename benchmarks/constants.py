@@ -24,12 +24,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
-import numpy as np
 import yaml
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from csv_rows import read_rows, write_rows
+from hexapod_example import write_halved_camera
 
 from legcal.machine.loader import load_mechanism
 
@@ -128,15 +128,7 @@ def small(source: Path, folder: Path, *, half: bool) -> Path:
         cameras.add(view["camera"])
     (folder / "dataset.yaml").write_text(yaml.safe_dump(entry, sort_keys=False), encoding="utf-8")
     for name in cameras if half else ():
-        camera = yaml.safe_load((folder / name).read_text(encoding="utf-8"))
-        camera["image_width"] //= 2
-        camera["image_height"] //= 2
-        K = np.array(camera["camera_matrix"]["data"]).reshape(3, 3)
-        K[:2] *= 0.5
-        K[:2, 2] -= 0.25
-        camera["camera_matrix"]["data"] = K.ravel().tolist()
-        camera.pop("projection_matrix", None)
-        (folder / name).write_text(yaml.safe_dump(camera), encoding="utf-8")
+        write_halved_camera(folder / name, folder / name)
     return folder
 
 

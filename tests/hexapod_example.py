@@ -87,6 +87,19 @@ class Spoiled:
         return self.path
 
 
+def write_halved_camera(source: Path, target: Path) -> None:
+    """Write the camera of a file for images at half their size."""
+    camera = yaml.safe_load(source.read_text(encoding="utf-8"))
+    camera["image_width"] //= 2
+    camera["image_height"] //= 2
+    K = np.array(camera["camera_matrix"]["data"]).reshape(3, 3)
+    K[:2] *= 0.5
+    K[:2, 2] -= 0.25
+    camera["camera_matrix"]["data"] = K.ravel().tolist()
+    camera.pop("projection_matrix", None)
+    target.write_text(yaml.safe_dump(camera), encoding="utf-8")
+
+
 def spoiled(path: Path, n: int, views: Sequence[str] = ("c1", "c2", "c3")) -> Spoiled:
     """Copy the first images of some views of the example at half their size."""
     shutil.copytree(HEXAPOD / "models", path / "models")
@@ -99,15 +112,7 @@ def spoiled(path: Path, n: int, views: Sequence[str] = ("c1", "c2", "c3")) -> Sp
         row["image"] = str(Path(row["image"]).with_suffix(".png"))
         small = cv2.resize(np.asarray(picture), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         assert cv2.imwrite(str(path / row["image"]), small)
-    camera = yaml.safe_load((HEXAPOD / "camera_info.yaml").read_text())
-    camera["image_width"] //= 2
-    camera["image_height"] //= 2
-    K = np.array(camera["camera_matrix"]["data"]).reshape(3, 3)
-    K[:2] *= 0.5
-    K[:2, 2] -= 0.25
-    camera["camera_matrix"]["data"] = K.ravel().tolist()
-    camera.pop("projection_matrix", None)
-    (path / "camera_info.yaml").write_text(yaml.safe_dump(camera))
+    write_halved_camera(HEXAPOD / "camera_info.yaml", path / "camera_info.yaml")
     entry = yaml.safe_load((HEXAPOD / "dataset.yaml").read_text())
     entry["views"] = {name: entry["views"][name] for name in views}
     return Spoiled(path, rows, entry)

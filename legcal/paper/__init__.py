@@ -15,5 +15,6 @@ In go a :class:`NominalMachine` (where the steps start), the leg axes that the i
 =====================  =======  ==================================================================
 
 Criteria choose the weights: all one (``literal``, as printed), or those of the covariances of the
-axes, with which (18) locates joints and offsets as well. Errors of the platform (20) are those of the machine room's ``pose_differences``.
+axes, with which (18) locates joints and offsets as well. Errors of the platform (20) are those of
+the machine room's ``pose_differences``.
 """
