@@ -11,7 +11,7 @@ from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types, with_round_arms
+from machines import MACHINES, with_round_arms
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -357,18 +357,6 @@ def intrinsics_sigma(owners: list[str], analysis: Analysis) -> Array:
     return np.array(sigma, dtype=np.float64)
 
 
-def test_intrinsics_are_known_less_by_fewer_images_and_where_radii_are_larger() -> None:
-    """A radius is known relatively; cameras of their own share none of what they show."""
-    one, three = (intrinsics_sigma(o, example()) for o in (["c"] * 3, ["a", "b", "c"]))
-    assert np.all((one > 0.1) & (one < 3.0))
-    assert not np.any(three <= one)
-    scaled = replace(example().predicted, radius=2.0 * example().predicted.radius)
-    wide, narrow = Analysis(scaled), example().images[:, :, 1::2]
-    depth = wide.images[:, :, 1::2][narrow != 0.0] / narrow[narrow != 0.0]
-    np.testing.assert_allclose(depth, 2.0)
-    np.testing.assert_array_less(intrinsics_sigma(["c"] * 3, wide), one)
-
-
 def test_a_dataset_gives_its_own_readings_cameras_and_legs() -> None:
     dataset = load_dataset(HEXAPOD, check_images=False)
     session, m = example().predicted, dataset.measurements
@@ -415,23 +403,6 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
 
 
-def test_planned_cameras_stand_outside_and_no_two_in_one_place() -> None:
-    machine = legcal.load_mechanism("hexapod")
-    views = [(0, 1, 2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5), (3,)]
-    session = planned_observations(machine, views, 3)
-    apart = np.linalg.norm(session.camera[:, None] - session.camera, axis=2)
-    assert apart[~np.eye(5, dtype=bool)].min() > 0.01
-    points = np.concatenate([session.A, (session.arm + session.t[:, None]).reshape(-1, 3)])
-    reach = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
-    away = session.camera - points.mean(axis=0)
-    assert np.linalg.norm(away, axis=1).min() > 2.0 * reach
-    assert away[4] @ (session.A[3] - session.A.mean(axis=0)) > 0.0  # that of leg 4 on its side
-    planar = planned_observations(legcal.load_mechanism("3-rpr"), [range(3)] * 3, 3)
-    away = planar.camera - planar.A.mean(axis=0)  # from along the normal, tilted
-    slant = away[:, 2] / np.linalg.norm(away, axis=1)
-    assert np.all((slant > 0.7) & (slant < 0.99))
-
-
 def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -446,11 +417,3 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
     )
     assert len(planned_observations(machine, [range(6)], 60).t) == 60
-
-
-def test_more_motors_than_freedoms_are_followed(tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = tmp_path_factory.mktemp("seven")
-    machine = legcal.load_mechanism(write_machine(folder, of_types(["US"] * 7), Layout()))
-    assert (machine.mobility, len(machine.motors)) == (6, 7)
-    found = legcal.identifiability(machine, [machine.leg_names] * 2)
-    assert (found.full.rank, found.full.of) == (37, 37)

@@ -1,8 +1,6 @@
 """The Monte Carlo runner: the same results however it is run, and nothing lost."""
 
 import json
-import os
-import resource
 import signal
 import subprocess
 import sys
@@ -26,14 +24,6 @@ def _lines(folder: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
 
-@pytest.mark.system
-def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() -> None:
-    study = Draws(seconds=0.002, fails_above=0.5)
-    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2)]
-    assert results[0] == results[1]
-    assert 0 < results[0]["n"] < 40
-
-
 def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_for(
     tmp_path: Path,
 ) -> None:
@@ -50,18 +40,6 @@ def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_fo
     (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join([*begun[:4], *begun[6:]]))
     assert run_study(Draws(), 10, output=tmp_path).document() == few
     assert sorted(_lines(tmp_path)) == sorted(begun)
-
-
-def test_failed_runs_are_recorded_and_counted(tmp_path: Path) -> None:
-    study = Draws(fails_above=0.5)
-    result = run_study(study, 40, output=tmp_path / "out")
-    document = result.document()
-    assert document["failures"] == {"DidNotConverge": 40 - document["n"]}
-    assert 0 < document["n"] < 40
-    failed = [line for line in _lines(tmp_path / "out") if b"failure" in line]
-    assert len(failed) == 40 - document["n"]
-    again = run_study(study, 40, output=tmp_path / "out")
-    assert again.document() == document
 
 
 def test_a_study_of_failures_only_says_why() -> None:
@@ -84,40 +62,6 @@ def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
     with pytest.raises(OutOfResources, match="one of the processes was ended from outside"):
         run_study(Deadly(), 20, workers=2, output=tmp_path)
     assert _lines(tmp_path) == before
-
-
-@contextmanager
-def _files_no_larger_than(size: int) -> Iterator[None]:
-    """Let writing fail beyond a size, in the middle of a line, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-@pytest.mark.parametrize("size", [40, 700])
-def test_a_full_disk_is_told_and_the_study_goes_on_when_there_is_room(
-    tmp_path: Path, size: int
-) -> None:
-    with (
-        _files_no_larger_than(size),
-        pytest.raises(OutOfResources, match=r"could not be kept.*goes on from the runs"),
-    ):
-        run_study(Draws(), 100, output=tmp_path)
-    assert (tmp_path / CHECKPOINT_NAME).stat().st_size == size
-    assert run_study(Draws(), 100, output=tmp_path).document() == run_study(Draws(), 100).document()
-
-
-def test_figures_that_cannot_be_written_are_told_and_no_run_is_lost(tmp_path: Path) -> None:
-    run_study(Draws(), 1, output=tmp_path)
-    (tmp_path / "total.txt").unlink()
-    (tmp_path / "total.txt").mkdir()
-    (tmp_path / "total.txt" / "mine").touch()
-    with pytest.raises(UsageError, match=r"result of the study.*total.txt, which is a folder"):
-        run_study(Draws(), 3, output=tmp_path)
-    assert len(_lines(tmp_path)) == 4
 
 
 @pytest.mark.parametrize(
@@ -278,14 +222,3 @@ def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> No
     n_done = len(_lines(tmp_path))
     assert 20 <= n_done < 401
     assert run_study(Draws(), 400, output=tmp_path).document() == run_study(Draws(), 400).document()
-
-
-@pytest.mark.system
-def test_ctrl_c_stops_all_processes_without_a_word_of_theirs(tmp_path: Path) -> None:
-    with _running(tmp_path) as process:
-        os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=20.0)
-    tracebacks = [line for line in told.decode().splitlines() if line.startswith("Traceback")]
-    assert len(tracebacks) == 1  # that of the program itself, which lets the interrupt pass
-    assert told.decode().splitlines()[-1].startswith("KeyboardInterrupt")
-    assert len(_lines(tmp_path)) < 401
