@@ -24,7 +24,7 @@ from legcal.machine.family import description_of
 from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, joint_values, readings_at
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
 from legcal.machine.parameter_id import ARMS as ARM_KINDS
@@ -277,13 +277,6 @@ def delta_with(folder: Path, old: str, new: str) -> Path:
     return folder / "delta.yaml"
 
 
-def test_a_home_above_the_base_closes_in_the_mode_of_its_readings(tmp_path: Path) -> None:
-    machine = load_mechanism(delta_with(tmp_path, "- -0.374", "- 0.374"))
-    at_home = joint_values(machine, machine.home_configuration)
-    np.testing.assert_allclose(at_home, readings_at(machine, machine.home), atol=1e-9)
-    np.testing.assert_allclose(at_home, np.radians(-20.0), atol=1e-9)
-
-
 def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path: Path) -> None:
     seen = re.search(r'<link name="leg1_a3_link">.*', (ROOT / "urdf/delta.urdf").read_text())
     assert seen is not None
@@ -325,20 +318,6 @@ def test_what_files_of_motors_cannot_be(
     with pytest.raises(LegcalError) as caught:
         load_mechanism(delta_with(tmp_path, old, new))
     assert all(word in str(caught.value) for word in named), str(caught.value)
-
-
-@pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])
-def test_exported_robots_are_the_same_machine(to: str, suffix: str, tmp_path: Path) -> None:
-    machine = load_mechanism("delta")
-    export(Subject(machine, "delta"), to, tmp_path / f"delta.{suffix}")
-    back = load_mechanism(tmp_path / f"delta.{suffix}")
-    assert sorted(back.motor_names) == sorted(machine.motor_names)
-    q = dict(zip(machine.motor_names, np.radians([5.0, 40.0, 25.0]), strict=True))
-    poses = [
-        forward_kinematics(m, np.array([q[leg.prismatic or ""] for leg in m.legs]))
-        for m in (machine, back)
-    ]
-    np.testing.assert_allclose(poses[1].as_matrix(), poses[0].as_matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])

@@ -53,16 +53,6 @@ def test_commands_load_only_what_they_need(words: list[str], heavy: set[str], pr
     assert printed in done.stdout
 
 
-def test_inspect_prints_a_table_of_80_columns(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert run(monkeypatch, "inspect", "hexapod") == 0
-    out = capsys.readouterr().out
-    assert "SPU" in out
-    assert max(len(line) for line in out.splitlines()) <= 80
-
-
 def test_calibrate_prints_one_screen_and_all_parameters_with_verbose(
     example_run: Run,
     tmp_path: Path,
@@ -169,28 +159,6 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("simulate", "hexapod", "-o", "x", "--poses="), ("empty text", "--poses=")),
-        (
-            ("calibrate", "x", "--check", "y", "--criteria", "literal", "--holdout", "0.2"),
-            ("--criteria", "--holdout", "--check"),
-        ),
-        (("calibrate", "a", "b", "-o", "out"), ("needed one dataset", "docs/python.md")),
-    ],
-)
-def test_options_without_sense_are_refused_by_name(
-    words: tuple[str, ...],
-    named: tuple[str, ...],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(monkeypatch, *words) == 2
-    said = capsys.readouterr().err
-    assert [word for word in named if word not in said] == []
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
         (("noise", "dataset", "--json"), ["legcal noise is gone: calibrate", "plan --noise"]),
         (("init", "photos", "--match=order"), ["--match of legcal init is gone", "column image"]),
         (("import", "a.bag", "--still", "1"), ["--still of legcal import is gone", "0.3 s"]),
@@ -245,15 +213,6 @@ def test_a_number_of_processes_beside_a_cluster_is_refused(
     monkeypatch.setenv("LEGCAL_CLUSTER", "tcp://127.0.0.1:1")
     assert run(monkeypatch, *words, "--workers", "2") == 2
     assert "found --workers beside a cluster" in capsys.readouterr().err
-
-
-def test_help_names_the_unit_of_the_tool_position(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "locate", "--help") == 0
-    assert "Tool in the platform, in metres" in " ".join(
-        capsys.readouterr().out.replace("\u2502", " ").split()
-    )
 
 
 def test_progress_is_shown_unless_somebody_wants_quiet(

@@ -94,15 +94,6 @@ def test_views_keep_their_camera_pose_and_legs(folder: Folder) -> None:
     assert "view c9 has no row" in note
 
 
-def test_view_names_are_text_whatever_yaml_thinks_of_them(folder: Folder) -> None:
-    for file, mark in (("dataset.yaml", "{}:"), ("measurements.csv", "\n{},")):
-        text = (folder.path / file).read_text()
-        for old, new in (("c1", "01"), ("c2", "on")):
-            text = text.replace(mark.format(old), mark.format(new))
-        (folder.path / file).write_text(text)
-    assert [v.name for v in load_dataset(folder.path).measurements.views] == ["01", "on"]
-
-
 def test_mechanism_is_a_path_before_it_is_a_shipped_name(
     folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,17 +128,6 @@ def test_mechanism_is_read_relative_to_the_dataset(
     folder.write()
     with pytest.raises(ModelError, match=r"none\.yaml"):
         load_dataset(folder.path)
-
-
-@pytest.mark.parametrize("version", [2, 0, "1.5", "one", True, None])
-def test_another_version_is_refused_without_a_look_at_its_keys(
-    folder: Folder, version: object
-) -> None:
-    folder.entry = {"legcal_dataset": version, "things": "of another time"}
-    folder.write()
-    with pytest.raises(DatasetError, match="needed version 1") as refusal:
-        load_dataset(folder.path)
-    assert len(refusal.value.problems) == 1
 
 
 def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None:
@@ -244,17 +224,6 @@ def test_paths_that_leave_the_folder_or_cannot_be_are_refused(folder: Folder, im
         read(folder)
 
 
-def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folder) -> None:
-    path = folder.path / "images/c1_2.png"
-    path.write_bytes(path.read_bytes()[:-30])
-    folder.rows[3]["image"] = ""
-    dataset = load_dataset(folder.write(), check_images=False)
-    assert dataset.image_path(3) is None
-    for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
-        with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
-            dataset.image_reader([row])(0)
-
-
 def test_an_image_is_decoded_once_until_its_file_changes(
     folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,17 +315,6 @@ def test_every_cut_of_a_file_is_found(tmp_path: Path, name: str, options: tuple[
     for end in range(0, len(content) - 1, 13):
         with pytest.raises(BadImage):
             image_size(content[:end])
-
-
-def test_end_marker_of_a_jpeg_is_that_of_the_picture(tmp_path: Path) -> None:
-    content = write(tmp_path / "a.jpg", picture()).read_bytes()
-    thumbnail = b"\xff\xe1" + struct.pack(">H", len(content) + 2) + content
-    whole = content[:2] + thumbnail + content[2:]
-    assert image_size(whole).height == H
-    half = len(content) // 2
-    for broken in (whole[:-2], content[:half] + bytes(len(content) - half)):
-        with pytest.raises(BadImage, match="cut off"):
-            image_size(broken)
 
 
 def test_orientation_in_the_exif_data_does_not_turn_the_pixels(tmp_path: Path) -> None:

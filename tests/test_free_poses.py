@@ -1,37 +1,31 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
-from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
+from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal.calibration.joint_fit import free_poses
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.scale import naming_missing_lengths
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import LegcalError, NotIdentifiable, UsageError
+from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.free_poses import find_free_poses, require_standing_joints
+from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
 from legcal.simulation.dataset import simulate
@@ -52,7 +46,8 @@ LAYOUTS = {
     "hung from the platform": Layout((LegLayout(hung="platform", sphere=False),)),
     "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True),)),
 }
-Poses = tuple[RigidTransform, ...]
+
+
 CAMERA = Camera(np.array([[1000.0, 0.0, 639.5], [0.0, 1000.0, 479.5], [0.0, 0.0, 1.0]]), 1280, 960)
 
 
@@ -246,37 +241,6 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
     assert min(off_at_home) > 40.0
 
 
-def away_from(poses: Poses, shift: float, turn: float) -> Poses:
-    """Poses moved at random, by at most so much along and about each axis [m], [rad]."""
-    rng = np.random.default_rng(1)
-    return tuple(
-        RigidTransform.from_components(
-            T.translation + rng.uniform(-shift, shift, 3),
-            Rotation.from_rotvec(rng.uniform(-turn, turn, 3)) * T.rotation,
-        )
-        for T in poses
-    )
-
-
-def distances(poses: Poses, others: Poses) -> list[float]:
-    """How far apart poses are [m]."""
-    both = zip(poses, others, strict=True)
-    return [float(np.linalg.norm(a.translation - b.translation)) for a, b in both]
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("seed", [0, 1])
-def test_poses_between_which_few_lines_leave_a_choice_are_found_by_the_fit(
-    seed: int, tmp_path: Path
-) -> None:
-    """Four legs and three readings an image allow several poses."""
-    path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
-    session = machine_session(str(path), n_views=2, seed=seed)
-    start = replace(session.start, T_Rb_Re=away_from(session.start.T_Rb_Re, 0.25, 0.6))
-    found = refine(session.legs, session.measurements, session.outlines, start)
-    assert max(distances(found.T_Rb_Re, session.truth.T_Rb_Re)) < 1e-6
-
-
 def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     """One leg and three readings let a platform slide, which no fit comes to the end of."""
     path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
@@ -291,28 +255,6 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     assert {why for why, out in zip(found.outlines.reason, open_ones, strict=True) if out} == {
         Rejection(Reason.FEW_LEGS)
     }
-
-
-def five_carriages(folder: Path) -> Machine:
-    """A Hexaglide that has lost a carriage, so that its motors leave a freedom."""
-    table = yaml.safe_load((ROOT / "models/tables/hexaglide.yaml").read_text()) | {"type": "5-PSS"}
-    del table["actuators"]["rail6"], table["base_joints"][5], table["platform_joints"][5]
-    (folder / "five.yaml").write_text(yaml.safe_dump(table))
-    return create_model(read_table(folder / "five.yaml"), folder).machine
-
-
-def test_poses_that_carriages_leave_open_are_looked_for_with_their_readings(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(free_poses, "_N_DRAWS", 1)
-    path = five_carriages(tmp_path).yaml_path
-    session = machine_session(path, length=0.0, angle=0.0, n_views=1, n_poses=3)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    poses = away_from(session.truth.T_Rb_Re, 0.02, 0.3)
-    begin = problem.projected(problem.begin(replace(session.truth, T_Rb_Re=poses)))
-    found = free_poses.with_better_poses(problem, begin).platform_pose
-    assert max(distances(found.motions, session.truth.T_Rb_Re)) < 1e-4
-    np.testing.assert_allclose(found.q, session.measurements.q, atol=1e-4)
 
 
 @pytest.mark.system
@@ -360,21 +302,6 @@ def test_without_a_rough_camera_pose_no_image_is_searched(
     assert "write T_base_camera" in problem
 
 
-def test_images_are_not_searched_where_neither_poses_nor_base_joints_are_known(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(NotIdentifiable, match=r"joints at A that move.*5 motors.*observations"):
-        require_standing_joints(five_carriages(tmp_path))
-
-
-def test_no_images_are_kept_aside_where_readings_give_no_poses(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    path = free_set(folder, monkeypatch, tmp_path)
-    with pytest.raises(UsageError, match="3 motors do not determine the pose"):
-        legcal.calibrate(path, holdout=0.25)
-
-
 @pytest.mark.parametrize(("kind", "says"), [("6-UPS by hand", True), ("5-SPS", False)])
 def test_a_fit_that_fails_without_any_length_says_what_to_measure(
     kind: str, says: bool, tmp_path: Path
@@ -386,14 +313,6 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
         refine(session.legs, session.measurements, some, session.start)
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
-
-
-def test_of_arms_one_length_is_to_be_measured() -> None:
-    session = machine_session("servo-hexapod", n_views=1, n_poses=1)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    with pytest.raises(NotIdentifiable) as refusal, naming_missing_lengths(problem):
-        raise NotIdentifiable("It is not determined.")
-    assert "state it (--length)" in refusal.value.problems[0]
 
 
 def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_path: Path) -> None:

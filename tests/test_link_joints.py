@@ -1,8 +1,6 @@
 """Joints in the links that an owner knows: as the written URDF has them, covariance and all."""
 
-import json
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from simulated import settings
 import legcal
 from legcal.calibration.change_detection import possible_changes
 from legcal.calibration.documents import Kinematic, ParameterRow
-from legcal.calibration.link_joints import joints_in_links, weak_in_links
+from legcal.calibration.link_joints import joints_in_links
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -57,20 +55,6 @@ def test_joints_are_where_the_written_model_has_them(example_run: Run) -> None:
     assert [row["status"] for row in rows[6:9]] == ["x axis of R_b", "defines R_b", "defines R_b"]
     sigma = {row.name: row.sigma for row in result.result.parameters}
     assert rows[5]["sigma"] == pytest.approx(1e3 * float(sigma["leg2.base.z"] or 0.0))  # z is z
-
-
-def test_earlier_results_get_their_joints_on_loading(example_run: Run, tmp_path: Path) -> None:
-    folder = shutil.copytree(example_run.output, tmp_path / "earlier")
-    document = json.loads((folder / "result.json").read_text())
-    recorded = document.pop("links")
-    (folder / "result.json").write_text(json.dumps(document))
-    found = legcal.load_result(folder).result.document()["links"]
-    for side, block in recorded.items():
-        assert found[side]["link"] == block["link"]
-        for one, other in zip(found[side]["joints"], block["joints"], strict=True):
-            for key in ("xyz", "nominal", "covariance"):
-                np.testing.assert_allclose(one[key], other[key], atol=1e-12)
-            assert one["status"] == other["status"]
 
 
 @pytest.mark.parametrize("model", [OBLIQUE, "3-rpr", "3-upu-tilted"])
@@ -138,17 +122,6 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
     write_calibrated_yaml(machine, tmp_path / "m.yaml", "m.urdf")
     written = load_mechanism(tmp_path / "m.yaml")
     np.testing.assert_allclose(written.A_base, joints_with(1e-3 * np.eye(n)[1])[0], atol=1e-12)
-
-
-def test_a_combination_of_parameters_is_told_along_the_axes_of_the_links() -> None:
-    machine = load_mechanism(OBLIQUE)
-    leg, by = machine.leg_names[5], np.array([0.0, 1.0, 0.0])  # along y of the base link
-    in_frame = machine.T_base_Rb.inv().rotation.apply(by)
-    parts = [(f"{leg}.base.{axis}", float(x)) for axis, x in zip("xyz", in_frame, strict=True)]
-    found = weak_in_links(machine, [*parts, (f"{leg}.offset", 0.5)])
-    assert found.parameters == [f"{leg}.base.y", f"{leg}.offset"]
-    np.testing.assert_allclose(found.components, [1.0, 0.5], atol=1e-12)
-    assert found.direction == "y of base joint 6 and offset of leg 6 together"
 
 
 @pytest.mark.parametrize("model", [OBLIQUE, "3-upu-tilted", "3-rpr"])

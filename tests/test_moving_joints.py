@@ -49,13 +49,6 @@ def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
         few.run()
 
 
-def test_steps_of_planar_machines_with_arms_are_refused() -> None:
-    observed = seen("delta")
-    planar = replace(observed, nominal=replace(observed.nominal, frame_legs=(0, 2)))
-    with pytest.raises(NotIdentifiable, match="moves in a plane, needed a machine that moves in"):
-        planar.run()
-
-
 def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
     observed = seen("linear-delta", noise=0.01)
     m = observed.measurements
@@ -149,17 +142,6 @@ def test_a_free_gain_of_every_carriage_loses_the_scale_too() -> None:
     assert not is_scale_open(Analysis(found))
     assert is_scale_open(Analysis(found, Choices(free=gains)))
     assert not is_scale_open(Analysis(found, Choices(free=gains - {"motor1.gain"})))
-
-
-def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None:
-    unseen = np.arange(6) != 1
-    found = {
-        name: Analysis(replace(session(name), seen=session(name).seen & unseen)).full
-        for name in ("delta", "hexaglide")
-    }
-    assert found["hexaglide"].rank == 42  # its readings tell of it
-    (weak,) = found["delta"].weak
-    assert all("2" in name.partition(".")[0] for name in weak.parameters)
 
 
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(

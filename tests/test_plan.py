@@ -28,7 +28,6 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
-from legcal.machine.actuator import Pulses
 from legcal.machine.configurations import random_configurations
 from legcal.machine.feasibility import Feasibility
 from legcal.machine.kinematics import follow, inverse_kinematics
@@ -40,9 +39,7 @@ from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
-from legcal.planning.goals import criterion_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
-from legcal.planning.noise import read_noise
 from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
@@ -204,48 +201,6 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
-@pytest.mark.usefixtures("answered_signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("place", ["legcal.cli.plan._previews", "legcal.planning.session._poses"])
-def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
-    place: str,
-    number: signal.Signals,
-    planned: Plan,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def stopped(*_found: Any, **_more: Any) -> Plan:
-        signal.raise_signal(signal.SIGINT)
-        return planned
-
-    def stopped_again(*_found: Any) -> Any:
-        signal.raise_signal(number)
-        pytest.fail("the second signal was not answered")
-
-    monkeypatch.setattr("legcal.planning.request.plan", stopped)
-    monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
-    monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr(place, stopped_again)
-    assert run(monkeypatch, *WORDS, "-o", tmp_path / "session") == 130
-    assert capsys.readouterr().err == "legcal: Stopped before the end.\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_stopped_search_says_that_it_missed_its_target() -> None:
-    found = legcal.plan(
-        "3-rpr",
-        target=1e-6,
-        cameras=2,
-        bounds=parse_bounds(BOUNDS),
-        setting=FEW,
-        stop=lambda: True,
-    )
-    assert found.error is not None
-    missed = f"error is {1e3 * found.error.mean_displacement:.3f} mm, not 0.001 mm"
-    assert any(missed in note for note in found.notes)
-
-
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     planned: Plan, shot: Path
 ) -> None:
@@ -367,41 +322,6 @@ def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path)
     assert plan.error.mean_displacement == pytest.approx(stated_error, rel=0.15)
 
 
-def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path: Path) -> None:
-    """It does not fall with their length, and fits to few images cannot tell the two apart."""
-    noise, place = {"scale": 0.7, "bias_px": 0.05, "tilt_px": 0.01}, "tilt of an edge at a place"
-    for shared, places in (({}, (0.05, 0.01)), ({place: 0.02}, (0.05, 0.02))):
-        found = {"legcal_result": 1, "residuals": {"noise": noise, "shared_px": shared}}
-        (tmp_path / "result.json").write_text(json.dumps(found))
-        assert read_noise(tmp_path).places_px == places
-
-
-def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -> None:
-    """From where a machine is shown as well, wherever that is."""
-    predictor = Predictor(load_mechanism("hexapod"), sample_camera(), WHITE, 1e-6)
-    poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
-    around = [
-        p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1, FEW), poses)
-    ]
-    middle = np.mean(around[:2], axis=0)  # one nearer than the other
-    box = middle[:, None] + [-0.01, 0.01]
-    assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
-    places = planner._places(Task(predictor, 6, 1, FEW, bounds=box), poses)
-    assert places
-    assert all(place.is_inside(box) for place in places)
-
-
-def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
-    """A tripod stands on the ground, whichever way the platform is."""
-    places = planner._places(
-        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1, FEW),
-        random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
-    )
-    below = [place.T_base_camera.translation[2] < -0.5 for place in places]
-    assert any(below)
-    assert all(place.T_base_camera.rotation.as_matrix()[2, 1] < 0.0 for place in places)
-
-
 def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
     machine = planned.machine
     feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
@@ -434,16 +354,6 @@ def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -
     session.renewed()
     sigma = np.sqrt(np.diagonal(session.covariance))
     assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
-
-
-def test_without_poses_a_plan_makes_the_volume_of_the_covariance_small() -> None:
-    legs = Predictor(load_mechanism("3-rpr"), sample_camera(), WHITE, 1e-6).legs
-    p = len(legs.parametrization.names)
-    criterion = criterion_of(None, legs, np.eye(p))
-    narrow = np.diag(np.r_[1e-12, np.full(p - 1, 1e-8)])
-    one, twice, smaller = criterion(np.stack([1e-8 * np.eye(p), 4e-8 * np.eye(p), narrow]))
-    assert twice == pytest.approx(2.0 * one)
-    assert smaller == pytest.approx(one * 1e-4 ** (1.0 / (2 * p)))
 
 
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
@@ -530,38 +440,6 @@ def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure
     listed = checklist(plan)
     assert any("Measure the rod of leg1" in item for item in listed)
     assert any("where motors read arm1 20.00 deg" in item for item in listed)
-
-
-def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
-    found: list[Predictor] = []
-
-    def told(task: Task, *_: object) -> Plan:
-        found.append(task.predictor)
-        raise DidNotConverge("It was told.")
-
-    monkeypatch.setattr("legcal.planning.request.plan_session", told)
-    delta = load_mechanism("delta")
-    legs = tuple(
-        replace(leg, actuator=replace(leg.actuator, pulses=Pulses(1500.0, 11.1)))
-        for leg in delta.legs
-        if leg.actuator is not None
-    )
-    for machine, stated in ((delta, None), (delta, "0.2deg"), (replace(delta, legs=legs), None)):
-        with pytest.raises(DidNotConverge, match="told"):
-            legcal.plan(machine, images=6, encoder_sigma=stated)
-    session = machine_session("delta", n_views=1, n_poses=4)
-    T_base_camera = delta.T_base_Rb * session.truth.T_camera_Rb[0].inv()
-    known = [
-        predictor.contributions(
-            {"c1": T_base_camera},
-            session.measurements.view,
-            session.truth.T_Rb_Re,
-            session.outlines,
-        ).rows
-        for predictor in found
-    ]
-    default, rough, servo = (np.linalg.norm(rows) for rows in known)
-    assert default > 1.1 * rough > 1.1 * servo
 
 
 def test_photographs_of_one_site_share_errors_at_its_places() -> None:

@@ -1,9 +1,7 @@
 """Pages in a browser: Chromium without a window, driven by Selenium."""
 
-import base64
 import csv
 import io
-import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -19,7 +17,6 @@ from hexapod_example import HEXAPOD, Run
 
 import legcal
 from legcal.calibration.detection import Detection
-from legcal.calibration.detection_folder import write_detection
 from legcal.calibration.examination import Examination
 from legcal.calibration.examination_page import examination_page
 from legcal.data.reasons import USED, Reason, Rejection
@@ -148,39 +145,6 @@ def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
     )
     assert page.execute_script(width) < 0.5 * before
     page.execute_script("document.getElementById('enlarged').close()")
-
-
-def test_it_prints_on_a4(page: Any) -> None:
-    _draw_all(page)
-    from selenium.webdriver.common.print_page_options import PrintOptions
-
-    options = PrintOptions()
-    options.set_page_size(PrintOptions.A4)
-    pdf = base64.b64decode(page.print_page(options))
-    sizes = {
-        tuple(round(float(x)) for x in found.split())
-        for found in re.findall(rb"/MediaBox\s*\[0 0 ([\d.]+ [\d.]+)\]", pdf)
-    }
-    assert sizes
-    assert all(abs(w - 595) <= 1 and abs(h - 842) <= 1 for w, h in sizes)
-
-
-def test_scenes_and_folded_tables_are_there_for_the_printer_alone(
-    page: Any,
-) -> None:
-    _draw_all(page)
-    copies = """dispatchEvent(new Event(arguments[0]));
-        return [...document.querySelectorAll("#machine-scene canvas, #platform-space canvas")]
-            .filter((one) => one.className === "copy").map((one) => new Set(
-                one.getContext("2d").getImageData(0, 0, one.width, one.height).data).size);"""
-    folded = "return document.querySelectorAll('details:not([open])').length"
-    n_folded = page.execute_script(folded)
-    colours = page.execute_script(copies, "beforeprint")
-    assert page.execute_script(folded) == 0 < n_folded
-    assert len(colours) == 2
-    assert min(colours) > 50
-    assert page.execute_script(copies, "afterprint") == []
-    assert page.execute_script(folded) == n_folded
 
 
 def test_it_is_interactive_within_two_seconds(example_run: Run, browser: Any) -> None:
@@ -460,47 +424,3 @@ def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
         assert written == pytest.approx(line / np.linalg.norm(line), abs=1e-9)
         assert written @ expected > 0.99
     assert _errors(browser) == []
-
-
-def test_the_page_of_a_detection_is_ready_in_time_and_hostile_names_do_nothing(
-    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
-) -> None:
-    _, examination = examined
-    found = examination.detection
-    assert found is not None
-    machine, measured = found.dataset.machine, found.dataset.measurements
-    legs = tuple(replace(leg, name=f'{leg.name}, "{HOSTILE}') for leg in machine.legs)
-    views = tuple(replace(view, name=f"{view.name}{HOSTILE}") for view in measured.views)
-    dataset = replace(
-        found.dataset,
-        machine=replace(machine, name=HOSTILE, legs=legs),
-        measurements=replace(measured, views=views),
-    )
-    changed = replace(found, dataset=dataset, rows=found.rows[:2])
-    hostile = replace(
-        examination,
-        mechanism=HOSTILE,
-        views=tuple(
-            view.model_copy(update={"view": f"{view.view}{HOSTILE}"}) for view in examination.views
-        ),
-        detection=changed,
-    )
-    write_detection(hostile, changed, tmp_path / "out", map, lambda *_: None)
-    editor = Editor(browser, tmp_path / "out" / "index.html", tmp_path)
-    assert (
-        browser.execute_script(
-            "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
-        )
-        <= INTERACTIVE
-    )
-    editor.open(1)
-    buttons = browser.find_elements("css selector", ".rows button")
-    buttons[0].click()
-    editor.press("r")
-    before = _rows((tmp_path / "out" / "observations.csv").read_text())
-    after = _rows(editor.download())
-    assert [a["leg"] for a in after] == [b["leg"] for b in before]
-    assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
-    assert _errors(browser) == []
-    assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
-    assert HOSTILE in browser.find_element("css selector", "h1").text

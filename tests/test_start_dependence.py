@@ -36,11 +36,3 @@ def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> No
     for end in (other, moved):
         assert difference(first, end)[0] < TOLERANCE
         assert end.solution.outlines.used_keys() == first.solution.outlines.used_keys()
-
-
-def test_photographs_give_one_result_with_and_without_the_four_steps(tmp_path: Path) -> None:
-    folder = session_folder("hexapod", Session("hexapod", Level.PHOTOGRAPHS, 1), tmp_path)
-    first = calibrated(folder, "nominal", steps=False)
-    other = calibrated(folder, "staged")
-    assert difference(first, other)[0] < TOLERANCE
-    assert other.solution.outlines.used_keys() == first.solution.outlines.used_keys()
