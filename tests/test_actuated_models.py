@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from dataset_folder import dataset_of_readings
-from machines import ROOT, check_same, read_table, with_round_arms
+from machines import ROOT, read_table, with_round_arms
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.pipeline import calibrate
@@ -180,33 +180,6 @@ def test_linear_deltas_and_orthoglides_move_by_three_spheres() -> None:
 
 
 # --- tables -------------------------------------------------------------------------------------
-
-
-def test_a_csv_gives_the_same_model_as_its_yaml(tmp_path: Path) -> None:
-    table = yaml.safe_load((TABLES / "delta.yaml").read_text())
-    header = (
-        "type,base_x,base_y,base_z,platform_x,platform_y,platform_z,length,radius,hangs_on,"
-        "point_x,point_y,point_z,axis_x,axis_y,axis_z,travel_deg_low,travel_deg_high,unit"
-    )
-    rows, told = [header], set[str]()
-    for a, b, motor in zip(
-        table["base_joints"], table["platform_joints"], table["hangs_on"], strict=True
-    ):
-        entry = table["actuators"][motor]
-        motion = [*entry["point"], *entry["axis"], *entry["travel_deg"]]
-        cells = [""] * 8 if motor in told else motion  # once is enough
-        told.add(motor)
-        rows.append(",".join(map(str, ["RSS", *a, *b, 400, 5, motor, *cells, "mm"])))
-    path = tmp_path / "delta.csv"
-    path.write_text("\n".join(rows))
-    described = description_of(path, Dimensions(height=table["home"]["xyz"][2]))
-    machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
-    check_same(machine, read_table(TABLES / "delta.yaml"))
-    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
-    other = rows[2].replace("," * 8, ",,,,1,0,0,,")
-    path.write_text("\n".join([*rows[:2], other]))
-    with pytest.raises(ModelError, match=r"line 3.*another axis.*'arm1'"):
-        read_table(path)
 
 
 def test_a_table_says_at_which_of_two_readings_a_motor_stands_at_home(tmp_path: Path) -> None:

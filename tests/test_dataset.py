@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 from dataset_folder import (
-    HEXAPOD,
     JOINTS,
     ROOT,
     SIZE,
@@ -26,13 +25,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, LegcalError, ModelError
+from legcal.errors import DatasetError, LegcalError
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
     BadImage,
-    decode_image,
     image_size,
     inspect_image,
     read_image,
@@ -113,21 +111,6 @@ def test_mechanism_is_a_path_before_it_is_a_shipped_name(
     assert loaded[1].name == "shipped.yaml"
     assert folder.path not in loaded[1].parents
     assert loaded[2] == folder.path / "../elsewhere/model.yaml"
-
-
-def test_mechanism_is_read_relative_to_the_dataset(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.undo()
-    (folder.path / "models").symlink_to(HEXAPOD.parent)
-    (folder.path / "urdf").symlink_to(HEXAPOD.parents[1] / "urdf")
-    folder.entry["mechanism"] = "models/hexapod.yaml"
-    folder.write()
-    assert load_dataset(folder.path).machine.leg_names == hexapod().leg_names
-    folder.entry["mechanism"] = "models/none.yaml"
-    folder.write()
-    with pytest.raises(ModelError, match=r"none\.yaml"):
-        load_dataset(folder.path)
 
 
 def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None:
@@ -222,31 +205,6 @@ def test_paths_that_leave_the_folder_or_cannot_be_are_refused(folder: Folder, im
     folder.rows[2]["image"] = image
     with pytest.raises(DatasetError, match=r"row 3 .*found (it also in|a path that cannot)"):
         read(folder)
-
-
-def test_an_image_is_decoded_once_until_its_file_changes(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decoded = list[Path]()
-
-    def decode(path: Path, camera: Camera, where: str) -> object:
-        decoded.append(path)
-        return decode_image(path, camera, where)
-
-    monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
-    read = load_dataset(folder.write()).image_reader([0, 1])
-    first = [read(k) for k in (0, 1)]
-    again = [read(k) for k in (0, 1)]
-    assert len(decoded) == 2
-    assert all(one.dtype == np.float32 for one in again)
-    np.testing.assert_array_equal(again, first)
-    again[0][:] = 0.0
-    np.testing.assert_array_equal(read(0), first[0])
-    decoded[0].write_bytes(decoded[1].read_bytes())
-    np.testing.assert_array_equal(read(0), first[1])
-    decoded[0].unlink()
-    with pytest.raises(DatasetError, match="needed the file there"):
-        read(0)
 
 
 # --- image files

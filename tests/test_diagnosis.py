@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from simulated import settings, simulated
@@ -15,7 +14,7 @@ from simulated import settings, simulated
 from legcal import calibrate, load_dataset
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
+from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
@@ -185,18 +184,6 @@ def _with_readings(d: Dataset, change: Callable[[Array], Array]) -> Dataset:
     return replace(d, measurements=replace(d.measurements, q=q))
 
 
-def test_motors_that_move_joints_at_A_are_mistaken_as_encoders_of_legs_are(delta: Dataset) -> None:
-    small = _with_readings(delta, lambda q: 0.5 * q)  # so that another zero is in their travel
-    data = order_dataset(small, in_turn, no_progress)
-    tried, rows = mistakes(data), list(range(6))
-    of_kinds = {one.kind: one for one in tried}
-    assert "deg too" in of_kinds["zero of an encoder"].what
-    assert "motors arm" in of_kinds["columns exchanged"].same_as[0]
-    given, mirrored = as_given(data).joints(rows), of_kinds["handedness"].true.joints(rows)
-    for ends, of_mirror in zip(given, mirrored, strict=True):
-        assert np.allclose(ends[rows] * [1.0, -1.0, 1.0], of_mirror[rows], atol=1e-9)
-
-
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("change", "kinds", "what"),
@@ -263,29 +250,6 @@ def of_symmetric_machine(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def _of_few_poses(d: Dataset) -> Dataset:
     return dataset_at(d, np.flatnonzero(d.measurements.pose % 10 < 7))
-
-
-NEARLY_SYMMETRIC = """leg,type,bx,by,bz,px,py,pz
-1,RPS,200.0,0.0,0,120.0,0.0,0
-2,RPS,-80.0,183.2,0,-70.0,123.9,0
-3,RPS,-110.0,-157.2,0,-76.0,-113.9,0
-"""
-
-
-def test_rough_camera_poses_find_what_a_nearly_symmetric_machine_hides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its images nearly agree with cameras elsewhere, near which the right one is not found."""
-    (tmp_path / "tripod.csv").write_text(NEARLY_SYMMETRIC)
-    lengths = ("--min-length", "380", "--max-length", "520", "--leg-radius", "9", "--height", "430")
-    assert (
-        run(monkeypatch, "new", tmp_path / "tripod.csv", "--unit", "mm", *lengths, "-o", tmp_path)
-        == 0
-    )
-    simulate(str(tmp_path / "models/tripod.yaml"), tmp_path / "set", settings(poses=5))
-    d = _with_readings(load_dataset(tmp_path / "set"), lambda q: q[:, [1, 0, 2]])
-    found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
-    assert found.what == "columns leg1_prismatic and leg2_prismatic look exchanged"
 
 
 def test_a_view_whose_camera_was_moved_is_named(

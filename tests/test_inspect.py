@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from csv_rows import read_rows, write_rows
-from machines import ROOT, regular
+from machines import regular
 from rich.console import Console
 from simulated import simulated
 
@@ -114,29 +113,6 @@ def test_the_mobility_is_that_of_other_poses_where_home_is_singular(tmp_path: Pa
     machine = create_model(regular("3-UPU", platform_radius=300.0), tmp_path).machine
     assert machine.mobility == 3
     assert any("is singular at home" in note for note in machine.diagnostics)
-
-
-def test_an_evaluation_leaves_out_what_a_machine_does_not_have(tmp_path: Path) -> None:
-    name = "hexapod-strut"
-    evaluation = evaluate(name, name)  # the strut is passive: it has no offset
-    passive = load_mechanism(name).legs[6].name
-    assert f"{passive}.platform.z" in evaluation.names
-    assert f"{passive}.offset" not in evaluation.names
-    assert np.all(evaluation.values == evaluation.references)
-    assert all(np.isfinite(row["difference"]) for row in evaluation.document()["parameters"])
-
-    entry = yaml.safe_load((ROOT / "models" / f"{name}.yaml").read_text())
-    entry["name_mot"].pop()  # without enough motors parameters alone are compared
-    entry["legcal"]["urdf"] = str(ROOT / "urdf" / f"{name}.urdf")
-    path = tmp_path / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(entry))
-    evaluation = evaluate(path, path)
-    document = evaluation.document()
-    assert document["dX_m"] is document["dE_rad"] is document["dX_max_m"] is None
-    assert document["poses"] == 0
-    assert len(document["parameters"]) > 30
-    text = _printed(accuracy_table(evaluation))
-    assert "Parameters only: the motors of a model do not determine its pose" in text
 
 
 def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path: Path) -> None:

@@ -1,15 +1,11 @@
 """Joints in the links that an owner knows: as the written URDF has them, covariance and all."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from command_line import run
 from hexapod_example import Run
-from simulated import settings
 
 import legcal
 from legcal.calibration.change_detection import possible_changes
@@ -26,8 +22,6 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, ParameterErrors
 from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
@@ -141,41 +135,3 @@ def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
                 after = vector_of(found, geometries(moved), legs)
                 np.testing.assert_allclose(change.columns[:, k], (after - before) / step, atol=2e-3)
             assert set(change.links) == {getattr(machine, side)}
-
-
-@pytest.mark.system
-def test_a_joint_that_was_moved_is_reported_in_its_link(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    machine = load_mechanism("3-rpr")
-    exact = settings(level=Level.AXES, poses=6, errors=ParameterErrors())
-    first = simulate("3-rpr", tmp_path / "set", exact).folder
-    legcal.calibrate(first, output=tmp_path / "result")
-    moved = _moved(machine, "base", 1, [1e-3, 0.0, 0.0])
-    write_urdf(machine, geometries(moved), tmp_path / "moved.urdf")
-    write_calibrated_yaml(machine, tmp_path / "moved.yaml", "moved.urdf")
-    new = simulate(tmp_path / "moved.yaml", tmp_path / "new", exact).folder
-    text = yaml.safe_load((new / "dataset.yaml").read_text()) | {"mechanism": "3-rpr"}
-    (new / "dataset.yaml").write_text(yaml.safe_dump(text))
-    assert run(monkeypatch, "calibrate", new, "--check", tmp_path / "result") == 1
-    said = " ".join(capsys.readouterr().out.split())
-    found = re.search(r"base joint of leg2: (\S+) mm in x of base .*, (\S+) mm in y of base", said)
-    assert found is not None
-    assert [float(x) for x in found.groups()] == pytest.approx([1.0, 0.0], abs=0.05)
-
-
-def test_two_models_are_compared_along_the_links_of_the_first() -> None:
-    # With no motor parameters alone are compared, which is quick.
-    machine = replace(load_mechanism(OBLIQUE), motor_rank=0)
-    leg = next(j for j in range(6) if j not in machine.frame_legs)
-    found = legcal.evaluate(_moved(machine, "base", leg, [1e-3, 0.0, 0.0]), machine).links["base"]
-    expected = np.zeros((6, 3))
-    expected[leg, 0] = 1e-3
-    np.testing.assert_allclose([joint.difference for joint in found.joints], expected, atol=1e-12)
-    assert found.frames_apart.dX_m == found.frames_apart.dE_rad == 0.0
-
-    third = machine.frame_legs[2]  # moved out of the plane of R_b, which turns with it
-    turned = legcal.evaluate(_moved(machine, "base", third, [0.0, 0.0, 1e-3]), machine)
-    assert turned.links["base"].frames_apart.dE_rad > 1e-3
-    for joint in turned.links["base"].joints:
-        assert not any(d for d, own in zip(joint.difference, joint.defined, strict=True) if own)

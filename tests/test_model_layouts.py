@@ -1,6 +1,5 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
-import pickle
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -17,7 +16,6 @@ from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 from outside_machines import missing, scaled
 from thinned import thinned
 
-from legcal.errors import UsageError
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
@@ -210,22 +208,6 @@ def test_a_platform_that_is_the_child_of_a_last_joint_changes_nothing(
     np.testing.assert_allclose(level[0].as_matrix(), level[1].as_matrix(), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("description", "hung"), [("3-RPR", "base"), ("3-RPR, tilted plane", "platform")]
-)
-def test_a_planar_virtual_joint_changes_nothing(
-    description: str, hung: str, tmp_path: Path
-) -> None:
-    drawn, layout = MACHINES[description](), Layout((LegLayout(hung=hung),), virtual="planar")
-    machine = load_mechanism(write_machine(tmp_path, drawn, layout))
-    _check(machine, drawn, layout)
-    assert machine.mobility == 3
-    assert drawn.normal is not None
-    _close(machine.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
-    z_e = (machine.home * machine.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
-    _close(z_e, drawn.normal)
-
-
 LEG_LAYOUTS = st.builds(
     LegLayout,
     hung=st.sampled_from(["base", "platform"]),
@@ -287,17 +269,6 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
     for j, leg in enumerate(machine.legs):
         _close(leg.A, description.legs[j].A)
         _close(leg.B, expected_B(description, j))
-
-
-def test_a_universal_joint_that_is_blocked_on_one_axis_is_a_revolute(tmp_path: Path) -> None:
-    old = 'name="leg4_b1" type="revolute"'
-    text = SHIPPED_URDF.read_text().replace(old, old.replace("revolute", "fixed"))
-    (tmp_path / "hexapod.urdf").write_text(text)
-    (tmp_path / "hexapod.yaml").write_text(SHIPPED_YAML.read_text().replace("../urdf/", ""))
-    machine = load_mechanism(tmp_path / "hexapod.yaml")
-    assert [leg.type for leg in machine.legs] == ["SPU", "SPU", "SPU", "SPR", "SPU", "SPU"]
-    assert machine.legs[3].platform_axis is not None
-    assert machine.mobility == 5
 
 
 @pytest.mark.parametrize(("types", "scale"), [("US", 1.0), ("RS", 0.1), ("UU", 25.0)])
@@ -368,34 +339,6 @@ def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
         assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.01}
     centre = load_mechanism("tricept").legs[3]
     assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}
-
-
-def test_parameters_are_zero_where_the_frames_make_them_zero(tmp_path: Path) -> None:
-    drawn = of_types(["US"] * 6)
-    xi = load_mechanism(write_machine(tmp_path, drawn, Layout())).parameters
-    for joints in (xi.base_joints, xi.platform_joints):
-        assert np.all(joints[0] == 0.0)
-        assert np.all(joints[1, 1:] == 0.0)
-        assert joints[2, 2] == 0.0
-        assert np.abs(joints[3:]).min() > 1e-6
-
-
-def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
-    machine = load_mechanism("hexapod")
-    names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")
-    other = machine.with_leg_order(names)
-    assert other.leg_names == names
-    assert [names[j] for j in other.frame_legs] == ["leg1", "leg3", "leg5"]
-    q = inverse_kinematics(machine, machine.home) + np.linspace(0.0, 0.02, 6)
-    expected = forward_kinematics(machine, q).as_matrix()
-    reordered = q[[machine.leg_names.index(name) for name in names]]
-    np.testing.assert_allclose(
-        forward_kinematics(other, reordered).as_matrix(), expected, atol=1e-12
-    )
-    copy = pickle.loads(pickle.dumps(machine))
-    np.testing.assert_allclose(forward_kinematics(copy, q).as_matrix(), expected, atol=1e-13)
-    with pytest.raises(UsageError, match="each of leg1"):
-        machine.with_leg_order(["leg1"])
 
 
 def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(

@@ -1,7 +1,6 @@
 """Models written from tables and families: what is written is what was stated, and it closes."""
 
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import LegcalError, OutOfClass, OutOfResources, UsageError
+from legcal.errors import OutOfClass, UsageError
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.files import shipped_names
@@ -300,25 +299,3 @@ def test_files_that_are_there_stay_without_force(tmp_path: Path) -> None:
         read_table(write_table(tmp_path, offsets=385)), tmp_path, force=True
     ).machine
     np.testing.assert_allclose(machine.q0, 0.385, atol=1e-15)
-
-
-def test_what_stands_in_the_way_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    machine = read_table(write_table(tmp_path))
-    blocked, file = tmp_path / "blocked", tmp_path / "file"
-    (blocked / "models" / "tripod.yaml").mkdir(parents=True)
-    file.write_text("")
-    with pytest.raises(UsageError, match=r"the folder .*tripod.yaml"):
-        create_model(machine, blocked, force=True)
-    assert not (blocked / "urdf").exists()
-    with pytest.raises(OutOfResources, match="the model could not be written"):
-        create_model(machine, file / "folder")
-
-    def refuse(path: Path) -> None:
-        raise OutOfClass(f"{path}: this machine is outside the method.")
-
-    monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
-    with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):
-        create_model(machine, tmp_path / "new" / "folder")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["blocked", "file", "table.yaml"]

@@ -1,6 +1,5 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
-import io
 import json
 import os
 import pickle
@@ -9,9 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,8 +16,6 @@ import pytest
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
-from machines import with_round_arms
-from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
 import legcal
@@ -28,14 +23,9 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
-from legcal.machine.feasibility import Feasibility
-from legcal.machine.kinematics import follow, inverse_kinematics
+from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import Cylinder
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import slider_columns
-from legcal.machine.model_builder import create_model
-from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
@@ -45,7 +35,6 @@ from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.request import difference
 from legcal.planning.session import write_session
-from legcal.report.plan import checklist, plan_table
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
@@ -284,62 +273,6 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
     assert missing <= 0.1 * agreeing
 
 
-@pytest.mark.system
-def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
-    """They are seen where the simulation shows them, and their lines become as well known."""
-    machine = create_model(with_round_arms("delta"), tmp_path).machine
-    setting = replace(FEW, shift=0.0, turn=0.0)
-    plan = legcal.plan(machine, images=15, seed=1, noise=WHITE, setting=setting)
-    write_session(plan, tmp_path / "session")
-    lengths = {"leg1.base:leg1.platform": 5e-5}
-    settings = SimulationSettings(
-        plan=tmp_path / "session", level=Level.OUTLINES, seed=2, lengths=lengths
-    )
-    simulate(machine, tmp_path / "shot", settings)
-    shown = load_dataset(tmp_path / "shot").observations
-    assert shown is not None
-    keys = {key for key in shown.row_keys() if key[2].startswith("arm")}
-    row, planned = 0, set()
-    for view in plan.views:
-        of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
-        planned |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
-        row += len(view.poses.poses)
-    assert keys <= planned
-    assert len(keys) >= 0.65 * len(planned)
-    found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
-    stated = dict(
-        zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
-    )
-    names = [name for name in plan.names if ParameterId.parse(name).kind in ARMS]
-    sigma = dict(zip(plan.names, plan.sigma.tolist(), strict=True))
-    ratios = [stated[name] / sigma[name] for name in names]
-    assert len(ratios) == 12
-    assert 0.75 < np.exp(np.mean(np.log(ratios))) < 1.3
-    assert found.platform is not None
-    assert found.platform.workspace is not None
-    assert plan.error is not None
-    stated_error = found.platform.workspace.mean_displacement
-    assert plan.error.mean_displacement == pytest.approx(stated_error, rel=0.15)
-
-
-def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
-    machine = planned.machine
-    feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
-    stations = [machine.home_configuration]
-    for view in planned.views:  # one after the other, without a way home between them
-        stations += [*view.poses.configurations]
-    for k, via in enumerate([via for view in planned.views for via in view.via]):
-        stops = [stations[k]]
-        if via:
-            stops.append(stations[0 if via == "home" else int(via)])
-        stops.append(stations[k + 1])
-        for here, there in pairwise(stops):
-            for part in np.linspace(0.1, 1.0, 10):
-                q = here[columns] + part * (there - here)[columns]
-                at = follow(machine, here, q)
-                assert feasibility.problem(at, of_motors=False) is None
-
-
 def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
     task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
     view = planned.views[0]
@@ -417,29 +350,6 @@ def test_a_machine_whose_legs_always_collide_says_so() -> None:
     assert "found 0 that the machine reaches in 300 draws" in message
     assert "excluded 300 times by collisions of legs" in message
     assert "check radii and ends of the cylinders" in message
-
-
-def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure(
-    planned: Plan, tmp_path: Path
-) -> None:
-    machine, sigma = load_mechanism("delta"), np.radians(0.5)
-    drawn = random_configurations(machine, 2, np.random.default_rng(1))
-    seen: Any = SimpleNamespace(legs_in=lambda *shape: np.ones(shape, dtype=np.bool_))
-    view = replace(planned.views[0], poses=drawn, via=("", ""), seen=seen)
-    plan = replace(planned, machine=machine, views=(view,), sigma_by_joint={"arm2": sigma})
-    write_session(plan, tmp_path)
-    rows = read_rows(tmp_path / "poses.csv")
-    told = [[float(row[f"arm{j} [deg]"]) for j in (1, 2, 3)] for row in rows]
-    found = load_dataset(tmp_path, check_images=False).measurements
-    np.testing.assert_allclose(np.radians(told), found.q[:, ::2], atol=1e-6)
-    assert found.sigma_by_joint["arm2"] == pytest.approx(sigma)
-    console = Console(file=io.StringIO(), width=200)
-    console.print(plan_table(plan, tmp_path))
-    printed = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "-o OUT --length leg1.base:leg1.platform=" in printed
-    listed = checklist(plan)
-    assert any("Measure the rod of leg1" in item for item in listed)
-    assert any("where motors read arm1 20.00 deg" in item for item in listed)
 
 
 def test_photographs_of_one_site_share_errors_at_its_places() -> None:

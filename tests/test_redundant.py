@@ -14,16 +14,12 @@ from fit_sessions import machine_session
 from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import displaced, of_types, planar, ring
 from outline_sessions import made
-from parameter_steps import written_with
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from simulated import settings
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.exports.formats import export
-from legcal.exports.subject import ExportOptions, Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import (
@@ -37,7 +33,7 @@ from legcal.machine.kinematics import (
 from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import generic_configurations
 from legcal.machine.model import Machine, slider_columns
-from legcal.machine.parameters import geometries, legs_in_links, parametrization_of
+from legcal.machine.parameters import geometries, legs_in_links
 from legcal.machine.redundancy import Contradiction, contradictions, reading_residuals
 from legcal.machine.solved_poses import solve_poses
 from legcal.simulation.dataset import simulate
@@ -158,30 +154,6 @@ def test_poses_are_those_of_least_squares(name: str) -> None:
         assert min(change) > -1e-12
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("7-UPS", marks=pytest.mark.slow),
-        "4-RPR",
-        pytest.param("2-RPS + 2-SPS + rod", marks=pytest.mark.system),
-    ],
-)
-def test_predicted_errors_are_those_of_written_models(name: str, tmp_path: Path) -> None:
-    machine = machine_of(name)
-    parametrization = parametrization_of(machine)
-    rng = np.random.default_rng(3)
-    step = 1e-6 * rng.normal(size=len(parametrization))
-    other = written_with(machine, parametrization, step, tmp_path)
-    drawn = random_configurations(machine, 2, rng)
-    before = platforms_in_base(machine, drawn.poses)
-    after = platforms_in_base(other, forward_kinematics_many(other, drawn.readings))
-    J = platform_by_parameters(geometries(machine), parametrization, machine.frame_legs, before)
-    for T, T_other, by in zip(before, after, J, strict=True):
-        turn = (T_other.rotation * T.rotation.inv()).as_rotvec()
-        moved = np.concatenate([turn, T_other.translation - T.translation])
-        np.testing.assert_allclose(by @ step, moved, atol=2e-3 * np.abs(moved).max())
-
-
 def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path: Path) -> None:
     machine = machine_of("4-RPR")
     q = inverse_kinematics(machine, machine.home)
@@ -231,23 +203,6 @@ def test_a_wrong_reading_is_told_from_errors_of_the_model_or_motors_that_explain
         assert own == pytest.approx(off, abs=1e-3 if most_alike == 1 else 3e-3)
         assert one.distances == tuple(sorted(one.distances))
         assert abs(one.off) == pytest.approx(one.distances[0])
-
-
-def test_carriages_may_be_redundant(tmp_path: Path) -> None:
-    """Seven carriages: a fit with too many readings is exact, a contradictory one is named."""
-    machine = made("7-pss", tmp_path)
-    assert machine.is_redundant
-    session = machine_session(str(machine.yaml_path))
-    found = refine(session.legs, session.measurements, session.outlines, session.start)
-    names, truth = found.kinematic.parametrization.names, session.legs.vector(session.truth.legs)
-    values = found.estimates.vector(names)
-    begun = session.legs.vector(session.start.legs)
-    assert np.abs(begun - truth).max() > 0.002
-    np.testing.assert_allclose(values, truth, atol=1e-7)
-    wrong = inverse_kinematics(machine, machine.home)
-    wrong[6] += 0.06
-    with pytest.raises(DidNotConverge, match=r"motor 'rail\d' \(or as likely one of rail.* mm"):
-        forward_kinematics(machine, wrong)
 
 
 @pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3), ("7-pss", -2e-3)])
@@ -302,25 +257,3 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     write_rows(table, of_pose)
     with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
         legcal.calibrate(folder, output=tmp_path / "refused")
-
-
-def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_path: Path) -> None:
-    machine = machine_of("4-RPR")
-    rng = np.random.default_rng(5)
-    legs = [
-        dataclasses.replace(leg, A=leg.A + np.append(rng.normal(scale=1e-3, size=2), 0.0))
-        for leg in geometries(machine)
-    ]
-    nominal = dataclasses.replace(machine, legs=legs_in_links(machine, legs))
-    subject = Subject(machine, "machine", nominal)
-    found = export(subject, "correction", tmp_path / "a.csv", options=ExportOptions(nodes=3))
-    assert found.figures["coordinates"] == ["x", "y", "yaw"]
-    table = np.loadtxt(tmp_path / "a.csv", delimiter=",", comments=("#", "x"))
-    assert len(table) == 27
-    for x, y, yaw, *corrected in table[::5].tolist():
-        turn = Rotation.from_euler("z", yaw, degrees=True)
-        height = machine.home.translation[2]
-        pose = RigidTransform.from_components([1e-3 * x, 1e-3 * y, height], turn)
-        moved = forward_kinematics(nominal, inverse_kinematics(machine, pose))
-        angle = moved.rotation.as_euler("xyz", degrees=True)[2]
-        np.testing.assert_allclose([*(1e3 * moved.translation[:2]), angle], corrected, atol=1e-5)

@@ -18,10 +18,7 @@ from hexapod_example import HEXAPOD, Run
 import legcal
 from legcal.calibration.detection import Detection
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import examination_page
-from legcal.data.reasons import USED, Reason, Rejection
-from legcal.vision.camera import Camera
-from legcal.vision.distortion import DistortionModel
+from legcal.data.reasons import Reason, Rejection
 
 pytestmark = pytest.mark.system
 
@@ -362,65 +359,4 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     assert used.h[moved] == pytest.approx(line, abs=1e-12)
     assert 1.0 < abs(off[0]) < 2.5  # across the line
     assert np.abs(calibration.residuals.offset[k]) == pytest.approx(np.abs(off), abs=0.3)
-    assert _errors(browser) == []
-
-
-def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
-    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
-) -> None:
-    folder, examination = examined
-    found = examination.detection
-    assert found is not None
-    measured = found.dataset.measurements
-    lenses: dict[DistortionModel, list[float]] = {
-        "plumb_bob": [-0.21, 0.08, 1e-3, -7e-4, -0.02],
-        "rational_polynomial": [0.3, -0.1, 8e-4, -5e-4, 0.02, 0.55, -0.06, 0.01],
-        "equidistant": [0.04, -0.02, 0.01, -0.003],
-    }
-    views = tuple(
-        replace(view, camera=replace(view.camera, distortion=np.array(lens), model=model))
-        for view, (model, lens) in zip(measured.views, lenses.items(), strict=True)
-    )
-    lost, h = 2, found.outlines.h.copy()
-    of_view = [int(np.flatnonzero(measured.view[found.outlines.row] == v)[lost]) for v in range(3)]
-    h[of_view] = np.nan
-    outlines = replace(
-        found.outlines,
-        h=h,
-        used=~np.isnan(h[:, 0]),
-        reason=tuple(Rejection(Reason.NO_EDGE) if np.isnan(a) else USED for a in h[:, 0]),
-    )
-    dataset = replace(found.dataset, measurements=replace(measured, views=views))
-    changed = replace(found, dataset=dataset, outlines=outlines)
-    page = folder.parent / "found" / "lenses.html"  # beside the same photographs
-    page.write_text(examination_page(examination, changed), "utf-8")
-    editor = Editor(browser, page, tmp_path)
-    for v in range(3):
-        row = int(outlines.row[of_view[v]])
-        editor.open(list(changed.overlay_files).index(row))
-        buttons = browser.find_elements("css selector", ".rows button")
-        name = buttons[lost].text.splitlines()[0]
-        editor.choose(name)
-        assert editor.state(name) == "not found: no convincing edge"
-        editor.press("u", "1", "Left", "Shift Down")
-        assert editor.state(name) == "used (edited)"
-        editor.close()
-    editor.open(0)
-    rows = _rows(editor.download())
-    for v, i in enumerate(of_view):
-        camera: Camera = views[v].camera
-        ends = _ends(rows[i]).reshape(2, 2)
-        (leg,) = (p for p in changed.predicted(int(outlines.row[i])) if p.leg == outlines.leg[i])
-        band, expected = leg.bands[0], leg.outlines[0][int(outlines.edge[i]) - 1]
-        assert band is not None
-        t = np.array([0.0, band.length])
-        placed = camera.distort(band.points(t, band.offsets(expected, t)))
-        assert np.linalg.norm(ends - placed, axis=1) == pytest.approx(
-            [np.hypot(0.1, 1.0), 0.0], abs=0.02
-        )
-        rays = np.column_stack([camera.undistort(ends), np.ones(2)])
-        line = np.cross(rays[1], rays[0])
-        written = np.array([float(rows[i][name]) for name in "abc"])
-        assert written == pytest.approx(line / np.linalg.norm(line), abs=1e-9)
-        assert written @ expected > 0.99
     assert _errors(browser) == []

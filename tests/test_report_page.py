@@ -288,24 +288,6 @@ def test_points_lead_to_overlays_beside_the_page(example_run: Run, tmp_path: Pat
         legcal.calibrate(calibration.dataset, overlays=True)
 
 
-@pytest.mark.usefixtures("page")  # which writes the report of the result
-def test_pages_of_earlier_results_go_and_files_of_others_stay(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
-    calibration, page = example_run.calibration, out / "report.html"
-    assert page.exists()
-    write_result(calibration, out)  # which that page does not describe
-    assert not page.exists()
-    page.write_text("mine")
-    write_result(calibration, out)
-    assert page.read_text() == "mine"
-    monkeypatch.setattr(
-        "legcal.calibration.pipeline.calibrate", lambda *_, **__: pytest.fail("too late")
-    )
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 2
-
-
 def test_other_commands_write_what_they_print_as_a_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -217,13 +216,3 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
     assert found.document()["failures"] == {}
     text = _printed(found)
     assert "steps as printed, coplanar joints: 2 of 2 runs failed (DidNotConverge)" in text
-
-
-def test_the_figure_needs_no_network_and_the_picture_no_browser(
-    result: tuple[StudyResult, Path],
-) -> None:
-    page = (result[1] / "fig4.html").read_text()
-    assert not re.search(r"<script[^>]*src=|<link[^>]*href=", page)
-    assert "Plotly.newPlot" in page
-    assert "A2x" in page
-    assert (result[1] / "fig4.png").read_bytes().startswith(b"\x89PNG")

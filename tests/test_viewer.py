@@ -12,7 +12,6 @@ from layouts import Layout, write_machine
 from machines import of_types
 from scipy.ndimage import map_coordinates
 
-from legcal.geometry.types import Array
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
@@ -73,12 +72,6 @@ def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def hexapod() -> Machine:
     return load_mechanism("hexapod")
-
-
-def along_z(wxyz: Array) -> Array:
-    """Return where turns take the z axis, (n, 3)."""
-    w, x, y, z = wxyz.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -224,21 +217,3 @@ def test_without_viser_the_command_that_installs_it_is_said(
     monkeypatch.setattr("legcal.viewer.window.find_spec", lambda name: None)
     assert run(monkeypatch, "view", "hexapod") == 2
     assert "pip install 'legcal[view]'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
-def test_arms_and_carriages_are_drawn_to_the_joints_that_they_carry(name: str) -> None:
-    machine = load_mechanism(name)
-    stage, motion = Stage(Source(machine)), Motion(machine)
-    before = stage.seen(motion.posture)
-    motion.read(2, motion.posture.q[2] - 0.05)
-    seen = stage.seen(motion.posture)
-    np.testing.assert_allclose(np.linalg.norm(seen.B - seen.A, axis=1), machine.q0, atol=1e-9)
-    ends = seen.motors.position + 0.5 * seen.motors.scale[:, 2:] * along_z(seen.motors.wxyz)
-    where = [stage.n_standing + 2 * k for k in range(3)]  # each followed by the bar of its rods
-    middles = 0.5 * (seen.A[::2] + seen.A[1::2])
-    carried = seen.motors.position[where] if name == "linear-delta" else ends[where]
-    np.testing.assert_allclose(carried, middles, atol=1e-12)
-    np.testing.assert_allclose(seen.motors.scale, before.motors.scale, atol=1e-12)
-    moved = np.linalg.norm(seen.motors.position - before.motors.position, axis=1) > 1e-6
-    assert np.flatnonzero(moved).tolist() == [stage.n_standing + 2, stage.n_standing + 3]

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from lxml import etree
-from machines import MACHINES, ROOT, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
+from machines import MACHINES, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
@@ -191,22 +190,6 @@ def test_comments_quotes_white_space_unknown_tags_and_line_ends_survive(tmp_path
     assert _canonical(before) == _canonical(after)
     for kept in (b"xyz='9 9 9'", b'xyz="8 8 8"', b"a &gt; b", "<!-- é".encode()):
         assert kept in after
-
-
-@pytest.mark.parametrize("link", ["leg1_b1_link", "leg3_seat", "leg4_end"])
-def test_a_leg_moves_alone_whose_link_carries_other_things(link: str, tmp_path: Path) -> None:
-    layout = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k < 4) for k in range(1, 6)]))
-    path = write_machine(tmp_path, of_types(["US"] * 6), layout)
-    urdf = path.with_suffix(".urdf")
-    extra = (
-        f'<link name="camera"/><joint name="camera_mount" type="fixed"><parent link="{link}"/>'
-        '<child link="camera"/></joint></robot>'
-    )
-    urdf.write_text(urdf.read_text().replace("</robot>", extra))
-    nominal = load_mechanism(path)
-    legs = other_legs(nominal, 3e-3)
-    written = write(nominal, legs, tmp_path)
-    assert max(map(apart, geometries(written), legs)) < 1e-10
 
 
 def test_a_leg_that_is_welded_to_the_platform_by_another_leg_is_refused(tmp_path: Path) -> None:
@@ -435,17 +418,3 @@ def test_errors_that_leave_no_closed_machine_are_refused_and_leave_nothing(
     with pytest.raises(ModelError, match=r"3 times a machine that .* in 3 draws") as caught:
         write_true_model(load_mechanism("hexapod"), huge, np.random.default_rng(0), tmp_path)
     assert str(tmp_path) not in str(caught.value)  # files that are gone
-
-
-def test_a_machine_without_enough_motors_gets_a_true_model_and_poses(tmp_path: Path) -> None:
-    path = tmp_path / "models" / "tricept.yaml"
-    path.parent.mkdir()
-    document = yaml.safe_load((ROOT / "models" / "tricept.yaml").read_text())
-    document["name_mot"] = document["name_mot"][1:]
-    document["legcal"]["urdf"] = str(ROOT / "urdf" / "tricept.urdf")
-    path.write_text(yaml.safe_dump(document))
-    nominal = load_mechanism(path)
-    assert not nominal.is_determined
-    true = _check(nominal, tmp_path / "true")
-    poses = draw_poses(true, 8, np.random.default_rng(0))
-    assert np.ptp(poses.readings, axis=0).min() > 0.02
