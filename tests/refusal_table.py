@@ -276,6 +276,7 @@ def _use() -> Iterable[Refusal]:
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
+        ("two-datasets", "calibrate a b -o out", ("needed one dataset", "docs/python.md")),
     ]
     yield from _worded("use", "", rows)
     existing = [text("thesis.tex", "years of work")]
@@ -334,7 +335,15 @@ def _options() -> Iterable[Refusal]:
         ("error-size", "--error joints=2m", ("2m", "1m")),
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
+        ("error-number", "--error joints=2", ("joints", "a number and its unit")),
+        ("error-shape", "--error joints=2mm:gauss", ("joints", "'gauss'")),
         ("camera", "--camera none.yaml", ("none.yaml",)),
+        ("camera-kind", "--camera webcm", ("'webcm'", "webcam, phone")),
+        ("camera-quality", "--camera phone:best", ("--camera", "'phone:best'")),
+        ("camera-two", "--camera phone --camera webcam", ("0 files and 2 kinds",)),
+        ("camera-level", "--camera phone --level outlines", ("--camera phone", "--level outlines")),
+        ("plan-poses", "--plan session --poses 3", ("--plan and --poses",)),
+        ("plan-held", "--plan session --hand-held", ("--plan and --hand-held",)),
         ("board", "--board chess", ("chess",)),
         ("hand-held", "--hand-held", ("--board",)),
         ("level", "--level pictures", ("--level", "pictures", "outlines")),

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +27,6 @@ from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.perception.board_corners import (
     SeenBoard,
-    board_in_words,
     describe_image,
     detect_corners,
     find_corners,
@@ -187,18 +185,6 @@ def test_pixels_of_a_rescaled_image_are_put_back_where_they_were(scale: float) -
     assert reduced(centroid, scale) == pytest.approx([31.3, 17.8], abs=0.03)
 
 
-def test_gamma_does_not_move_corners() -> None:
-    board, T, _ = plain_picture("charuco")
-    looks: dict[str, Any] = {"bits": 16, "electrons": np.inf}
-    (a, one, _), (b, other, _) = (
-        find_corners(board, picture(board, T, gamma=gamma, **looks)) for gamma in (1.0, 2.4)
-    )
-    both = np.intersect1d(a, b)
-    shift = one[np.isin(a, both)] - other[np.isin(b, both)]
-    assert len(both) > 10
-    assert np.abs(shift.mean(axis=0)).max() < 0.004
-
-
 @pytest.mark.parametrize("kind", [board.kind for board in BOARDS])
 def test_cameras_that_sharpen_move_no_corner(kind: str) -> None:
     """Edges overshoot by a tenth of the contrast and more, and a JPEG is coarse."""
@@ -306,44 +292,6 @@ def test_tags_of_a_mirrored_picture_are_named(kind: str) -> None:
     assert not tags_are_mirrored(board, image)
     assert tags_are_mirrored(board, image[:, ::-1])
     assert "mirrored" in str(describe_image(board, image[:, ::-1]))
-
-
-def _tags_of(board: Board) -> SeenBoard:
-    """Return the tags of an AprilGrid as a camera sees them."""
-    corners = board.points.reshape(board.rows, 2, board.columns, 2, 3)
-    middles = corners.mean(axis=(1, 3)).reshape(-1, 3)
-    px = LENS.project(before(board, 1.0, np.array([0.4, -0.3, 0.2])).apply(middles))
-    nothing = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp)
-    return SeenBoard("aprilgrid", *nothing, np.arange(len(px)), px)
-
-
-@pytest.mark.parametrize(
-    ("board", "changes", "words"),
-    [
-        (replace(APRILGRID, columns=6, rows=5), {}, ""),
-        (replace(APRILGRID, columns=6, rows=5), {"columns": 5, "rows": 6}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"columns": 7, "rows": 6}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"rows": 4}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"rows": 7}, "or that part of one is seen in 3 of"),
-        (CHARUCO, {}, ""),
-        (CHARUCO, {"columns": CHARUCO.rows, "rows": CHARUCO.columns}, "found"),
-        (CHARUCO, {"columns": CHARUCO.columns - 1}, "found"),
-    ],
-)
-def test_numbers_of_tags_say_how_many_columns_and_rows_there_are(
-    board: Board, changes: dict[str, int], words: str
-) -> None:
-    stated = replace(board, **changes)  # type: ignore[arg-type]
-    is_charuco = board.kind == "charuco"
-    seen = search_board(stated, plain_picture("charuco")[2]) if is_charuco else _tags_of(board)
-    shown, said = shown_board(stated, [seen] * 3)
-    if words == "found":
-        assert shown is None
-        assert said == f"{board_in_words(board)} in 3 of its 3 images"
-    else:
-        assert shown is stated
-        assert words in said
-        assert bool(words) == bool(said)
 
 
 @pytest.mark.parametrize("legacy", [False, True])

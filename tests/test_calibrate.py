@@ -31,6 +31,7 @@ from legcal.data.corners import found_corners
 from legcal.errors import (
     DatasetError,
     NotIdentifiable,
+    NotVisible,
 )
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
@@ -378,6 +379,13 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
     np.testing.assert_allclose(A, right_A, atol=1e-8)
 
 
+def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:
+    folder = _simulated(tmp_path, poses=2, views=1, board="charuco").folder
+    _change(folder / "corners.csv", lambda rows: rows[:2])
+    with pytest.raises(NotVisible, match="found no image with 4 of its corners or more"):
+        calibrate(folder)
+
+
 def _seen(n_views: int) -> BoardViews:
     none = np.zeros(0)
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
@@ -454,19 +462,3 @@ def test_good_photographs_give_no_notes(example_run: Run) -> None:
     usual = ("From the ", "The gamma of ", exact)
     assert sum(note.startswith(exact) for note in example_run.calibration.notes) == 1
     assert [note for note in example_run.calibration.notes if not note.startswith(usual)] == []
-
-
-def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(example_run.folder, tmp_path / "edited"))
-    path = folder / "observations.csv"
-    lines = path.read_text().splitlines()
-    k = next(i for i, line in enumerate(lines) if ",used,,detected," in line)
-    lines[k] = lines[k].replace(",used,,detected", ",rejected,a reflection,edited")
-    path.write_text("\n".join(lines) + "\n")
-    result = calibrate(folder, output=tmp_path / "out")
-    key = ",".join(lines[k].split(",")[:5])
-    for table in (path, tmp_path / "out/observations.csv"):
-        [kept] = [line for line in table.read_text().splitlines() if line.startswith(key + ",")]
-        assert all(word in kept for word in (",rejected,", ",edited,", "a reflection"))
-    before, after = example_run.calibration.solution.outlines, result.solution.outlines
-    assert after.used.sum() < before.used.sum()

@@ -342,15 +342,6 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert [i["sigma"] for i in document["intrinsics"]] == found.sigma.tolist()
 
 
-def test_inner_corners_that_are_stated_for_squares_are_found_out(
-    found: CameraCalibration, folder: Path
-) -> None:
-    again = calibrate_camera(folder, "chessboard:8x5:30mm")
-    assert (again.board.columns, again.board.rows) == (9, 6)
-    assert "write --board chessboard:9x6" in again.warnings[0]
-    assert np.abs((again.values - found.values) / found.sigma).max() < 1e-4  # the same minimum
-
-
 def test_the_file_is_a_camera_info_with_the_whole_covariance(
     found: CameraCalibration, folder: Path
 ) -> None:

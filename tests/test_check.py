@@ -282,6 +282,14 @@ def test_the_simplest_change_that_suffices_is_named_with_its_size(
     assert best.sigma[0] < 0.1 * abs(moved[columns[0]])
 
 
+def test_a_change_that_the_new_images_do_not_determine_raises_no_alarm() -> None:
+    moved = np.zeros(N)
+    moved[-1] = 3.0 * PRIOR[-1]
+    assert not any(_compare(seed, moved, significance=1e-3).moved for seed in range(20))
+    with pytest.raises(NotIdentifiable, match="determine no direction"):
+        difference(np.zeros(N), np.diag(0.9 * PRIOR**2), PRIOR, np.zeros(N), np.zeros((N, N)))
+
+
 def test_priors_that_data_dominate_are_no_degrees_of_freedom() -> None:
     """A linear fit of n data with unit noise and wide priors of p parameters: n - p are left."""
     rng, n, p = np.random.default_rng(7), 40, 5

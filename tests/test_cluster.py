@@ -25,7 +25,7 @@ from toy_studies import Draws
 
 from legcal import workers
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation.study import run_study
+from legcal.simulation.study import CHECKPOINT_NAME, run_study
 from legcal.workers import Workers, worker_pool
 
 
@@ -154,6 +154,39 @@ def test_a_calibration_on_a_cluster_is_that_of_this_process_byte_for_byte(
         assert run_command(monkeypatch, *there) == code
     assert files_of(Path("there")) == files_of(Path("here"))
     assert "result.json" in files_of(Path("there"))
+
+
+@pytest.mark.system
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_study_outlives_a_worker_and_keeps_its_runs_when_the_scheduler_stops(
+    tmp_path: Path,
+) -> None:
+    def after(n_lines: int, action: Any) -> Thread:
+        def watch() -> None:
+            path, end = tmp_path / "out" / CHECKPOINT_NAME, time.monotonic() + 60.0
+            while time.monotonic() < end:
+                if path.exists() and path.read_bytes().count(b"\n") >= n_lines:
+                    break
+                time.sleep(0.02)
+            action()
+
+        thread = Thread(target=watch)
+        thread.start()
+        return thread
+
+    study, out = Draws(seconds=0.05), tmp_path / "out"
+    with local_cluster(tmp_path / "cluster", 2) as local:
+        acting = after(40, local.workers[0].kill)
+        found = run_study(study, 100, workers=local.address, output=out)
+        acting.join()
+        assert found.document() == run_study(Draws(), 100).document()
+        stopping = after(120, local.scheduler.kill)
+        with pytest.raises(OutOfResources, match="does not answer any more") as told:
+            run_study(study, 400, workers=local.address, output=out)
+        stopping.join()
+        assert len(told.value.problems) == 1
+    whole = run_study(Draws(), 400)
+    assert run_study(Draws(), 400, output=out).document() == whole.document()
 
 
 @pytest.mark.system

@@ -31,6 +31,7 @@ from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
     BadImage,
+    decode_image,
     image_size,
     inspect_image,
     read_image,
@@ -205,6 +206,42 @@ def test_paths_that_leave_the_folder_or_cannot_be_are_refused(folder: Folder, im
     folder.rows[2]["image"] = image
     with pytest.raises(DatasetError, match=r"row 3 .*found (it also in|a path that cannot)"):
         read(folder)
+
+
+def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folder) -> None:
+    path = folder.path / "images/c1_2.png"
+    path.write_bytes(path.read_bytes()[:-30])
+    folder.rows[3]["image"] = ""
+    dataset = load_dataset(folder.write(), check_images=False)
+    assert dataset.image_path(3) is None
+    for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
+        with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
+            dataset.image_reader([row])(0)
+
+
+def test_an_image_is_decoded_once_until_its_file_changes(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded = list[Path]()
+
+    def decode(path: Path, camera: Camera, where: str) -> object:
+        decoded.append(path)
+        return decode_image(path, camera, where)
+
+    monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
+    read = load_dataset(folder.write()).image_reader([0, 1])
+    first = [read(k) for k in (0, 1)]
+    again = [read(k) for k in (0, 1)]
+    assert len(decoded) == 2
+    assert all(one.dtype == np.float32 for one in again)
+    np.testing.assert_array_equal(again, first)
+    again[0][:] = 0.0
+    np.testing.assert_array_equal(read(0), first[0])
+    decoded[0].write_bytes(decoded[1].read_bytes())
+    np.testing.assert_array_equal(read(0), first[1])
+    decoded[0].unlink()
+    with pytest.raises(DatasetError, match="needed the file there"):
+        read(0)
 
 
 # --- image files

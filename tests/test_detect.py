@@ -20,18 +20,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal import detect, doctor, load_dataset
 from legcal.calibration.detection import Detection
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import examination_page
-from legcal.data.corners import found_corners
 from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
 from legcal.perception.overlays import (
-    COLOURS,
     PartMarks,
-    draw,
-    marks_of_corners,
     marks_of_image,
 )
 from legcal.vision.camera import Camera
@@ -149,19 +144,6 @@ def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should
     assert len(lines) > 10
     assert np.nanmedian(off) < 2.0
     assert np.nanmin(signs) > 0.0  # the first end is nearer to the base
-
-
-def test_pages_of_many_images_show_the_worst_and_leave_out_a_table_that_is_too_long(
-    examined: Examination, found: Detection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("legcal.calibration.examination_page.MAX_ROWS", 2)
-    monkeypatch.setattr("legcal.calibration.examination_page.MAX_BYTES", 1000)
-    page: Any = html.fromstring(examination_page(examined, found))
-    captions = page.xpath("//figure//figcaption/text()")
-    assert [text.split(":")[0] for text in captions] == [BLANK, ASIDE]
-    assert "The 2 of 5 images with the fewest used outlines are shown." in page.xpath("string()")
-    assert "There are more outlines than a page should hold." in page.xpath("string()")
-    assert page.xpath("//dialog[@id='editor'] | //button[@data-edit]") == []
 
 
 def test_the_written_table_is_read_as_what_was_found(
@@ -313,19 +295,3 @@ def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_
         assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
     gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
     assert marks_of_image(cam, gone, predicted(cam), NAMES) == []
-
-
-def test_corners_of_boards_are_crosses_where_they_were_found() -> None:
-    px, none = np.array([[300.2, 200.0], [1200.0, 700.5]]), np.zeros(2, dtype=np.intp)
-    found = found_corners(none, none, px, np.ones(2))
-    found = replace(
-        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.OTHER, "far off"))
-    )
-    grey = np.full((1200, 1600), 100.0)
-    picture = draw(grey, [], "c1 a.png", marks_of_corners(found)).astype(int)
-    for (x, y), colour in zip(px, (COLOURS["corner"], COLOURS["rejected"]), strict=True):
-        is_lit = np.abs(picture[:1200] - np.array(colour)).max(axis=2) < 60
-        rows, columns = np.nonzero(is_lit)
-        assert abs(rows.mean() - y) < 0.6
-        assert abs(columns.mean() - x) < 0.6
-    assert np.any(picture[1200:] != draw(grey, [], "c1 a.png")[1200:])  # the legend says so

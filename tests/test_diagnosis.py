@@ -25,8 +25,6 @@ from legcal.progress import no_progress
 from legcal.simulation.dataset import simulate
 from legcal.workers import in_turn
 
-COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
-
 
 def _exchange(one: str, other: str) -> Callable[[Spoiled], None]:
     def change(session: Spoiled) -> None:
@@ -34,14 +32,6 @@ def _exchange(one: str, other: str) -> Callable[[Spoiled], None]:
             row[one], row[other] = row[other], row[one]
 
     return change
-
-
-def _numbers(change: Callable[[float], float]) -> Callable[[Spoiled], None]:
-    def of_all(session: Spoiled) -> None:
-        for row in session.rows:
-            row.update({name: f"{change(float(row[name])):.9f}" for name in COLUMNS})
-
-    return of_all
 
 
 @pytest.mark.system  # fifty mistakes are tried
@@ -330,26 +320,3 @@ def test_a_table_of_outlines_in_another_form_is_called_what_it_looks_like(
         load_dataset(folder)
     assert (len(refusal.value.problems) == 1) == bool(cause)
     assert f"they would suit them if {cause}" in refusal.value.problems[0] or not cause
-
-
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        (lambda q: 1e3 * q, "millimetres: divide them by 1000"),
-        (lambda q: q + 0.345, "whole leg lengths: subtract"),
-        (lambda q: 1e3 * (q + 0.345), "whole leg lengths in millimetres"),
-        (lambda q: 1e2 * q, "centimetres"),
-        (lambda q: q / 0.0254, "inches"),
-        (lambda q: -q - 0.01, "readings with the opposite sign"),
-    ],
-)
-def test_readings_outside_the_travel_are_called_what_they_look_like(
-    change: Callable[[float], float], cause: str, tmp_path: Path
-) -> None:
-    session = spoiled(tmp_path / "set", 4, ("c1",))
-    _numbers(change)(session)
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(session.write())
-    (problem,) = refusal.value.problems
-    assert f"these look like {cause}" in problem
-    assert "columns leg1_prismatic, leg2_prismatic" in problem

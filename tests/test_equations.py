@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from random_legs import changed, closed_leg, leg_and_pose
 from scipy.spatial.transform import Rotation
 
+from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations, pose_equations, pose_sensitivity
@@ -242,3 +243,9 @@ def _residual(legs: Sequence[Leg], readings: Sequence[float], R: Array, t: Array
             rows.append(values[0] - (reading if leg.kind is ACTUATED else 0.0))
         rows += (length * values[1:]).tolist()
     return np.array(rows)
+
+
+def test_too_few_equations_do_not_move_the_platform_anywhere() -> None:
+    legs, R, t = legs_of(["US"] * 6, 0, [*[ACTUATED] * 5, PASSIVE])
+    with pytest.raises(NotIdentifiable, match="the 5 readings do not determine platform pose 1"):
+        pose_sensitivity(legs, parametrized(legs), (0, 1, 2), R[None], t[None])

@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
-from command_line import run
 from hexapod_example import Run
 from layouts import Layout, write_machine
 from lxml import etree
@@ -30,7 +29,7 @@ from thinned import thinned
 import legcal
 from legcal import load_mechanism
 from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, UsageError
-from legcal.exports.formats import FORMATS, export, formats_of
+from legcal.exports.formats import export, formats_of
 from legcal.exports.identifiers import identifiers
 from legcal.exports.subject import ExportOptions, Subject, load_subject
 from legcal.geometry.types import Array
@@ -539,19 +538,3 @@ def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_writt
     assert there.read_text().startswith("hexapod")
     export("hexapod", "ros", tmp_path / "ros", force=True)
     assert yaml.safe_load((tmp_path / "ros/calibration.yaml").read_text())["robot"] == "hexapod"
-
-
-def test_the_command_says_what_it_wrote(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        run(monkeypatch, "export", "hexapod", "--to", "csv", "-o", tmp_path / "a.csv", "--json")
-        == 0
-    )
-    found = json.loads(capsys.readouterr().out)
-    assert found["written"] == [str(tmp_path / "a.csv")]
-    assert (
-        run(monkeypatch, "export", "3-rps", "--to", "linuxcnc", "-o", tmp_path / "b", "--json") == 1
-    )
-    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "OutOfClass"
-    assert set(FORMATS) >= {"table", "csv", "json", "urdf", "mjcf", "linuxcnc", "ros", "correction"}

@@ -17,16 +17,15 @@ from dataset_folder import Folder, folder
 from pool_work import row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import load_dataset, load_mechanism
-from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
-from legcal.files.folder import check_destination, result_folder, write_atomically
+from legcal import load_dataset
+from legcal.errors import DatasetError, OutOfResources
+from legcal.files.folder import result_folder, write_atomically
 from legcal.files.schema import parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import Run, worker_pool
 
 __all__ = ["folder"]
 
-LONG = "a" * 400
 
 POOL = """
 import multiprocessing, os, time
@@ -222,20 +221,6 @@ def test_a_view_whose_name_a_table_cannot_hold_is_refused(folder: Folder, name: 
     folder.entry["views"][name] = folder.entry["views"]["c2"]
     with pytest.raises(DatasetError, match="needed printable characters"):
         load_dataset(folder.write())
-
-
-def test_names_that_are_too_long_are_those_of_no_file(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load_mechanism)
-    for key in ("measurements", "mechanism"):
-        folder.entry[key] = LONG
-        with pytest.raises((DatasetError, ModelError), match="found no such file"):
-            load_dataset(folder.write())
-    with pytest.raises(DatasetError, match="found no"):
-        load_dataset(LONG)
-    with pytest.raises(UsageError, match="File name too long"):
-        check_destination(Path(LONG))
 
 
 @pytest.mark.parametrize("value", ["!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"])

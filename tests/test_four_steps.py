@@ -10,7 +10,6 @@ import pytest
 from actuated_sessions import MACHINES as ACTUATED
 from actuated_sessions import session as actuated
 from hexapod_sessions import extreme_poses, nominal_of
-from scipy.spatial.transform import RigidTransform, Rotation
 from staged_sessions import Observed, errors, exact_session, noisy_session, planned, shipped, staged
 from thinned import thinned
 
@@ -19,7 +18,6 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs
 from legcal.machine.parameters import from_vector, to_vector
-from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_base_steps, run_platform_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
@@ -259,23 +257,6 @@ def test_scaling_all_lengths_scales_the_result() -> None:
 
 
 # Where cameras stand
-
-
-def test_axes_across_the_line_of_two_joints_place_a_camera_unless_two_places_fit_alike() -> None:
-    A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    across = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1]])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    T = RigidTransform.from_components([0.2, -0.3, 1.0], Rotation.from_rotvec([0.4, 0.2, -0.3]))
-    seen = T.apply(A), T.rotation.apply(across) * [[1.0], [-1.0]]
-    (found,), fixed = candidate_camera_poses(A, across, *seen)
-    assert fixed
-    assert np.abs((found * T).as_matrix() - np.eye(4)).max() < 0.01  # of the turns that are tried
-    assert signs_seen(across, seen[1], found).tolist() == [1.0, -1.0]
-    square = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
-    assert len(candidate_camera_poses(A, square, A, square)[0]) == 2  # half a turn about the line
-    along = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    assert candidate_camera_poses(A, along, A, along)[1] is False
-    assert candidate_camera_poses(A[:1], along[:1], A[:1], along[:1]) == ([], False)
 
 
 # Which legs and images take part, and refusals

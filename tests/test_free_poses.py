@@ -5,27 +5,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
-from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
+from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.scale import naming_missing_lengths
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import LegcalError, NotIdentifiable
+from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.free_poses import find_free_poses
+from legcal.perception.free_poses import find_free_poses, require_standing_joints
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
 from legcal.simulation.dataset import simulate
@@ -257,6 +261,14 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     }
 
 
+def five_carriages(folder: Path) -> Machine:
+    """A Hexaglide that has lost a carriage, so that its motors leave a freedom."""
+    table = yaml.safe_load((ROOT / "models/tables/hexaglide.yaml").read_text()) | {"type": "5-PSS"}
+    del table["actuators"]["rail6"], table["base_joints"][5], table["platform_joints"][5]
+    (folder / "five.yaml").write_text(yaml.safe_dump(table))
+    return create_model(read_table(folder / "five.yaml"), folder).machine
+
+
 @pytest.mark.system
 def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
     tmp_path: Path,
@@ -302,6 +314,21 @@ def test_without_a_rough_camera_pose_no_image_is_searched(
     assert "write T_base_camera" in problem
 
 
+def test_images_are_not_searched_where_neither_poses_nor_base_joints_are_known(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(NotIdentifiable, match=r"joints at A that move.*5 motors.*observations"):
+        require_standing_joints(five_carriages(tmp_path))
+
+
+def test_no_images_are_kept_aside_where_readings_give_no_poses(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = free_set(folder, monkeypatch, tmp_path)
+    with pytest.raises(UsageError, match="3 motors do not determine the pose"):
+        legcal.calibrate(path, holdout=0.25)
+
+
 @pytest.mark.parametrize(("kind", "says"), [("6-UPS by hand", True), ("5-SPS", False)])
 def test_a_fit_that_fails_without_any_length_says_what_to_measure(
     kind: str, says: bool, tmp_path: Path
@@ -313,6 +340,14 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
         refine(session.legs, session.measurements, some, session.start)
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
+
+
+def test_of_arms_one_length_is_to_be_measured() -> None:
+    session = machine_session("servo-hexapod", n_views=1, n_poses=1)
+    problem = build_fit(session.legs, session.measurements, session.outlines)
+    with pytest.raises(NotIdentifiable) as refusal, naming_missing_lengths(problem):
+        raise NotIdentifiable("It is not determined.")
+    assert "state it (--length)" in refusal.value.problems[0]
 
 
 def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_path: Path) -> None:

@@ -6,24 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from layouts import Layout, LegLayout, write_machine
 from machines import (
     MACHINES,
     SHIPPED,
     displaced,
-    exechon,
     of_types,
     write_home,
 )
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal import identifiability
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
 from legcal.machine.equations import pose_equations
-from legcal.machine.home import legs_outside
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
@@ -118,21 +114,6 @@ def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) 
     np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
 
 
-@pytest.mark.parametrize("layout", [Layout(), CARRIED])
-def test_where_a_file_without_a_block_draws_open_loops_travel_decides(
-    layout: Layout, tmp_path: Path
-) -> None:
-    path = write_machine(tmp_path, exechon(), layout)
-    document = yaml.safe_load(path.read_text())
-    document.pop("legcal")
-    path.write_text(yaml.safe_dump(document))
-    machine = load_mechanism(path)
-    check_closed(machine)
-    assert any("the file draws no closed pose" in note for note in machine.diagnostics)
-    middle = [np.mean(leg.travel) for leg in machine.legs]
-    np.testing.assert_allclose(readings_at(machine, machine.home), middle, atol=1e-9)
-
-
 def test_that_there_is_no_home_at_all_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,15 +163,3 @@ def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
     ) as caught:
         load_mechanism(path)
     assert len(caught.value.problems) == 1
-
-
-@pytest.mark.parametrize(("z", "n_legs"), [(0.55, 6), (0.3, 3)])
-def test_a_home_a_little_out_of_the_travel_is_noted(z: float, n_legs: int, tmp_path: Path) -> None:
-    path = write_home(tmp_path, "hexapod", RigidTransform.from_translation([0.0, 0.0, z]))
-    machine = load_mechanism(path)
-    assert len(legs_outside(machine)) == n_legs
-    assert sum("outside its travel" in note for note in machine.diagnostics) == n_legs
-    if z > 0.5:  # planned poses go there
-        notes = identifiability(machine, [machine.leg_names], 3).notes
-        assert any("outside their travel by more than 5 %" in note for note in notes)
-    assert legs_outside(machine_of("hexapod")) == {}

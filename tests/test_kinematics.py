@@ -2,13 +2,10 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from layouts import Layout, LegLayout, write_machine
 from machines import MACHINES, SHIPPED, displaced, of_types
 from scipy.spatial.transform import RigidTransform
@@ -153,30 +150,6 @@ def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: 
 # --- closed forms and other routes --------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
-@given(xyz=st.tuples(*[st.floats(-0.05, 0.05)] * 3), turn=st.tuples(*[st.floats(-0.25, 0.25)] * 3))
-def test_a_hexapod_goes_where_its_leg_lengths_put_it(
-    xyz: tuple[float, ...], turn: tuple[float, ...]
-) -> None:
-    hexapod = machine_of("hexapod")
-    T = displaced(hexapod.home, [*turn, *xyz])
-    q = inverse_kinematics(hexapod, T)
-    lengths = np.linalg.norm(T.apply(hexapod.B_platform) - hexapod.A_base, axis=1)
-    np.testing.assert_allclose(q, lengths - hexapod.q0, atol=1e-12)
-    np.testing.assert_allclose(
-        forward_kinematics(hexapod, q).as_matrix(), T.as_matrix(), atol=1e-11
-    )
-
-
-def test_a_path_of_readings_gives_a_continuous_path_of_poses() -> None:
-    start, end = np.zeros(6), np.array([0.14, 0.0, 0.14, 0.02, 0.1, 0.03])
-    q = start + np.linspace(0.0, 1.0, 60)[:, None] * (end - start)
-    for one, two in pairwise(forward_kinematics_many(machine_of("hexapod"), q)):
-        step = one.inv() * two
-        assert np.linalg.norm(step.translation) < 0.02
-        assert step.rotation.magnitude() < 0.05
-
-
 def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
     machine, drawn = machine_of("3-rpr"), drawn_of("3-rpr")
     A, B = machine.A_base, machine.B_platform
@@ -270,19 +243,6 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
 
 
 # --- random configurations ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept"])
-def test_without_enough_motors_home_wanders_inside_the_travel(name: str) -> None:
-    machine = without_a_motor(name)
-    drawn = random_configurations(machine, 10, 1)
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    for configuration, q in zip(drawn.configurations, drawn.readings, strict=True):
-        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
-        assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
-    assert np.ptp(drawn.readings, axis=0).min() > 1e-3
-    middles: Array = np.array([T.translation for T in drawn.poses])
-    assert np.ptp(middles, axis=0).max() > 5e-3
 
 
 # --- refusals -----------------------------------------------------------------------------------

@@ -165,19 +165,6 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     assert beside.noise.reading == pytest.approx(50e-6)
 
 
-def test_few_poses_and_weak_directions_are_noted() -> None:
-    weak = near_home("hexapod", 12, 0.02, (0.01, 0.01, 1.0))
-    notes = locate(weak.machine, weak.poses).notes
-    assert any("the position of the tool in the platform along" in note for note in notes)
-    hexapod = made("hexapod", 20)
-    notes = locate(hexapod.machine, hexapod.rows(range(3))).notes
-    assert any("A wrong row among the 3 poses" in note for note in notes)
-    one = replace(hexapod.poses, oriented=np.arange(20) == 4)
-    found = locate(hexapod.machine, one, angle_sigma=SIGMA_ANGLE)
-    assert found.has_tool_orientation
-    assert found.sigma[9:].max() > 0.9 * SIGMA_ANGLE
-
-
 def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Located:
     hexapod = located("hexapod", n)
     position = change(hexapod.poses.position)
@@ -325,23 +312,6 @@ def test_a_table_says_the_same_as_arrays(tmp_path: Path) -> None:
     ]
     write_rows(path, short)
     assert "quaternions were made unit" in locate(hexapod.machine, path, angle_sigma=1e-3).notes[0]
-
-
-@pytest.mark.parametrize(
-    ("cells", "named"),
-    [
-        ({"position_sigma": "0"}, ("position_sigma", "'0'")),
-        ({"position_sigma": ""}, ("position_sigma", "empty cell")),
-    ],
-)
-def test_sigmas_of_a_table_are_read_strictly(
-    tmp_path: Path, cells: dict[str, str], named: tuple[str, ...]
-) -> None:
-    rows = write_poses(tmp_path / "poses.csv", made("hexapod", 4))
-    write_rows(tmp_path / "poses.csv", [row | cells for row in rows])
-    with pytest.raises(DatasetError) as refused:
-        locate(shipped("hexapod"), tmp_path / "poses.csv")
-    assert [word for word in named if word not in str(refused.value)] == []
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal import load_mechanism
-from legcal.errors import LegcalError
+from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.chain import ClosedChain
 from legcal.machine.mjcf import MjcfReader
@@ -119,6 +119,14 @@ def test_what_is_written_down_loads_with_an_equal_analysis(
     assert_same_analysis(written, found)
     for key in ("leg_names", "frame_legs", "platform_joint"):
         assert getattr(written, key) == getattr(found, key)
+
+
+def test_a_urdf_that_needs_no_change_is_copied_and_nothing_written_over(tmp_path: Path) -> None:
+    machine = machine_of("hexapod")
+    _, urdf_path = write_model(machine, tmp_path)
+    assert urdf_path.read_bytes() == machine.urdf_path.read_bytes()
+    with pytest.raises(UsageError, match="already there, needed new files"):
+        write_model(machine, tmp_path)
 
 
 def test_what_closes_no_loop_is_left_out_of_an_mjcf_scene(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -16,6 +17,7 @@ from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 from outside_machines import missing, scaled
 from thinned import thinned
 
+from legcal.errors import UsageError
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
@@ -339,6 +341,24 @@ def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
         assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.01}
     centre = load_mechanism("tricept").legs[3]
     assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}
+
+
+def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
+    machine = load_mechanism("hexapod")
+    names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")
+    other = machine.with_leg_order(names)
+    assert other.leg_names == names
+    assert [names[j] for j in other.frame_legs] == ["leg1", "leg3", "leg5"]
+    q = inverse_kinematics(machine, machine.home) + np.linspace(0.0, 0.02, 6)
+    expected = forward_kinematics(machine, q).as_matrix()
+    reordered = q[[machine.leg_names.index(name) for name in names]]
+    np.testing.assert_allclose(
+        forward_kinematics(other, reordered).as_matrix(), expected, atol=1e-12
+    )
+    copy = pickle.loads(pickle.dumps(machine))
+    np.testing.assert_allclose(forward_kinematics(copy, q).as_matrix(), expected, atol=1e-13)
+    with pytest.raises(UsageError, match="each of leg1"):
+        machine.with_leg_order(["leg1"])
 
 
 def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(

@@ -46,6 +46,13 @@ def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
         few.run()
 
 
+def test_steps_of_planar_machines_with_arms_are_refused() -> None:
+    observed = seen("delta")
+    planar = replace(observed, nominal=replace(observed.nominal, frame_legs=(0, 2)))
+    with pytest.raises(NotIdentifiable, match="moves in a plane, needed a machine that moves in"):
+        planar.run()
+
+
 def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
     observed = seen("linear-delta", noise=0.01)
     m = observed.measurements

@@ -1,6 +1,7 @@
 """Models written from tables and families: what is written is what was stated, and it closes."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass, UsageError
+from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.files import shipped_names
@@ -199,18 +200,6 @@ def test_millimetres_metres_and_csv_give_the_same_files(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
-@pytest.mark.parametrize("travel", [[None, [0, 150], [0, 150]], [0, 150]])
-def test_a_passive_slider_reads_its_length_and_moves_freely(
-    tmp_path: Path, travel: list[Any]
-) -> None:
-    passive = {"kinds": ["passive", None, None], "offsets": [None, 380, 380], "travel": travel}
-    machine = made(tmp_path, type="SPS", **passive)
-    leg = machine.legs[0]
-    length = float(np.linalg.norm(machine.home.apply(leg.B) - leg.A))
-    assert (leg.kind, leg.q0) == (LegKind.PASSIVE, 0.0)
-    np.testing.assert_allclose(leg.travel, [0.5 * length, 1.5 * length])
-
-
 def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
     base = [[400, 0, 0], [-200, 0, 346], [-200, 0, -346]]
     platform = [[140, 0, 0], [-70, 0, 121], [-70, 0, -121]]
@@ -286,6 +275,27 @@ def test_the_delta_is_the_shipped_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
 
 
+HEAD = "type,base_x,base_y,platform_x,platform_y"
+
+
+def test_a_csv_whose_file_name_is_no_name_needs_one(tmp_path: Path) -> None:
+    path = tmp_path / "my machine (2).csv"
+    path.write_text(f"{HEAD}\nSS,1,2,3,4\nSS,5,6,7,8\n")
+    with pytest.raises(ModelError, match=r"'my machine \(2\)'.*--name NAME"):
+        read_table(path, "mm")
+    assert read_table(path, "mm", "mine").name == "mine"
+
+
+def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:
+    path = write_table(tmp_path, unit=None)
+    assert read_table(path, "mm").legs[0].offset == 0.38
+    with pytest.raises(UsageError, match="'inch', needed mm or m"):
+        read_table(path, "inch")
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    with pytest.raises(ModelError, match="needed 'key: value' lines"):
+        read_table(tmp_path / "list.yaml")
+
+
 # --- files ------------------------------------------------------------------------------------
 
 
@@ -299,3 +309,25 @@ def test_files_that_are_there_stay_without_force(tmp_path: Path) -> None:
         read_table(write_table(tmp_path, offsets=385)), tmp_path, force=True
     ).machine
     np.testing.assert_allclose(machine.q0, 0.385, atol=1e-15)
+
+
+def test_what_stands_in_the_way_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = read_table(write_table(tmp_path))
+    blocked, file = tmp_path / "blocked", tmp_path / "file"
+    (blocked / "models" / "tripod.yaml").mkdir(parents=True)
+    file.write_text("")
+    with pytest.raises(UsageError, match=r"the folder .*tripod.yaml"):
+        create_model(machine, blocked, force=True)
+    assert not (blocked / "urdf").exists()
+    with pytest.raises(OutOfResources, match="the model could not be written"):
+        create_model(machine, file / "folder")
+
+    def refuse(path: Path) -> None:
+        raise OutOfClass(f"{path}: this machine is outside the method.")
+
+    monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
+    with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):
+        create_model(machine, tmp_path / "new" / "folder")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["blocked", "file", "table.yaml"]

@@ -385,33 +385,6 @@ def test_of_two_edges_too_near_to_each_other_the_surer_is_the_outline(surer: int
     assert found.bias == pytest.approx(3.0 * NARROW_BIAS)
 
 
-@pytest.mark.parametrize(
-    ("off", "sigma", "is_step"),
-    [(3.0, 0.1, True), (-3.0, 0.28, True), (-3.0, 0.1, False)],
-    ids=["too far from each other", "about as sure", "no step"],
-)
-def test_otherwise_edges_at_another_distance_are_not_used(
-    off: float, sigma: float, is_step: bool
-) -> None:
-    one = _edge(np.zeros(2), sigma=sigma, is_step=is_step)
-    found = _judged(off, one, _edge(WIDTH + off, sigma=0.3))
-    assert all(reason.reason is Reason.WIDTH for reason in found.reasons)
-
-
-@pytest.mark.parametrize(
-    ("off", "alone", "kept", "used"),
-    [(0.5, False, 1.0, True), (4.0, False, 1.0, False), (4.0, True, 1.0, True),
-     (0.5, False, 0.4, False)],
-    ids=["found at its distance", "found elsewhere", "convincing alone", "half of it seen"],
-)  # fmt: skip
-def test_an_edge_whose_partner_was_found_but_not_measured(
-    off: float, alone: bool, kept: float, used: bool
-) -> None:
-    found = _judged(off, _edge(np.zeros(2), kept=kept), None, alone=alone)
-    expected = USED if used else Rejection(Reason.PARTNER, Reason.FAINT)
-    assert found.reasons == (expected, Rejection(Reason.FAINT))
-
-
 @pytest.mark.parametrize(("beside", "used"), [(0.5, True), (3.0, False)])
 def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, used: bool) -> None:
     found = _judged(6.0, _edge(np.full(2, beside)), _edge(WIDTH + 6.0), window=5.0)

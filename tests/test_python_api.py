@@ -15,7 +15,7 @@ from matplotlib import pyplot
 from simulated import simulated
 
 import legcal
-from legcal.errors import UsageError
+from legcal.errors import OutOfResources, UsageError
 from legcal.simulation.settings import Level
 
 
@@ -57,6 +57,12 @@ def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run
     assert repr(table).count("\n") == len(table)
 
 
+def test_pandas_is_asked_for_by_name(example_run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(OutOfResources, match="pip install pandas"):
+        example_run.calibration.table().to_pandas()
+
+
 def test_figures_show_every_view_and_every_parameter(example_run: Run) -> None:
     calibration = example_run.calibration
     residuals, sigma = calibration.plot_residuals(), calibration.plot_uncertainty()
@@ -72,10 +78,8 @@ def test_progress_can_be_switched_on_and_a_fit_without_outlines_has_no_residuals
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     simulated(tmp_path / "set", "3-rpr", level=Level.AXES, views=3, poses=6)
-    legcal.calibrate(tmp_path / "set", progress=True)
+    calibration = legcal.calibrate(tmp_path / "set", progress=True)
     assert "Joint fit: 1/1" in capsys.readouterr().err
-    calibration = legcal.calibrate(tmp_path / "set", progress=False)
-    assert capsys.readouterr().err == ""
     with pytest.raises(UsageError, match="found a fit without outlines"):
         calibration.plot_residuals()
 
@@ -104,6 +108,7 @@ def test_notebooks_show_other_objects_as_tables_of_text() -> None:
     assert "<b>" not in html
 
 
+@pytest.mark.system
 def test_the_examples_of_the_page_on_python_print_what_it_says(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

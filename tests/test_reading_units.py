@@ -98,15 +98,6 @@ def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_
     assert "opposite sign" in said
 
 
-@pytest.mark.parametrize("sigma", ["0.5deg", "0.1deg"])
-def test_readings_are_outside_the_travel_by_more_than_noise(sigma: str, tmp_path: Path) -> None:
-    angles = ANGLES.copy()
-    angles[1, 2] = np.radians(46.0)
-    entry = {"encoder_sigma": dict.fromkeys(SERVOS, sigma)}
-    notes = load_dataset(dataset_of_readings(tmp_path, angles, entry), check_images=False).notes
-    assert sum("outside the travel" in note for note in notes) == (sigma == "0.1deg")
-
-
 def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_they_are_given(
     tmp_path: Path,
 ) -> None:

@@ -22,7 +22,7 @@ from legcal.data.reasons import Reason, Rejection
 
 pytestmark = pytest.mark.system
 
-INTERACTIVE = 2000  # [ms]
+
 HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
 
 
@@ -142,19 +142,6 @@ def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
     )
     assert page.execute_script(width) < 0.5 * before
     page.execute_script("document.getElementById('enlarged').close()")
-
-
-def test_it_is_interactive_within_two_seconds(example_run: Run, browser: Any) -> None:
-    path = legcal.write_report(example_run.calibration, example_run.output)
-    times = []
-    for _ in range(3):  # the best: others work on this machine too
-        browser.get(path.as_uri())
-        times.append(
-            browser.execute_script(
-                "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
-            )
-        )
-    assert min(times) <= INTERACTIVE
 
 
 def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path) -> None:

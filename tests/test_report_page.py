@@ -169,6 +169,16 @@ def test_hostile_names_are_harmless(example_run: Run, tmp_path: Path) -> None:
         assert not re.search(r"<[b/s]", script.text.replace("<br>", "").replace("<extra>", ""))
 
 
+@pytest.mark.usefixtures("page")  # which writes the report of the result
+def test_a_report_is_not_written_over_another_file(example_run: Run, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(UsageError, match=r"report\.html"):
+        legcal.write_report(example_run.calibration, tmp_path)
+    assert (tmp_path / "report.html").read_text() == "mine"
+    (tmp_path / "report.html").write_bytes((example_run.output / "report.html").read_bytes())
+    assert legcal.write_report(example_run.calibration, tmp_path).exists()
+
+
 def _writing(calibration: Calibration) -> Any:
     """Return a calibration of no time, which writes its result."""
 
@@ -286,6 +296,21 @@ def test_points_lead_to_overlays_beside_the_page(example_run: Run, tmp_path: Pat
         legcal.calibrate(calibration.dataset, output=tmp_path, overlays=True)
     with pytest.raises(UsageError, match="no output folder"):
         legcal.calibrate(calibration.dataset, overlays=True)
+
+
+def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
+    example_run: Run, tmp_path: Path
+) -> None:
+    calibration = with_overlays(example_run.calibration)
+    moved = replace(calibration.dataset, folder=tmp_path / "gone")
+    written = write_result(replace(calibration, dataset=moved), tmp_path / "out")
+    assert "There are no overlays." in written.notes[-1]
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert "overlays" not in result
+    assert result["notes"] == list(written.notes)
+    assert not (tmp_path / "out" / "overlays").exists()
+    with pytest.raises(UsageError, match="found no photograph"):
+        legcal.calibrate(moved, output=tmp_path / "out", overlays=True)
 
 
 def test_other_commands_write_what_they_print_as_a_page(

@@ -11,7 +11,7 @@ import pytest
 from machines import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DatasetError, DidNotConverge, ModelError
+from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.configurations import MIN_SINGULARITY, Configurations
 from legcal.machine.feasibility import JITTER, Feasibility
@@ -60,13 +60,6 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:
         assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
-
-
-def test_poses_of_the_workspace_are_anywhere_in_the_travel() -> None:
-    machine = load_mechanism("hexapod")
-    part = _parts(machine, _drawn(machine, 40, "workspace"))
-    assert np.abs(part.mean(axis=0) - 0.5).max() < 0.2
-    assert 0.4 < np.mean((part > 0.25) & (part < 0.75)) < 0.6
 
 
 @pytest.mark.parametrize("name", ["hexapod", "tricept"])
@@ -135,6 +128,12 @@ def test_a_joint_outside_its_limits_at_home_is_named(tmp_path: Path) -> None:
     wrong = _limited("hexapod", "leg2_b1", (0.5, 1.0), tmp_path)
     with pytest.raises(ModelError, match=r"joint 'leg2_b1' outside its limits of 28\.6 to 57\.3"):
         _drawn(wrong, 2)
+
+
+@pytest.mark.parametrize(("n", "sampling"), [(0, "extreme"), (-3, "extreme"), (3, "often")])
+def test_no_poses_and_unknown_samplings_are_refused(n: int, sampling: str) -> None:
+    with pytest.raises(UsageError, match="Poses could not be drawn: found"):
+        _drawn(load_mechanism("3-rpr"), n, sampling)
 
 
 def _along(machine: Machine, T: RigidTransform, j: int, n: int = 40) -> list[tuple[Array, float]]:
@@ -235,6 +234,19 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
         given_poses(thick, _csv(tmp_path, thick, poses.readings))
     rows = {int(re.findall(r"row (\d+)", problem)[0]) - 1 for problem in caught.value.problems}
     assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}
+
+
+def test_malformed_files_of_poses_are_refused(tmp_path: Path) -> None:
+    """Others are among those of tests/refusal_table.py."""
+    path = tmp_path / "poses.csv"
+    path.write_text("leg1_prismatic,leg2_prismatic,leg3_prismatic\n0,0,0\n0,0\n")
+    machine = load_mechanism("3-rps")
+    with pytest.raises(DatasetError, match=rf"^{path}.*row 2 \(line 3\)"):
+        given_poses(machine, path)
+    passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
+    free = replace(machine, legs=(machine.legs[0], passive, machine.legs[2]))
+    with pytest.raises(UsageError, match="found a machine of 3 freedoms and 2 motors"):
+        given_poses(free, path)
 
 
 # --- poses that a controller with the nominal model could have commanded

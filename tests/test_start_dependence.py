@@ -20,9 +20,7 @@ from legcal.simulation.settings import Level
 
 OUTLINES = {
     "hexapod": Session("hexapod", Level.OUTLINES, 8, 3, 6),
-    "tricept": Session("tricept", Level.OUTLINES, 9, 3, 6),
     "linear-delta": Session("linear-delta", Level.OUTLINES, 10, 3, 6),
-    "3-rpr": Session("3-rpr", Level.OUTLINES, 11, 3, 6),
 }
 
 

@@ -1,6 +1,7 @@
 """The Monte Carlo runner: the same results however it is run, and nothing lost."""
 
 import json
+import resource
 import signal
 import subprocess
 import sys
@@ -62,6 +63,40 @@ def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
     with pytest.raises(OutOfResources, match="one of the processes was ended from outside"):
         run_study(Deadly(), 20, workers=2, output=tmp_path)
     assert _lines(tmp_path) == before
+
+
+@contextmanager
+def _files_no_larger_than(size: int) -> Iterator[None]:
+    """Let writing fail beyond a size, in the middle of a line, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("size", [40, 700])
+def test_a_full_disk_is_told_and_the_study_goes_on_when_there_is_room(
+    tmp_path: Path, size: int
+) -> None:
+    with (
+        _files_no_larger_than(size),
+        pytest.raises(OutOfResources, match=r"could not be kept.*goes on from the runs"),
+    ):
+        run_study(Draws(), 100, output=tmp_path)
+    assert (tmp_path / CHECKPOINT_NAME).stat().st_size == size
+    assert run_study(Draws(), 100, output=tmp_path).document() == run_study(Draws(), 100).document()
+
+
+def test_figures_that_cannot_be_written_are_told_and_no_run_is_lost(tmp_path: Path) -> None:
+    run_study(Draws(), 1, output=tmp_path)
+    (tmp_path / "total.txt").unlink()
+    (tmp_path / "total.txt").mkdir()
+    (tmp_path / "total.txt" / "mine").touch()
+    with pytest.raises(UsageError, match=r"result of the study.*total.txt, which is a folder"):
+        run_study(Draws(), 3, output=tmp_path)
+    assert len(_lines(tmp_path)) == 4
 
 
 @pytest.mark.parametrize(

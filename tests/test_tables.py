@@ -34,7 +34,6 @@ from legcal.data.outlines import (
     write_observations,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
-from legcal.errors import DatasetError
 from legcal.geometry.types import Array, IntArray
 
 FAST = settings(
@@ -93,13 +92,6 @@ def edited(path: Path, row: int, **cells: str) -> Path:
         return lines
 
     return rewritten(path, change)
-
-
-def problems(path: Path) -> tuple[str, ...]:
-    with pytest.raises(DatasetError) as refusal:
-        read_again(path)
-    assert all(problem.startswith(str(path)) for problem in refusal.value.problems)
-    return tuple(refusal.value.problems)
 
 
 # --- written and read
@@ -253,18 +245,3 @@ def test_sentences_of_earlier_versions_are_read_as_reasons(
 
 
 # --- refused
-
-
-def test_many_problems_are_listed_at_once_and_said_shortly(tmp_path: Path) -> None:
-    path = written(tmp_path, outlines_of(10, rejected=0.0))
-    edited(path, 1, view="up", leg="none", edge="0")
-    edited(path, 4, a="x", b="y")
-    edited(path, 6, a="9", s00="-1")
-    assert len(problems(path)) == 7
-    path = written(tmp_path, axis_table())
-    for row in range(1, 13):
-        edited(path, row, theta=str(-90 - row))
-    with pytest.raises(DatasetError) as refusal:
-        read_again(path)
-    assert len(refusal.value.problems) == 12
-    assert str(refusal.value).splitlines()[5:] == ["... and 7 more like these."]

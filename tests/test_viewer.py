@@ -99,25 +99,6 @@ def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> No
     assert 1e-4 < seen[1.0].apart < 1e-2
 
 
-def test_weak_directions_are_motions_about_the_calibrated_machine(result: Source) -> None:
-    stage, motion = Stage(result), Motion(result.machine)
-    assert len(stage.motions) >= 1
-    forth, back = (stage.seen(motion.posture, 0, 1000.0, phase) for phase in (1.0, -1.0))
-    here = stage.seen(motion.posture)
-    np.testing.assert_allclose(0.5 * (forth.B + back.B), here.B, atol=1e-12)
-    assert np.abs(forth.B - here.B).max() > 1e-3
-    axes, enlarged = stage.ellipsoids
-    assert result.result is not None
-    links = result.result.result.links
-    assert links is not None
-    for side, block in links.items():
-        covariance = np.array([joint.covariance for joint in block.joints])
-        np.testing.assert_allclose(
-            axes[side] @ axes[side].transpose(0, 2, 1), covariance, atol=1e-15
-        )
-    assert 10.0 <= enlarged <= 1e4
-
-
 def test_outlines_lie_on_the_legs_as_their_camera_sees_them(result: Source) -> None:
     photographs, motion = Photographs(result), Motion(result.machine)
     assert len(photographs.poses) == 45

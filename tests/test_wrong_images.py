@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fit_sessions import machine_session
 from hexapod_example import Picture, Spoiled, spoiled
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -19,14 +18,12 @@ from simulated import simulated
 from legcal import calibrate, detect, load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import BoolArray
-from legcal.machine.loader import load_mechanism
 from legcal.perception.diagnostics import (
     hint_notes,
 )
@@ -243,14 +240,6 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
 
 
-def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
-    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.identity())
-    for off, angle, n in (((0.03, 0, 0), 3.0, 0), ((0.15, 0, 0), 0.0, 1), ((0, 0, 0), 9.0, 1)):
-        turn = Rotation.from_rotvec([0.0, angle, 0.0], degrees=True)
-        hint = T * RigidTransform.from_components(off, turn)
-        assert len(hint_notes(["c1"], [hint], [T])) == n
-
-
 @pytest.mark.parametrize(
     ("written", "words"),
     [
@@ -358,18 +347,6 @@ def test_what_is_flat_has_no_edges() -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
 
 
-def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "hand", 3, ("c1", "c2"))
-    image = made.change("c2", 1, _blurred)
-    made.rows = [*made.rows[:3], made.row("c2", 1)]
-    found = _observed(made).placement
-    assert list(found.unplaced) == ["c2"]
-    words = (
-        rf"in its 1 image \({image}: the image is blurred by \d\.\d px, the others of its camera"
-    )
-    assert re.search(words, found.unplaced["c2"]), found.unplaced
-
-
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     """A calibration of a hexapod from outlines."""
@@ -434,22 +411,6 @@ def test_a_wrong_digit_is_named_where_outlines_of_few_legs_leave_the_pose_open(
         assert found is not None, notes
         assert int(found[1]) == leg + 1
         assert float(found[2]) == pytest.approx(1e3 * m.q[row, leg], abs=1.0)
-
-
-def test_a_wrong_angle_of_an_arm_is_named_in_degrees_beyond_its_sigma() -> None:
-    session = machine_session("delta", n_poses=3)
-    m, machine, row = session.measurements, load_mechanism("delta"), 1
-    found = refine(session.legs, m, session.outlines, session.start)
-    fit = replace(found, outlines=_with_rejected(found.outlines, found.outlines.row == row))
-    q = m.q.copy()
-    q[row, :2] += 0.25  # of both rods of the first arm
-    (note,) = outlier_images(replace(m, q=q), machine, fit).values()
-    shown = re.search(r"reading of arm1 of ([\d.-]+) \+- [\d.]+ deg, given ([\d.-]+) deg", note)
-    assert shown is not None, note
-    expected = np.degrees([m.q[row, 0], q[row, 0]])
-    np.testing.assert_allclose([float(x) for x in shown.groups()], expected, atol=0.02)
-    rough = replace(m, q=q, sigma_by_joint=dict.fromkeys(machine.motor_names, 0.06))
-    assert "its readings suit it" in outlier_images(rough, machine, fit)[row]
 
 
 def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration) -> None:
