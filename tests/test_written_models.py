@@ -349,6 +349,21 @@ def test_errors_have_the_size_and_distribution_that_was_asked_for() -> None:
     assert np.abs(correlation).max() < 0.45
 
 
+def test_errors_of_one_kind_do_not_depend_on_those_of_another(tmp_path: Path) -> None:
+    nominal = load_mechanism("tricept")
+    names, everything = _differences(nominal, ALL, 1)
+    _, offsets = _differences(nominal, ParameterErrors(offsets=ALL.offsets), 1)
+    of_offsets = np.array([name.endswith(".offset") for name in names])
+    np.testing.assert_allclose(offsets[0, of_offsets], everything[0, of_offsets], atol=1e-15)
+    assert np.abs(offsets[0, ~of_offsets]).max() < 1e-12
+    hexapod = load_mechanism("hexapod")
+    errors = ParameterErrors(Spread(2e-3), Spread(2e-3), coplanar=True)
+    true = write_true_model(hexapod, errors, np.random.default_rng(5), tmp_path)
+    for joints in (true.parameters.base_joints, true.parameters.platform_joints):
+        assert np.abs(joints[:, 2]).max() < 1e-15
+        assert np.abs(joints - hexapod.parameters.base_joints).max() > 1e-4
+
+
 @pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])
 def test_radii_of_the_true_legs_are_drawn_and_nothing_else_with_them(
     name: str, tmp_path: Path
