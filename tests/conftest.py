@@ -14,6 +14,7 @@ import process_settings  # noqa: F401
 import pytest
 import typer.main
 from hexapod_example import Run, copy_of_the_example
+from xdist.scheduler import LoadScopeScheduling
 
 from legcal import calibrate
 from legcal.machine import loader
@@ -37,14 +38,23 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one process run what shares fixtures: a file, and all tests of the example's result."""
-    for item in items:
-        if item.path.stem != "test_recorded_sessions":
-            is_of_example = "example_run" in getattr(item, "fixturenames", ())
-            group = "example" if is_of_example else item.path.stem
-            item.add_marker(pytest.mark.xdist_group(group))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Let one process run what shares fixtures: a file; all files about the example's result."""
+
+    class ByFixtures(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            if "test_recorded_sessions" in file:
+                return nodeid
+            return "example" if _is_about_the_example(config.rootpath / file) else file
+
+    return ByFixtures(config, log)
+
+
+@cache
+def _is_about_the_example(path: Path) -> bool:
+    return "example_run" in path.read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="session", autouse=True)
