@@ -42,14 +42,15 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Let one process run what shares fixtures: a file; all files about the example's result."""
 
-    class ByFixtures(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.partition("::")[0]
-            if "test_recorded_sessions" in file:
-                return nodeid
-            return "example" if _is_about_the_example(config.rootpath / file) else file
+    def scope_of(nodeid: str) -> str:
+        file = nodeid.partition("::")[0]
+        if "test_recorded_sessions" in file:
+            return nodeid
+        return "example" if _is_about_the_example(config.rootpath / file) else file
 
-    return ByFixtures(config, log)
+    scheduler = LoadScopeScheduling(config, log)
+    scheduler._split_scope = scope_of
+    return scheduler
 
 
 @cache
