@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import yaml
 from command_line import run
-from thinned import thinned
 
 from legcal.calibration.result_folder import load_result
 from legcal.machine.loader import load_mechanism
@@ -15,9 +14,8 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
 
-@pytest.mark.parametrize(
-    ("name", "unit"), thinned([("hexaglide", "mm"), ("delta", "deg")], [("delta", "deg")], "system")
-)
+@pytest.mark.system
+@pytest.mark.parametrize(("name", "unit"), [("hexaglide", "mm"), ("delta", "deg")])
 def test_commands_know_that_joints_at_A_move(
     name: str,
     unit: str,

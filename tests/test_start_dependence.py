@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from thinned import thinned
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -24,7 +25,7 @@ OUTLINES = {
 }
 
 
-@pytest.mark.parametrize("name", OUTLINES)
+@pytest.mark.parametrize("name", thinned(OUTLINES, ["hexapod"]))
 def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> None:
     folder = session_folder(name, OUTLINES[name], tmp_path)
     first = calibrated(folder, "nominal", steps=False)
