@@ -415,7 +415,7 @@ def _datasets() -> Iterable[Refusal]:
         ("sigma-0", entry(encoder_sigma=0.0), ("encoder_sigma", "0.0")),
         ("sigma-negative", entry(encoder_sigma=-1e-6), ("encoder_sigma", "-1e-06")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
-        ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "one standard deviation")),
+        ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("sigma-text", entry(encoder_sigma="small"), ("encoder_sigma", "'small'")),
         ("no-views", entry(views={}), ("views",)),
         ("view-list", entry(views=["c1"]), ("views",)),
