@@ -23,7 +23,7 @@ from legcal.calibration.change_detection import (
     possible_changes,
 )
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.errors import DatasetError, NotIdentifiable, NotVisible
+from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Line
@@ -154,6 +154,12 @@ def test_images_without_used_outlines_are_refused(
     blank = _edited(images, tmp_path / "blank", "observations.csv", reject)
     with pytest.raises(NotVisible, match="found no used outline in any image"):
         check(blank, result)
+
+
+@pytest.mark.parametrize("significance", [0.0, -0.1, 0.6, float("nan")])
+def test_a_significance_that_is_no_small_probability_is_refused(significance: float) -> None:
+    with pytest.raises(UsageError, match=r"found the significance .* needed a probability above 0"):
+        check("images", "result", significance=significance)
 
 
 # Results that are read back. More refusals are in refusal_table.py.
