@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.schema import closest
+from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
@@ -460,6 +460,7 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         for i, (one, two) in enumerate(file.closed_loop)
         if one == two
     ]
+    problems += _frames_of_neighbours(file, urdf, path)
     if block is not None and block.base == block.platform:
         problems.append(
             f"{path}: legcal.platform could not be used: found the link '{block.base}' as base and "
@@ -467,6 +468,40 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         )
     if problems:
         raise ModelError(problems)
+
+
+def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[str]:
+    """Say where a closure names the frame of another one, and its own is left over.
+
+    Legs that meet in a point may share a frame: then no similar name beside it is unused.
+    """
+    places: dict[str, list[int]] = {}
+    for i, pair in enumerate(file.closed_loop):
+        for frame in set(pair):
+            places.setdefault(frame, []).append(i)
+    above = {joint.child: joint for joint in urdf.joints.values()}
+    parents = {joint.parent for joint in urdf.joints.values()}
+    spare = {
+        link: joint.parent
+        for link, joint in above.items()
+        if not joint.moves and not {link, joint.name} & places.keys() and link not in parents
+    }
+    problems = []
+    for frame, closures in places.items():
+        if len(closures) == 1 or frame not in above:
+            continue
+        beside = [link for link, parent in spare.items() if parent == above[frame].parent]
+        spared = nearest(frame, beside)
+        if spared:
+            *others, last = closures
+            named = " and ".join(f"closed_loop.{i}" for i in others)
+            problems.append(
+                f"{path}: closed_loop.{last} could not be used: found the frame '{frame}', which "
+                f"{named} {'names' if len(others) == 1 else 'name'} too, and '{spared}' in no "
+                f"closure; write '{spared}' in one of them, or remove it from "
+                f"{urdf.path.name} where these legs meet in one point."
+            )
+    return problems
 
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
