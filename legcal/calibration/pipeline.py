@@ -97,7 +97,8 @@ def calibrate(
         The weights of the four steps: from the covariances of the axes, or all one, as the paper
         has them.
     use_cache : bool
-        Use the outlines that an earlier run left beside the dataset, if they still fit.
+        Use the outlines that an earlier run left beside the dataset, if they still fit. False
+        searches the images again; either way the new outlines replace those beside the dataset.
     workers : int, str or executor
         Search the images in that many processes; with more than one, the program that calls this
         must be safe to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address
