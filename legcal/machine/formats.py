@@ -367,7 +367,7 @@ def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[
         given = common if part is None else part
         axis = x if given is None else _three(element, given, "xyz", problems)
         norm = float(np.linalg.norm(axis))
-        if norm < 1e-9 and not problems.sentences:
+        if norm < 1e-9 and not problems:
             problems.add(element, "has a zero axis, needed a direction", "correct its xyz")
         axes.append(axis / max(norm, 1e-9))
     return axes[0], axes[1]

@@ -26,7 +26,7 @@ from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.covariances import whitener
@@ -129,8 +129,13 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     if "angle_sigma" in table:
         if "qx" not in table:
             table.refuse_file(
-                f"{path}, header: the columns could not be used: found angle_sigma and no "
-                "quaternions, needed qx, qy, qz, qw beside it; add the columns."
+                Problem(
+                    "the columns could not be used",
+                    "angle_sigma and no quaternions",
+                    "qx, qy, qz, qw beside it",
+                    "add the columns",
+                    f"{path}, header",
+                )
             )
         table.need(["angle_sigma"], oriented)
     joints = [column.name for column in reading_columns(machine.legs)]
@@ -183,8 +188,8 @@ def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
     for i in np.flatnonzero(error > QUATERNION_TOLERANCE).tolist():
         hint = "; these look like angles in degrees" if norms[i] > 2.0 else ""
         found = f"a quaternion of norm {norms[i]:.6g}"
-        needed = f"1 within {QUATERNION_TOLERANCE:g}{hint}; check its four numbers"
-        table.refuse(i, found, needed, *_QUATERNION, what="orientation")
+        needed, remedy = f"1 within {QUATERNION_TOLERANCE:g}{hint}", "check its four numbers"
+        table.refuse(i, found, needed, *_QUATERNION, remedy=remedy, what="orientation")
     oriented = error <= QUATERNION_TOLERANCE
     if np.any(oriented):
         rotation[oriented] = Rotation.from_quat(quaternions[oriented]).as_matrix()
