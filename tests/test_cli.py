@@ -141,8 +141,8 @@ def test_json_has_the_facts_of_what_is_wrong(
     copy_of_the_example(tmp_path / "data")
     table = tmp_path / "data" / "measurements.csv"
     head, first, *rest = table.read_text("utf-8").splitlines()
-    view, *cells, reading = first.split(",")
-    table.write_text("\n".join([head, ",".join([view, *cells, "far"]), *rest]), "utf-8")
+    cells = first.split(",")[:-1]
+    table.write_text("\n".join([head, ",".join([*cells, "far"]), *rest]), "utf-8")
     assert run(monkeypatch, "doctor", str(tmp_path / "data"), "--json") == 2
     error = json.loads(capsys.readouterr().out)["error"]
     (problem,) = error["problems"]
