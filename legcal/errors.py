@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
@@ -74,6 +75,12 @@ class Problem:
         """Return the problem with the file that it is in, where it does not say one."""
         return self if self.file else replace(self, file=str(file))
 
+    def moved(self, old: Path, new: Path) -> Problem:
+        """Return the problem of a file that goes from one folder to another."""
+        if not Path(self.file).is_relative_to(old):
+            return self
+        return replace(self, file=str(new / Path(self.file).relative_to(old)))
+
     def document(self) -> dict[str, Any]:
         """Return the facts that there are, as ``--json`` has them."""
         facts = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -122,7 +129,7 @@ class LegcalError(Exception):
         return type(self), (self.facts,), {"diagnosis": self.diagnosis}
 
     def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
-        """Return an error of the same kind with all problems changed."""
+        """Return an error of the same kind whose problems are changed."""
         error = type(self)([change(problem) for problem in self.facts])
         error.diagnosis = self.diagnosis
         return error

@@ -16,7 +16,7 @@ from lxml import etree
 from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass
+from legcal.errors import ModelError, OutOfClass, Problem
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.machine.bodies import rigid_bodies
@@ -102,9 +102,14 @@ def _read_xml(path: Path) -> Source:
     if any(element.tag in LOOP_TAGS for element in root):
         return read_loop_source(path, content)
     raise OutOfClass(
-        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
-        f"loops, and no YAML that closes them; write {path.with_suffix('.yaml')} with closed_loop, "
-        "type, name_mot and a legcal block."
+        Problem(
+            "this is not a parallel mechanism",
+            "a URDF, which is a tree without closed loops, and no YAML that closes them",
+            "",
+            f"write {path.with_suffix('.yaml')} with closed_loop, type, name_mot and "
+            "a legcal block",
+            str(path),
+        )
     )
 
 
@@ -140,9 +145,13 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
         on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
         if on_replaced:
             raise ModelError(
-                f"{path}: legcal.legs could not be used: found '{on_replaced[0]}', which stands "
-                "for another joint (joint_name), needed another joint of that leg; name its "
-                "prismatic joint."
+                Problem(
+                    "legcal.legs could not be used",
+                    f"'{on_replaced[0]}', which stands for another joint (joint_name)",
+                    "another joint of that leg",
+                    "name its prismatic joint",
+                    str(path),
+                )
             )
     wording = NO_BLOCK if file.legcal is None else BLOCK
     completed = replace(completed, wording=wording)
@@ -155,23 +164,43 @@ def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
         if name not in urdf.joints:
             problems.append(
-                f"{path}: joint_name.{i} could not be used: found the joint '{name}', which is not "
-                f"in {urdf.path.name}; {closest(name, sorted(urdf.joints))}"
+                Problem(
+                    f"joint_name.{i} could not be used",
+                    f"the joint '{name}', which is not in {urdf.path.name}",
+                    "",
+                    closest(name, sorted(urdf.joints)),
+                    str(path),
+                )
             )
         elif file.joint_name.index(name) != i:
             problems.append(
-                f"{path}: joint_name.{i} could not be used: found '{name}' twice, needed each "
-                "joint once; remove one."
+                Problem(
+                    f"joint_name.{i} could not be used",
+                    f"'{name}' twice",
+                    "each joint once",
+                    "remove one",
+                    str(path),
+                )
             )
         elif name in file.name_mot and kind != "FIXED":
             problems.append(
-                f"{path}: name_mot could not be used: found '{name}', which stands for "
-                f"{kind} (joint_name.{i}), needed a joint with one reading; remove it."
+                Problem(
+                    "name_mot could not be used",
+                    f"'{name}', which stands for {kind} (joint_name.{i})",
+                    "a joint with one reading",
+                    "remove it",
+                    str(path),
+                )
             )
         if rotation_letters(kind) is None:
             problems.append(
-                f"{path}: joint_type.{i} could not be used: found '{kind}', needed SPHERICAL, "
-                "FIXED, or UJOINT_ and two different letters of X, Y, Z; correct it."
+                Problem(
+                    f"joint_type.{i} could not be used",
+                    f"'{kind}'",
+                    "SPHERICAL, FIXED, or UJOINT_ and two different letters of X, Y, Z",
+                    "correct it",
+                    str(path),
+                )
             )
     if problems:
         raise ModelError(problems)
@@ -234,8 +263,13 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     elements = [element for element in robot if element.tag in LOOP_TAGS]
     if len(elements) > MAX_LOOPS:
         raise ModelError(
-            f"{path}: the loops could not be closed: found {len(elements)} of them, needed at most "
-            f"{MAX_LOOPS}; give one mechanism."
+            Problem(
+                "the loops could not be closed",
+                f"{len(elements)} of them",
+                f"at most {MAX_LOOPS}",
+                "give one mechanism",
+                str(path),
+            )
         )
     bare = checked_tree(robot, path, content, problems, travel_needed=False)
     loops = _loops(elements, bare, problems)
@@ -403,9 +437,7 @@ def completed(source: Source) -> Source:
     try:
         chain = ClosedChain(source.urdf.text, closures)
     except ModelError as error:
-        raise ModelError(
-            [f"{source.urdf.path}: {problem}" for problem in error.problems]
-        ) from error
+        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import OutOfClass, Problem
 from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
@@ -242,9 +242,13 @@ class Handles:
         if problem is not None:
             raise problem
         raise OutOfClass(
-            f"{self._urdf.path}: leg '{leg}' is outside the method: found several welds between "
-            f"joint '{joint.name}' and the link '{body}', needed one, which moves with the "
-            "parameters of the leg; close the leg once."
+            Problem(
+                f"leg '{leg}' is outside the method",
+                f"several welds between joint '{joint.name}' and the link '{body}'",
+                "one, which moves with the parameters of the leg",
+                "close the leg once",
+                str(self._urdf.path),
+            )
         )
 
     def _carrier(self, closure: int, side: int) -> UrdfJoint:

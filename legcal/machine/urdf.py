@@ -63,21 +63,36 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
         ) from error
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
         raise ModelError(
-            f"{path}: the {what} could not be read: found more than {MAX_ELEMENTS} elements, "
-            "needed fewer; give the file of one mechanism."
+            Problem(
+                f"the {what} could not be read",
+                f"more than {MAX_ELEMENTS} elements",
+                "fewer",
+                "give the file of one mechanism",
+                str(path),
+            )
         )
     document: Any = root.getroottree().docinfo
     if document.doctype or document.internalDTD is not None:
         raise ModelError(
-            f"{path}: the {what} could not be read: found a document type (<!DOCTYPE>), whose "
-            "entities are never expanded, needed plain XML; remove it."
+            Problem(
+                f"the {what} could not be read",
+                "a document type (<!DOCTYPE>), whose entities are never expanded",
+                "plain XML",
+                "remove it",
+                str(path),
+            )
         )
     try:
         content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ModelError(
-            f"{path}: the {what} could not be read: found text in another encoding, needed "
-            "UTF-8; save it as UTF-8."
+            Problem(
+                f"the {what} could not be read",
+                "text in another encoding",
+                "UTF-8",
+                "save it as UTF-8",
+                str(path),
+            )
         ) from error
     return root
 
@@ -360,8 +375,13 @@ def checked_tree(
     ):
         if found > most:
             raise ModelError(
-                f"{path}: the mechanism could not be read: found {found} {what}, needed at most "
-                f"{most}; give one mechanism, with fixed joints where nothing moves."
+                Problem(
+                    "the mechanism could not be read",
+                    f"{found} {what}",
+                    f"at most {most}",
+                    "give one mechanism, with fixed joints where nothing moves",
+                    str(path),
+                )
             )
     for element in (*links, *joints):
         check_numbers(element, problems)

@@ -306,7 +306,7 @@ def tool_measurements(
     try:
         T = forward_kinematics_many(machine, poses.q)
     except (DidNotConverge, UsageError) as error:
-        raise type(error)([f"{name}: {problem}" for problem in error.problems]) from error
+        raise error.told(lambda problem: _of_table(problem, name)) from error
     matrices = np.array([pose.as_matrix() for pose in T])
     pairs = PosePairs(
         R=matrices[:, :3, :3],
@@ -400,6 +400,12 @@ def motions_by_readings(
         axis=2,
     )
     return _of_link(machine, poses, moved)
+
+
+def _of_table(problem: Problem, name: str) -> Problem:
+    """Return what is wrong with the poses of a table at a machine, which may name its file."""
+    what = f"{problem.file}: {problem.what}" if problem.file else problem.what
+    return replace(problem, what=what, file=name)
 
 
 def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Array | None:
