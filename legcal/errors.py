@@ -37,7 +37,8 @@ class Place(NamedTuple):
 class Problem:
     """One thing that is wrong, and where. Its text is the sentence that a message has.
 
-    Where found, needed and remedy are empty, ``what`` is all that is said.
+    Where found, needed and remedy are empty, ``what`` is all that is said, as it stands: a sentence
+    that ends with a command has no full stop.
     """
 
     what: str  # what could not be done: "the number could not be used"

@@ -105,11 +105,9 @@ def _check_kind(found: Mapping[str, Any], path: Path) -> None:
     if "legcal_table" in found:
         raise ModelError(
             Problem(
-                f"the {WHAT} could not be read",
-                "a table of legs (legcal_table)",
-                "a model",
-                f"write the model of the table with: legcal new {path} -o DIR",
-                str(path),
+                f"the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
+                f"model; write the model of the table with: legcal new {path} -o DIR",
+                file=str(path),
             )
         )
     if path.name == DATASET_YAML:
