@@ -280,7 +280,7 @@ def _estimate(
             *first.solution.camera_doubts.notes,
             *_camera_notes(data.dataset, first.solution),
         )
-        raise type(error)([*cameras, *error.problems]) from error
+        raise type(error)([*cameras, *error.facts]) from error
     return replace(
         estimate,
         image_notes=(
@@ -323,7 +323,7 @@ def _refuse_too_few(
     try:
         check_identifiable(data.at(left).in_file_order()[0], choices)
     except NotIdentifiable as failure:
-        raise NotIdentifiable([*failure.problems, *notes]) from None
+        raise NotIdentifiable([*failure.facts, *notes]) from None
 
 
 def outline_key(dataset: Dataset, choices: Choices) -> str:

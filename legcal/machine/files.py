@@ -114,7 +114,7 @@ def read_file(path: Path, what: str) -> bytes:
     try:
         return content_of(path, what)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
 
 
 def yaml_of_urdf(path: Path) -> Path | None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from legcal.errors import DatasetError, ModelError, Problem
+from legcal.errors import BadValue, DatasetError, ModelError, Problem
 from legcal.files.motions import MotionEntry
 from legcal.files.published import with_schema
 from legcal.files.schema import (
@@ -60,9 +60,8 @@ class LegcalBlock(FileSchema):
             return None
         repeated = sorted({name for name in value if value.count(name) > 1})
         if repeated:
-            raise ValueError(
-                f"found the leg '{repeated[0]}' more than once, needed different legs; "
-                "name each once."
+            raise BadValue(
+                f"the leg '{repeated[0]}' more than once", "different legs", "name each once"
             )
         return value
 
@@ -93,7 +92,7 @@ def read_mechanism_file(path: Path) -> MechanismFile:
         _check_kind(found, path)
         file = validate(MechanismFile, _without_nulls(found), path)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
     problems = _contradictions(file, path)
     if problems:
         raise ModelError(problems)
