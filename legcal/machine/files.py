@@ -104,8 +104,11 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
         if path.is_file():
             return path
     raise ModelError(
-        f"{yaml_path}: the URDF of the mechanism could not be found: looked for {near[0]} and "
-        f"{near[1]}, needed one of them; write its path in legcal.urdf."
+        Problem(
+            f"the URDF of the mechanism could not be found: looked for {near[0]} and "
+            f"{near[1]}, needed one of them; write its path in legcal.urdf.",
+            file=str(yaml_path),
+        )
     )
 
 

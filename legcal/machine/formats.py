@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from lxml import etree
@@ -96,8 +97,13 @@ def _read_xml(path: Path) -> Source:
         return read_mjcf_source(path, content)
     if root.tag != "robot":
         raise ModelError(
-            f"{path}, line {root.sourceline}: the mechanism could not be read: found <{root.tag}> "
-            "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give one of them."
+            Problem(
+                f"the mechanism could not be read: found <{root.tag}> "
+                "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give "
+                "one of them.",
+                file=str(path),
+                line=cast("int", root.sourceline),
+            )
         )
     if any(element.tag in LOOP_TAGS for element in root):
         return read_loop_source(path, content)

@@ -129,9 +129,12 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             break
     if best is None:
         raise DidNotConverge(
-            f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
-            f"loops did not close from {TRIALS} starts, needed a closed pose; "
-            f"{machine.urdf.wording.state_home}."
+            Problem(
+                f"no home pose was found: with all legs at mid-travel the "
+                f"loops did not close from {TRIALS} starts, needed a closed pose; "
+                f"{machine.urdf.wording.state_home}.",
+                file=str(machine.yaml_path),
+            )
         )
     home = best[1]
     if machine.actuators:

@@ -441,10 +441,13 @@ def follow(
             if failure is not None:
                 raise failure
         raise DidNotConverge(
-            f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
-            f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
-            "legs meet no more or the mechanism is singular, needed a regular path; check the "
-            f"readings and {machine.urdf.wording.home}."
+            Problem(
+                f"the pose at the readings{which} could not be reached: at "
+                f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
+                "legs meet no more or the mechanism is singular, needed a regular path; check the "
+                f"readings and {machine.urdf.wording.home}.",
+                file=str(machine.yaml_path),
+            )
         )
     sliders = dict(zip(q_columns, last.tolist(), strict=True)) if not is_redundant else {}
     closed = _closed_at(machine, T, configuration, sliders, free)

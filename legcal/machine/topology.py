@@ -313,9 +313,12 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
     if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
         axis = ", ".join(f"{x:g}" for x in joint.axis)
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
-            f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
-            "plane of its frame; turn its origin rpy instead."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+                f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
+                "plane of its frame; turn its origin rpy instead.",
+                file=str(path),
+            )
         )
 
 

@@ -31,18 +31,30 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
     robot = parse_xml(path, content, "URDF")
     if robot.tag != "robot":
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <{robot.tag}> "
-            "as its outermost element, needed <robot>; give the URDF of the mechanism."
+            Problem(
+                f"the URDF could not be read: found <{robot.tag}> "
+                "as its outermost element, needed <robot>; give the URDF of the mechanism.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     if not robot.get("name", "").isprintable():
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> with the "
-            f"name {describe(robot.get('name'))}, needed printable characters; rename it."
+            Problem(
+                f"the URDF could not be read: found <robot> with the "
+                f"name {describe(robot.get('name'))}, needed printable characters; rename it.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     if not robot.get("name", "").strip():
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> without "
-            "a name, needed one; write <robot name=...>."
+            Problem(
+                "the URDF could not be read: found <robot> without "
+                "a name, needed one; write <robot name=...>.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     return robot
 
@@ -58,8 +70,12 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
         raise ModelError(
-            f"{path}, line {line}: the {what} could not be read: found {error.msg}, needed "
-            "well-formed XML; mend that line, or copy the file again if it was cut off."
+            Problem(
+                f"the {what} could not be read: found {error.msg}, needed "
+                "well-formed XML; mend that line, or copy the file again if it was cut off.",
+                file=str(path),
+                line=line,
+            )
         ) from error
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
         raise ModelError(
