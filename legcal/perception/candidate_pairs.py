@@ -20,6 +20,7 @@ from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
+MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
 MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
 MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
 MAX_GAP = 3.0  # between such pieces [lengths of the shorter one]
@@ -101,7 +102,7 @@ def _pieces(small: Grey) -> Array:
     pieces = _straight(_edge_middles(slopes, at, gradient), gradient, chain.take(order))
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MAX_PIECES]
-    return np.asarray(pieces[order[length[order] >= 0.5 * EDGE_LENGTH]])
+    return np.asarray(pieces[order[length[order] >= MIN_PIECE_LENGTH]])
 
 
 def _middle(values: Image) -> float:

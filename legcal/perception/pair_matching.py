@@ -18,7 +18,7 @@ from legcal.geometry.rotations import cross_matrices, rotation_matrices
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.perception.tuning import JOINT_ERROR, WIDTH_ERROR
+from legcal.perception.tuning import WIDTH_ERROR
 from legcal.vision.visibility import visible_segments
 
 # Lengths are parts of the mean leg length of the machine.
@@ -27,7 +27,7 @@ WIDTH_PIXELS = 1.0  # and of a pair in its pixels
 MAX_WIDTH_SIGMAS = 2.5  # standard deviations
 WIDTH_BIAS_PIXELS = 0.4  # of pairs: shading ends inside an outline [px of a pair]
 TOLERANCE_PIXELS = 1.5  # added to every tolerance [px of a pair]
-LINE_ERROR, LINE_PIXELS = JOINT_ERROR / 3.0, 0.7  # of an axis beside its pair: length, [px]
+LINE_ERROR, LINE_PIXELS = 0.005, 0.7  # of an axis beside its pair: length, [px]
 ALONG_ERROR = 0.1  # of the middle of a pair that is as long as its segment, in its length
 MIN_LINE_SHARE = 1.0 / 6.0  # at least this part of the tolerance
 MIN_OVERLAP = 0.8  # share of a pair that should lie along the leg

@@ -35,7 +35,11 @@ OUTER_GAP, OUTER_PART = 2, 0.5  # columns between parallel lines; and what the o
 LEAST_LEFT = 1e-3  # of the score of a line
 SEPARATION = 2  # columns and differences of ends up to which a line is the same as a better one
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
-LONE_SCORE = EDGE_SCORE / 0.3  # of an edge that may stand alone
+LONE_SCORE = 0.5  # of an edge that may stand alone
+LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
+MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
+BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
 # An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
 # multiples of half a pixel: between two of these, rounding decides nothing.
 MAX_PREDICTION_ERROR = 1.25
@@ -102,7 +106,7 @@ def _pairs(parts: Sequence[LegPart], shift: Array, score: Array) -> list[EdgePai
     predicted = np.array([part.predicted for part in parts])
     i, j, together = _best_pairs(parts, predicted, shift, score)
     guided = np.array([part.guided for part in parts])
-    alone = _alone(shift, score, np.where(guided, 0.7 * LONE_SCORE, LONE_SCORE))
+    alone = _alone(shift, score, np.where(guided, LONE_SCORE_GUIDED, LONE_SCORE))
     best = score[..., 0]
     edge = np.argmax(np.where(alone, best, 0.0), axis=1)
     every = np.arange(len(parts))
@@ -146,7 +150,7 @@ def _best_pairs(
 def _alone(shift: Array, score: Array, least: Array) -> BoolArray:
     """Return whether the best line near each edge (n_parts, 2) is good enough without rivals."""
     middle = shift.sum(axis=-1)
-    other = np.abs(middle - middle[..., :1]) > 2.0 * 3.0  # px between lines that are not one
+    other = np.abs(middle - middle[..., :1]) > 2.0 * MIN_RIVAL_DISTANCE  # sums of both ends
     best = score[..., 0]
     rivalled = np.any(other & (score > RIVAL * best[..., None]), axis=-1)
     return np.asarray((best >= least[:, None]) & (best > 0.0) & ~rivalled)
@@ -232,10 +236,10 @@ def _sharpness(profiles: Samples, seen: BoolArray, n_blocks: IntArray) -> Sample
     peak = np.where(gradient >= wide, gradient, np.float32(0.0)) ** 2
     bounds = np.concatenate([[0], np.cumsum(n_blocks)]).tolist()
     typical = np.array([_median(gradient[i:j], seen[i:j]) for i, j in pairwise(bounds)])
-    level = np.repeat((4.0 * typical) ** 2 + 1e-3, n_blocks).astype(np.float32)
+    level = np.repeat((NOISE_LEVELS * typical) ** 2 + 1e-3, n_blocks).astype(np.float32)
     sharpness = peak / (peak + level[:, None])
     widened = np.asarray(cv2.dilate(sharpness, beside), dtype=np.float32)
-    return np.asarray(np.maximum(sharpness, np.float32(0.8) * widened), dtype=np.float32)
+    return np.asarray(np.maximum(sharpness, np.float32(BESIDE_WEIGHT) * widened), dtype=np.float32)
 
 
 def _median(values: Samples, seen: BoolArray) -> float:

@@ -23,7 +23,7 @@ from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
-from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
+from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -32,7 +32,7 @@ Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
 # Of joint centres that the nominal model and its platform pose predict, of the mean leg length
-PREDICTED_JOINT_ERROR = JOINT_ERROR / 1.5
+PREDICTED_JOINT_ERROR = 0.01
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 

@@ -48,13 +48,15 @@ MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must exp
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
-MIN_ERROR = JOINT_ERROR / 3.75  # of the joint centres of a leg that a view shows
+# Of the joint centres of a leg that a view shows: at least, besides standard deviations
+MIN_ERROR, ERROR_SIGMAS = 0.004, 2.5
+POSE_JOINT_ERROR = 0.0075  # of the legs as a pose has them
 
 N_POSES, N_REFINED = 4, 3  # at which outlines are measured, and at the best missing legs sought
-MARGIN = 3.0  # of the evidence for a pose over the least
+MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of a single image
 # Of the evidence for a pose to that for any other one: where edge pairs are convincing by
 # themselves, of a single image, and from which on no margin is needed.
-RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = (EVIDENCE_RATIO / 1.6 * x for x in (1.5, 2.5, 4.0))
+RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 
@@ -301,7 +303,7 @@ def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int
     T: list[RigidTransform | None] = [None] * n_views
     for v in group.views:
         T[v] = candidates.pose(i) * group.T_group_camera[v]
-    placement = Placement(search.A_base, search.B_base, tuple(T), 0.5 * JOINT_ERROR)
+    placement = Placement(search.A_base, search.B_base, tuple(T), POSE_JOINT_ERROR)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
@@ -323,7 +325,7 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
     alone = len(group.rows) == 1
-    margin, ratio = (2.0 * MARGIN, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
+    margin, ratio = (MARGIN_ALONE, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
@@ -384,7 +386,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
         for v in group.views:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + 2.5 * one.leg_error, JOINT_ERROR)
+            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, JOINT_ERROR)
     placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
