@@ -120,6 +120,7 @@ class Photographs:
             self.machine.size,
             {} if pairs is None else pairs,
             {} if blur is None else blur,
+            self.machine.occluders,
         )
 
     def with_found(self, found: Outlines) -> Outlines:

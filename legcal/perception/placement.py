@@ -19,6 +19,7 @@ from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
+from legcal.machine.occluders import Occluder
 from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
@@ -50,6 +51,7 @@ class Search:
     size: float  # mean leg length of the machine [m]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
+    occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
 
     @property
     def n_legs(self) -> int:
