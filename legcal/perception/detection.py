@@ -39,7 +39,7 @@ def measure_outlines(
     """
     if placement.window is not None:
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
-    search = replace(search, edge_pairs={})  # of no use to worker processes
+    search = replace(search, edge_pairs={}, still={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
     task = partial(_of_image, search, placement, method)
     for row, (outlines, blur[row]) in zip(rows, run(task, rows), strict=True):

@@ -21,7 +21,13 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
 from legcal.machine.occluders import Occluder
 from legcal.machine.rods import arms_at
-from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
+from legcal.perception.candidate_pairs import (
+    CandidatePairs,
+    find_candidate_pairs,
+    find_segments,
+    reduction,
+    segments_of_reduced,
+)
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.perception.tuning import WINDOW_PX
@@ -52,6 +58,7 @@ class Search:
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
     occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
+    still: Mapping[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
     def n_legs(self) -> int:
@@ -69,8 +76,21 @@ class Search:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
-        camera = self.measurements.views[view].camera
-        return find_candidate_pairs(find_segments(self.load(row), camera))
+        camera, still = self.measurements.views[view].camera, self.still.get(view)
+        factor = self.reduction(view)
+        return find_candidate_pairs(find_segments(self.load(row), camera, factor, still))
+
+    def reduction(self, view: int) -> int:
+        """Return the factor by which the pictures of a view are reduced."""
+        thinnest = min((c.radius for one in self.cylinders for c in one), default=self.size)
+        return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
+
+    def pairs_of_reduced(self, row: int, small: Grey) -> CandidatePairs:
+        """Return the edge pairs of an image that has been reduced."""
+        view = int(self.measurements.view[row])
+        camera, factor = self.measurements.views[view].camera, self.reduction(view)
+        segments = segments_of_reduced(small, camera, factor, self.still.get(view))
+        return find_candidate_pairs(segments)
 
     def own_pairs(self, row: int) -> CandidatePairs:
         """Return the edge pairs of an image."""
