@@ -12,6 +12,7 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.image_causes import by_cause, image_notes
@@ -19,7 +20,7 @@ from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
-from legcal.machine.occluders import Occluder
+from legcal.machine.occluders import LegHalf, Occluder
 from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import (
     CandidatePairs,
@@ -40,6 +41,8 @@ Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that 
 
 # Of joint centres that the nominal model and its platform pose predict, of the mean leg length
 PREDICTED_JOINT_ERROR = 0.01
+# Of solids around legs by which these are recognised: distance of their axes, length [radii]
+HOUSING_OFF, HOUSING_LENGTH = 0.4, 4.0
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 
@@ -99,11 +102,39 @@ class Search:
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""
         legs = np.flatnonzero(self.wanted[view])
-        return leg_segments(self.A_base[row], self.B_base[row], self.cylinders, legs)
+        parts = self.cylinders
+        if self.occluders:
+            parts = [
+                (*own, *housings)
+                for own, housings in zip(parts, housings_of_legs(self.occluders, len(parts)))
+            ]
+        return leg_segments(self.A_base[row], self.B_base[row], parts, legs)
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
         """Return what an image shows with what it should show by other cylinders."""
         return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
+
+
+def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
+    """Return long solids around the axis of each leg as cylinders that look as thick.
+
+    A convex solid is as wide as its circumference over pi, in the mean of all directions from
+    which it is seen; a square one differs from that by up to 21 %.
+    """
+    found: list[list[Cylinder]] = [[] for _ in range(n_legs)]
+    for occluder in occluders:
+        half = occluder.carrier
+        if not isinstance(half, LegHalf):
+            continue
+        across, along = occluder.corners[:, :2], occluder.corners[:, 2]
+        start, end = float(along.min()), float(along.max())
+        hull = across[ConvexHull(across).vertices]
+        around = float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
+        radius = around / (2.0 * np.pi)
+        off = float(np.linalg.norm(hull.mean(axis=0)))
+        if off <= HOUSING_OFF * radius and end - start >= HOUSING_LENGTH * radius:
+            found[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
+    return found
 
 
 def sensor_extent(camera: Camera) -> Array:
