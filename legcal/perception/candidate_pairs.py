@@ -98,10 +98,15 @@ def _differs(picture: Grey, still: Grey) -> BoolArray:
     return np.asarray(away > least)
 
 
+def moving_pixels(picture: Grey, still: Grey) -> Image:
+    """Return 1 near pixels of a picture that are not those of what stands still, else 0."""
+    size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
+    return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
+
+
 def _moving(pieces: Array, picture: Grey, still: Grey) -> BoolArray:
     """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
-    size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
-    differs = cv2.dilate(_differs(picture, still).astype(np.uint8), size)
+    differs = moving_pixels(picture, still)
     share = np.linspace(0.0, 1.0, 12)[:, None]
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
     x, y = np.rint(np.clip(along, 0, np.array(picture.shape[::-1]) - 1)).astype(np.intp).T

@@ -550,9 +550,7 @@ def defects_of(
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 
 
-def _inspect(
-    search: Search, rows: Collection[int], row: int
-) -> tuple[Exposure, Grey | None]:
+def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Grey | None]:
     """Return how an image was exposed, and reduced if it is one of rows."""
     image = search.load(row)
     factor = search.reduction(int(search.measurements.view[row]))

@@ -26,9 +26,12 @@ from legcal.perception.candidate_pairs import (
     CandidatePairs,
     find_candidate_pairs,
     find_segments,
+    moving_pixels,
     reduction,
     segments_of_reduced,
 )
+from legcal.perception.edge_maps import EdgeMaps
+from legcal.perception.light import reduce
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.perception.tuning import WINDOW_PX
@@ -88,6 +91,18 @@ class Search:
         thinnest = min((c.radius for one in self.cylinders for c in one), default=self.size)
         return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
 
+    def edge_maps(self, rows: Sequence[int]) -> EdgeMaps:
+        """Return where the images of rows show edges of each direction, if these move."""
+        views = [int(self.measurements.view[row]) for row in rows]
+        factors = [self.reduction(view) for view in views]
+        cameras = [self.measurements.views[view].camera for view in views]
+        small = [reduce(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
+        moving = [
+            moving_pixels(picture, self.still[view]) if view in self.still else None
+            for picture, view in zip(small, views, strict=True)
+        ]
+        return EdgeMaps.of(small, moving, cameras, factors)
+
     def pairs_of_reduced(self, row: int, small: Grey) -> CandidatePairs:
         """Return the edge pairs of an image that has been reduced."""
         view = int(self.measurements.view[row])
@@ -106,7 +121,9 @@ class Search:
         if self.occluders:
             parts = [
                 (*own, *housings)
-                for own, housings in zip(parts, housings_of_legs(self.occluders, len(parts)))
+                for own, housings in zip(
+                    parts, housings_of_legs(self.occluders, len(parts)), strict=True
+                )
             ]
         return leg_segments(self.A_base[row], self.B_base[row], parts, legs)
 
