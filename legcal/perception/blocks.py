@@ -22,8 +22,8 @@ from legcal.vision.image_file import Grey
 
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 MAX_DEPTH = 0.8  # largest used depth, in half-widths
-NEAR_DEPTH = (0.5, 2.0)  # the same inside narrow parts once lines are known well
-MILD_DEPTH, MAX_NEAR_DEPTH = 0.12, 0.6  # then, in half-widths: used if it is more; and at most
+NEAR_DEPTH = (1.0, 2.0)  # the same inside narrow parts once lines are known well
+MILD_DEPTH, MAX_NEAR_DEPTH = 0.25, 0.6  # then, in half-widths: used if it is more; and at most
 ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
 MIN_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
 MIN_SHARE_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
