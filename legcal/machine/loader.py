@@ -59,6 +59,7 @@ from legcal.machine.mobility import (
     motor_rank,
 )
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
+from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
@@ -214,6 +215,9 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     names = list(block.legs)
     base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
+    legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
+    solids = visual_solids(urdf)
+    occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
     machine = Machine(
         name=urdf.name,
         yaml_path=yaml_path,
@@ -221,7 +225,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0]),
+        legs=with_covers(legs, occluders),
         frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
@@ -230,6 +234,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         urdf=urdf,
         base_normal=base_normal,
         platform_normal=platform_normal,
+        occluders=occluders,
     )
     _check_frames(machine)
     return machine

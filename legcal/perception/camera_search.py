@@ -9,12 +9,14 @@ left and right exchanged.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
@@ -59,6 +61,30 @@ UP_DOWN = np.array([1.0, -1.0])
 UPSIDE_DOWN = np.array([-1.0, -1.0])
 
 
+class EdgeStep(NamedTuple):
+    """How poses are moved to edges."""
+
+    blur: float  # how far edges count [cells of half the size, or of the maps]
+    turn: float  # by which poses are turned, one standard deviation [deg]
+    part: float  # and moved, as a part of the distance
+    n_kept: int
+    is_fine: bool = False
+    all_pictures: bool = False
+
+
+N_SUGGESTING, N_MOVED, N_TRIED = 4, 60, 24  # pictures; poses that are moved, and so often
+EDGE_STEPS = (
+    EdgeStep(4.0, 6.0, 0.08, 40),
+    EdgeStep(4.0, 3.0, 0.05, 30),
+    EdgeStep(3.0, 2.0, 0.03, 20),
+    EdgeStep(2.0, 1.5, 0.02, 12),
+    EdgeStep(2.0, 1.0, 0.012, 8),
+    EdgeStep(1.5, 0.6, 0.008, 6, all_pictures=True),
+    EdgeStep(2.0, 0.4, 0.005, 6, is_fine=True, all_pictures=True),
+    EdgeStep(1.5, 0.2, 0.003, 4, is_fine=True, all_pictures=True),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class PoseCandidates:
     """Poses of a camera, best first, each far from the better ones or with legs on other pairs."""
@@ -72,6 +98,7 @@ class PoseCandidates:
     hinted: bool = False  # whether it was searched for near a rough pose only
     by_outlines: bool | None = None  # whether outlines measured at the poses support the first
     # one; None where pairs were clear
+    along_edges: float = 0.0  # legs with edges along them at the first pose, where it is by edges
 
     @property
     def needed(self) -> float:
@@ -221,6 +248,59 @@ def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
     return CameraPoses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
 
+def place_by_edges(
+    pictures: Sequence[Picture], maps: EdgeMaps, n_legs: int, known: CameraPoses
+) -> PoseCandidates:
+    """Return the camera poses along whose limbs most edges of pictures lie.
+
+    Pairs of edges and known poses suggest them; they are moved at random, less and less, to where
+    edges are. ``maps`` are of the same pictures. Pairs do not say which pose is best: see
+    :attr:`PoseCandidates.by_outlines`.
+    """
+    every = Pictures.of(pictures)
+    suggested = [_suggested(picture, n_legs) for picture in pictures[:N_SUGGESTING]]
+    poses = CameraPoses.joined([known, *suggested])
+    if len(poses) == 0:
+        return _candidates(every, poses)
+    coarse, rng = maps.halved(), np.random.default_rng(len(poses))
+    few = slice(0, N_SUGGESTING)
+    some, maps_of_some = every.take(few), maps.take(range(len(pictures))[few])
+    rough = maps_of_some.halved()
+    score = rough.blurred(EDGE_STEPS[0].blur).scores(some, poses)
+    poses = poses.take(_best(score, N_MOVED))
+    for step in EDGE_STEPS:
+        of_step, seen = (maps_of_some, some) if step.is_fine else (rough, some)
+        if step.all_pictures:
+            of_step, seen = (maps if step.is_fine else coarse), every
+        poses, score = _moved_to_edges(of_step.blurred(step.blur), seen, poses, step, rng)
+        poses = poses.take(_distinct(poses, score, step.n_kept))
+    found = match_pairs(every, poses, FITTING[-1])
+    support, expected = (_by_legs(every, x).T for x in (found.exclusive_score, found.visible))
+    error = _leg_error(every, poses.take(slice(0, 1)))
+    first = float(score.max()) / len(pictures)
+    return PoseCandidates(poses, support, expected, support.sum(axis=1), error, along_edges=first)
+
+
+def _moved_to_edges(
+    maps: EdgeMaps, pictures: Pictures, poses: CameraPoses, step: EdgeStep, rng: np.random.Generator
+) -> tuple[CameraPoses, Array]:
+    """Return for each pose the best one of some around it, and the scores."""
+    n, middle = len(poses), pictures.all_ends.mean(axis=0)
+    R, t = np.repeat(poses.R, N_TRIED, axis=0), np.repeat(poses.t, N_TRIED, axis=0)
+    at = R @ middle + t
+    distance = np.linalg.norm(at, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec(np.deg2rad(step.turn) * rng.normal(size=(len(R), 3)))
+    at = at + step.part * distance * rng.normal(size=at.shape) * np.array([0.5, 0.5, 1.0])
+    R = turns.as_matrix() @ R
+    around = CameraPoses.rigid(R, at - R @ middle, poses.shift.shape[1])
+    tried = CameraPoses.joined([poses, around])
+    score = maps.scores(pictures, tried)
+    parent = np.concatenate([np.arange(n), np.repeat(np.arange(n), N_TRIED)])
+    order = np.lexsort([-score, parent])
+    best = order[np.flatnonzero(np.diff(parent[order], prepend=-1))]
+    return tried.take(best), score[best]
+
+
 def place_near(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
 ) -> PoseCandidates:
@@ -322,17 +402,21 @@ def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
 
 def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     """Return the poses that suit a picture best, among those that two of its pairs suggest."""
-    poses = pose_hypotheses(picture, n_legs)
+    poses = _suggested(picture, n_legs)
     if len(poses) == 0:
         return poses
-    # From the frame of the picture to that of the poses.
-    back = picture.R.T
-    poses = CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     own = Pictures.of([picture])
     poses = poses.take(_best(scores(own, poses, SEARCHING[0]), N_KEPT[0]))
     poses = refined(own, poses, SEARCHING[:3])
     score = scores(own, poses, SEARCHING[2])
     return poses.take(_distinct(poses, score, N_KEPT[1]))
+
+
+def _suggested(picture: Picture, n_legs: int) -> CameraPoses:
+    """Return the poses that two pairs of a picture suggest."""
+    poses, back = pose_hypotheses(picture, n_legs), picture.R.T
+    # From the frame of the picture to that of the poses.
+    return CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
 
 
 def refined(

@@ -7,7 +7,7 @@ the limb model fitted to all outlines of the image; the verdict on each part, wi
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.occluders import PlacedOccluders
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
@@ -60,6 +61,7 @@ class ImageSearch:
     near_fit: bool = False  # whether outlines are known to tenths of a pixel, and the blur as well
     # The legs of which arms are parts: they follow the legs, and no fit knows their widths
     arms: tuple[int, ...] = ()
+    occluders: PlacedOccluders = field(default_factory=PlacedOccluders.none)  # in its frame
 
     @property
     def n_legs(self) -> int:
@@ -177,12 +179,13 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
             else:
                 searched.append(_Predicted(leg, segment, band, h, v, width))
     free_parts: list[LegPart] = []
-    for predicted, front in zip(searched, _in_front(search.legs, searched), strict=True):
+    names = [*search.names, *(occluder.link for occluder in search.occluders.occluders)]
+    for predicted, front in zip(searched, _in_front(search, searched), strict=True):
         leg, segment, band, _, v, width = predicted
         hidden = np.any(front >= 0, axis=0)
         if np.mean(~hidden) * band.length < least_length(width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
-            in_front = search.names[values[np.argmax(counts)]]
+            in_front = names[values[np.argmax(counts)]]
             reject(leg, segment.link, Reason.HIDDEN, in_front)
         else:
             window = float(search.window[leg.leg])
@@ -250,8 +253,11 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     )
 
 
-def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> list[IntArray]:
-    """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
+def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntArray]:
+    """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free.
+
+    Other solids of the machine count on from the legs and arms.
+    """
     if not searched:
         return []
     points = []
@@ -263,7 +269,12 @@ def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> l
     n = [len(of_part) for of_part in points]
     own = np.repeat([part.leg.leg for part in searched], n)
     margin = np.repeat([MARGIN / part.band.scale for part in searched], n)
-    front = hidden_by(legs, own, np.concatenate(points), margin)
+    P_camera = np.concatenate(points)
+    front = hidden_by(search.legs, own, P_camera, margin)
+    if len(search.occluders):
+        reach = margin * np.linalg.norm(P_camera, axis=1)
+        solid = search.occluders.hide(P_camera, np.where(own < search.n_legs, own, -1), reach)
+        front = np.where(solid >= 0, len(search.names) + solid, front)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
 

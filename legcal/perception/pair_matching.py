@@ -271,7 +271,7 @@ def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
     return PairMatches(*(np.concatenate(x, axis=axis) for x in zip(*parts, strict=True)))
 
 
-def _projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
+def projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
     """Return ends X (K, n, T, 2, 3) [m], points (K, n, T, 2, 2) and widths (K, n, T, 2).
 
     Of K pictures, n poses and T segments.
@@ -308,7 +308,7 @@ def _shown(xy: Array, corners: Array) -> Array:
 
 def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match a few poses to a few pictures."""
-    X, xy, width = _projected(pictures, poses)
+    X, xy, width = projected(pictures, poses)
     front = (X[..., 0, 2] > pictures.min_depth) & (X[..., 1, 2] > pictures.min_depth)
     front &= pictures.share[:, None] > 0.0
     visible = np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
@@ -444,7 +444,7 @@ def segment_equations(
     which alone are accurate enough to move joints, by shifts of A and B of the leg; residuals and
     weights (K, n, T, 4).
     """
-    X, xy, width = _projected(pictures, poses)
+    X, xy, width = projected(pictures, poses)
     K, n_pairs = pictures.pairs.shape[:2]
     table = np.concatenate([pictures.pairs, _width_sigmas(pictures)[..., None]], axis=2)
     at = found.pair + (n_pairs * np.arange(K))[:, None, None]
@@ -510,7 +510,7 @@ def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Arr
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
     _, _, residual, _ = segment_equations(pictures, poses, found, 1.0)
-    X, _, _ = _projected(pictures, poses)
+    X, _, _ = projected(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 

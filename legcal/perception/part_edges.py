@@ -31,6 +31,8 @@ MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
+OUTER_GAP, OUTER_PART = 2, 0.5  # columns between parallel lines; and what the outer one takes
+LEAST_LEFT = 1e-3  # of the score of a line
 SEPARATION = 2  # columns and differences of ends up to which a line is the same as a better one
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 LONE_SCORE = 0.5  # of an edge that may stand alone
@@ -267,6 +269,7 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
             rows = np.concatenate([np.arange(first[e], first[e] + n_blocks[e]) for e in own])
             of_own = votes[rows, most - half : most + half + 1]
             score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
+    _mark_down_inner(score)
     flat, every = score.reshape(n, -1), np.arange(n)
     around = np.arange(-SEPARATION, SEPARATION + 1)
     around = (around[:, None] * side + around).ravel()
@@ -279,6 +282,23 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
     change, place = 0.5 * (tilt - middle), place - middle
     shifts = np.stack([place - change, place + change], axis=-1)
     return np.where(best.T[..., None] > 0.0, shifts, 0.0), best.T
+
+
+def _mark_down_inner(score: Samples) -> None:
+    """Take from scores (n_patches, tilts, middles) of lines what parallel ones further out have.
+
+    A rod reflects the room in stripes along it, and nothing behind it runs along it for long: of
+    several parallel lines the outermost is the limb. Patches alternate between edges 1 and 2.
+    """
+    wide = score.copy()
+    np.maximum(wide[:, 1:], score[:, :-1], out=wide[:, 1:])
+    np.maximum(wide[:, :-1], score[:, 1:], out=wide[:, :-1])
+    for first, outwards in ((0, 1), (1, -1)):  # edge 1 is outermost where places are least
+        of_edge, lines = score[first::2, :, ::outwards], wide[first::2, :, ::outwards]
+        further_out = np.maximum.accumulate(lines, axis=2)[:, :, :-OUTER_GAP]
+        inner = of_edge[:, :, OUTER_GAP:]
+        left = np.maximum(inner - OUTER_PART * further_out, LEAST_LEFT * inner)
+        of_edge[:, :, OUTER_GAP:] = left
 
 
 def _added(votes: Samples, n_blocks: IntArray, halves: IntArray, half: int) -> Samples:
