@@ -924,6 +924,8 @@ def _models() -> Iterable[Refusal]:
     rows: Rows = [
         ("frame", swap(y, "- - leg1_end", "- - leg1_ned"), ("closed_loop.0.0", "'leg1_end'")),
         ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
+        ("frame-of-another", swap(y, "  - leg5_seat", "  - leg2_seat"),
+         ("closed_loop.4", "'leg2_seat'", "closed_loop.1", "write 'leg5_seat'")),
         ("three", swap(y, "  - leg1_seat\n", "  - leg1_seat\n  - base\n"), ("closed_loop.0",)),
         ("motor", swap(y, "- leg1_prismatic\n", "- leg9_prismatic\n"), ("name_mot.0",)),
         ("motor-twice", swap(y, "- leg1_prismatic\n", "- leg2_prismatic\n"),

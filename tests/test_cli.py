@@ -125,6 +125,24 @@ def test_failures_have_their_exit_code_and_are_said_once(
     assert said in found["message"]
 
 
+def test_json_has_the_facts_of_what_is_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy_of_the_example(tmp_path / "data")
+    table = tmp_path / "data" / "measurements.csv"
+    head, first, *rest = table.read_text("utf-8").splitlines()
+    cells = first.split(",")[:-1]
+    table.write_text("\n".join([head, ",".join([*cells, "far"]), *rest]), "utf-8")
+    assert run(monkeypatch, "doctor", str(tmp_path / "data"), "--json") == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    (problem,) = error["problems"]
+    assert problem["file"] == str(table)
+    assert (problem["row"], problem["line"], problem["columns"]) == (1, 2, head.split(",")[-1:])
+    assert problem["found"] == "'far'"
+    assert problem["needed"].startswith("a finite number")
+    assert all(problem[key] in error["message"] for key in ("what", "found", "needed", "remedy"))
+
+
 @pytest.mark.parametrize("words", [(), ("study",)])
 def test_without_a_command_the_help_is_shown(
     words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -25,7 +25,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, LegcalError
+from legcal.errors import DatasetError, LegcalError, Place
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
@@ -224,9 +224,9 @@ def test_an_image_is_decoded_once_until_its_file_changes(
 ) -> None:
     decoded = list[Path]()
 
-    def decode(path: Path, camera: Camera, where: str) -> object:
+    def decode(path: Path, camera: Camera, named: Place) -> object:
         decoded.append(path)
-        return decode_image(path, camera, where)
+        return decode_image(path, camera, named)
 
     monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
     read = load_dataset(folder.write()).image_reader([0, 1])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
+from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.files import shipped_names
@@ -325,7 +325,7 @@ def test_what_stands_in_the_way_leaves_nothing_behind(
         create_model(machine, file / "folder")
 
     def refuse(path: Path) -> None:
-        raise OutOfClass(f"{path}: this machine is outside the method.")
+        raise OutOfClass(Problem("this machine is outside the method.", file=str(path)))
 
     monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
     with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):

@@ -17,11 +17,11 @@ from photograph_files import exif, jpeg, png, tiff, undecodable_png
 from legcal import calibrate, calibrate_camera, load_dataset
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.data.photograph_notes import compression_notes
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError, NotVisible, Place
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_facts import ImageFacts, read_facts
-from legcal.vision.image_file import BadImage, image_size, inspect_image, read_image
+from legcal.vision.image_file import BadImage, decode_image, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 
@@ -136,10 +136,10 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(
     path = tmp_path / "a.jpg"
     path.write_bytes(content)
     with pytest.raises(DatasetError) as refused:
-        read_image(path, CAMERA, "table, row 3")
+        decode_image(path, CAMERA, Place("table", 3))
     (sentence,) = refused.value.problems
     assert [w for w in ("table, row 3: image", "a.jpg", *words) if w not in sentence] == []
-    assert inspect_image(path, CAMERA, "table, row 3")[1] == sentence
+    assert str(inspect_image(path, CAMERA, Place("table", 3))[1]) == sentence
     assert cv2.utils.logging.getLogLevel() == level
     assert capfd.readouterr().err == ""
 

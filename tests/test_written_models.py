@@ -204,6 +204,20 @@ def test_a_leg_that_is_welded_to_the_platform_by_another_leg_is_refused(tmp_path
         load_mechanism(path)
 
 
+def test_legs_that_meet_in_one_frame_move_alone(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, MACHINES["6-UPS"](), Layout())
+    urdf = path.with_suffix(".urdf")
+    path.write_text(path.read_text().replace("- leg5_seat", "- leg4_seat"))
+    urdf.write_text(
+        "\n".join(line for line in urdf.read_text().splitlines() if "leg5_seat" not in line)
+    )
+    nominal = load_mechanism(path)
+    first, second = nominal.legs[3:5]
+    assert min(np.abs(first.A - second.A).max(), np.abs(first.B - second.B).max()) < 1e-12
+    legs = other_legs(nominal, 3e-3)
+    assert max(map(apart, geometries(write(nominal, legs, tmp_path)), legs)) < 1e-10
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
