@@ -27,6 +27,7 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
 WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
+SLACK = 0.5  # radii by which a solid before an outline is nearer; others are the part as drawn
 NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
@@ -260,7 +261,9 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     front = hidden_by(search.legs, own, P_camera, margin)
     if len(search.occluders):
         reach = margin * np.linalg.norm(P_camera, axis=1)
-        solid = search.occluders.hide(P_camera, np.where(own < search.n_legs, own, -1), reach)
+        leg = np.where(own < search.n_legs, own, -1)
+        before = SLACK * np.repeat([part.segment.radius for part in searched], n)
+        solid = search.occluders.hide(P_camera, leg, reach, before)
         front = np.where(solid >= 0, len(search.names) + solid, front)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
