@@ -182,6 +182,18 @@ class PlacedOccluders:
         """Return the corners of one of them (m, 3) [m]."""
         return np.asarray(self.occluders[i].corners @ self.R[i].T + self.t[i])
 
+    def silhouette(self, i: int) -> Array:
+        """Return the edges (k, 2, 2) around one of them, seen from the origin along z, at depth 1.
+
+        There are none of a mesh, nor where a part of it is not before the origin.
+        """
+        corners = self.corners(i)
+        if self.occluders[i].triangles is not None or corners[:, 2].min() <= EMPTY:
+            return np.zeros((0, 2, 2))
+        xy = corners[:, :2] / corners[:, 2:]
+        around = xy[ConvexHull(xy).vertices]
+        return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
+
     def hide(self, points: Array, own: IntArray, margin: Array, before: Array) -> IntArray:
         """Return which of them hides each point (n, 3) from the origin, -1 where none does.
 
