@@ -151,9 +151,8 @@ def _files(dataset: Dataset) -> list[bytes]:
     models = [path for path in (machine.yaml_path, machine.urdf_path) if path is not None]
     images = sorted({image for image in dataset.measurements.image if image})
     meshes = [o.corners.tobytes() for o in machine.occluders if o.triangles is not None]
-    return [
-        *meshes, *(_digest(path) for path in (*models, *(dataset.folder / name for name in images)))
-    ]  # fmt: skip
+    files = [_digest(path) for path in (*models, *(dataset.folder / name for name in images))]
+    return meshes + files
 
 
 def _digest(path: Path) -> bytes:

@@ -191,7 +191,10 @@ class PlacedOccluders:
         if self.occluders[i].triangles is not None or corners[:, 2].min() <= EMPTY:
             return np.zeros((0, 2, 2))
         xy = corners[:, :2] / corners[:, 2:]
-        around = xy[ConvexHull(xy).vertices]
+        try:
+            around = xy[ConvexHull(xy).vertices]
+        except QhullError:  # a plate seen edge-on
+            return np.zeros((0, 2, 2))
         return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
 
     def hide(self, points: Array, own: IntArray, margin: Array, before: Array) -> IntArray:
@@ -287,7 +290,7 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
         if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
             with suppress(ValueError):  # it hides nothing, and pictures of it say why
                 solids.append(VisualSolid(link, *read_mesh(urdf.path, visual)))
-        corners = _corners(str(shape.tag), shape.attrib)
+        corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
             cylinder = None
             if shape.tag == "cylinder":
@@ -367,6 +370,7 @@ def _places(
     """Return what each body is on, and the pose (4, 4) of the body in the frame of that."""
     T_base, T_platform = (matrix_inverse(bodies.T_body_link[link]) for link in (base, platform))
     free = [j for j, leg in enumerate(legs) if not leg.is_fixed_to_platform]
+    free = free if len(free) >= 3 else list(range(len(legs)))  # B of the others may be anywhere
     held = (_none(),) * 2 if normals is None else (normals[1][None], normals[0][None])
     on_base = Carrier()
     on_platform = Carrier(

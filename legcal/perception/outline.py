@@ -263,9 +263,9 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     front = hidden_by(search.legs, own, P_camera, margin)
     if len(search.occluders):
         reach = margin * np.linalg.norm(P_camera, axis=1)
-        leg = np.where(own < search.n_legs, own, -1)
+        along = np.where(own < search.n_legs, own, -1)
         before = SLACK * np.repeat([part.segment.radius for part in searched], n)
-        solid = search.occluders.hide(P_camera, leg, reach, before)
+        solid = search.occluders.hide(P_camera, along, reach, before)
         front = np.where(solid >= 0, len(search.names) + solid, front)
     found = [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
     for i, occluder in enumerate(search.occluders.occluders):
