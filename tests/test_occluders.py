@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,8 @@ def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Mac
     (root / "models").mkdir()
     (root / "urdf").mkdir()
     parts = [trimesh.creation.box((0.1, 0.1, 0.01)), trimesh.creation.box((0.01, 0.1, 0.1))]
-    trimesh.util.concatenate(parts).export(root / "urdf/angle.stl")
+    angle: Any = trimesh.util.concatenate(parts)
+    angle.export(root / "urdf/angle.stl")
     trimesh.creation.annulus(0.013, 0.02, 0.2).export(root / "urdf/hollow.stl")
 
     @cache
