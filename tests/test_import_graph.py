@@ -51,6 +51,7 @@ PUBLIC: dict[str, set[str]] = {
         "kinematics",
         "leg",
         "loader",
+        "meshes",
         "mobility",
         "model",
         "model_builder",

@@ -1,11 +1,13 @@
 """Solids of a model that are not measured: where they are, and what they hide of legs."""
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 import legcal
 from legcal.geometry.motions import look_at
@@ -21,28 +23,49 @@ from legcal.vision.camera import sample_camera
 from legcal.vision.visibility import visible_segments
 
 ROOT = Path(__file__).parents[1]
-HOUSING = '<visual><origin xyz="0.004 -0.003 -0.14"/><geometry><box size="0.03 0.03 0.2"/></geometry></visual>'  # noqa: E501
-MOTOR = '<visual><origin xyz="0.05 0 -0.2"/><geometry><cylinder radius="0.02" length="0.1"/></geometry></visual>'  # noqa: E501
-BRACKET = '<visual><origin xyz="0.1 0 0.03" rpy="0.3 0.2 0"/><geometry><box size="0.1 0.05 0.03"/></geometry></visual>'  # noqa: E501
-BALL = '<visual><origin xyz="0.1 0.1 0.05"/><geometry><sphere radius="0.03"/></geometry></visual>'
 
 
-@cache
-def with_solids(name: str) -> Machine:
-    """Return a shipped machine with solids on base, platform, and a stage of each leg."""
-    text = (ROOT / f"urdf/{name}.urdf").read_text()
-    for link in ("base", "platform"):
-        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{BRACKET}{BALL}</link>')
-    for j in range(1, 7):
-        stage = f'<link name="leg{j}_tube">'
-        text = text.replace(stage, f"{stage}{HOUSING}{MOTOR}")
-    with TemporaryDirectory() as folder:
-        root = Path(folder)
-        (root / "urdf").mkdir()
-        (root / "models").mkdir()
+def visual(shape: str, xyz: str, rpy: str = "0 0 0") -> str:
+    return f'<visual><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{shape}</geometry></visual>'
+
+
+HOUSING = visual('<box size="0.03 0.03 0.2"/>', "0.004 -0.003 -0.14")
+HOLLOW = visual('<mesh filename="hollow.stl"/>', "0 0 -0.14")
+MOTOR = visual('<cylinder radius="0.02" length="0.1"/>', "0.05 0 -0.2")
+ON_ENDS = (
+    visual('<box size="0.1 0.05 0.03"/>', "0.1 0 0.03", "0.3 0.2 0")
+    + visual('<sphere radius="0.03"/>', "0.1 0.1 0.05")
+    + visual('<mesh filename="package://any/angle.stl"/>', "-0.1 0 0.05")
+)
+
+
+@pytest.fixture(scope="module")
+def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Machine]:
+    """Return shipped machines with solids on base, platform, and a stage of each leg.
+
+    Of their meshes one, on both ends, is not convex, the other surrounds the last leg.
+    """
+    root = tmp_path_factory.mktemp("solids")
+    (root / "models").mkdir()
+    (root / "urdf").mkdir()
+    parts = [trimesh.creation.box((0.1, 0.1, 0.01)), trimesh.creation.box((0.01, 0.1, 0.1))]
+    angle: Any = trimesh.util.concatenate(parts)
+    angle.export(root / "urdf/angle.stl")
+    trimesh.creation.annulus(0.013, 0.02, 0.2).export(root / "urdf/hollow.stl")
+
+    @cache
+    def machine(name: str) -> Machine:
+        text = (ROOT / f"urdf/{name}.urdf").read_text()
+        for link in ("base", "platform"):
+            text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{ON_ENDS}</link>')
+        for j in range(1, 7):
+            stage = f'<link name="leg{j}_tube">'
+            text = text.replace(stage, f"{stage}{HOLLOW if j == 6 else HOUSING}{MOTOR}")
         (root / f"urdf/{name}.urdf").write_text(text)
         (root / f"models/{name}.yaml").write_text((ROOT / f"models/{name}.yaml").read_text())
         return legcal.load_mechanism(root / f"models/{name}.yaml")
+
+    return machine
 
 
 def posed(machine: Machine, n: int) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
@@ -57,7 +80,9 @@ def posed(machine: Machine, n: int) -> tuple[tuple[PosedMachine, ...], list[Plac
 @pytest.mark.parametrize(
     "name", ["hexapod", "3-prs", "linear-delta", "delta", "servo-hexapod", "hexaglide"]
 )
-def test_hidden_is_what_rays_at_the_model_do_not_reach(name: str) -> None:
+def test_hidden_is_what_rays_at_the_model_do_not_reach(
+    name: str, with_solids: Callable[[str], Machine]
+) -> None:
     """Rays meet triangles of the visuals at the links' poses in Pinocchio, by another code."""
     machine = with_solids(name)
     size, rng = machine.size, np.random.default_rng(3)
@@ -67,26 +92,29 @@ def test_hidden_is_what_rays_at_the_model_do_not_reach(name: str) -> None:
         direction = rng.normal(size=3)
         centre = middle + 4.0 * size * direction / np.linalg.norm(direction)
         points = middle + size * rng.uniform(-1.0, 1.0, (4000, 3))
-        none = np.full(len(points), -1)
+        none, zero = np.full(len(points), -1), np.zeros(len(points))
         T = look_at(centre, middle)
         seen = placed.before(T.as_matrix())
-        hidden = seen.hide(T.inv().apply(points), none, np.zeros(len(points))) >= 0
-        by_rays = here.hidden(centre, points, np.zeros(len(points)))
+        hidden = seen.hide(T.inv().apply(points), none, zero, zero) >= 0
+        by_rays = here.hidden(centre, points, zero)
         share.append(float(np.mean(hidden != by_rays)))
         n_hidden += int(np.count_nonzero(by_rays))
     assert n_hidden > 50
     assert max(share) < 0.003  # polygons stand for circles, one around and one within
 
 
-def test_a_rod_is_not_looked_for_inside_the_housing_of_its_leg() -> None:
+@pytest.mark.parametrize("name", ["leg1", "leg6"])  # a box, and a mesh that is hollow
+def test_a_rod_is_not_looked_for_inside_the_housing_of_its_leg(
+    name: str, with_solids: Callable[[str], Machine]
+) -> None:
     machine = with_solids("hexapod")
-    leg = machine.legs[0]
+    leg = machine.legs[machine.leg_names.index(name)]
     length = leg.length_at(0.5 * sum(leg.travel))
     segments = visible_segments(leg.cylinders, length)
     # from 0.14 - 0.1 to 0.14 + 0.1 from A inside it; the longer stretch begins at its end
     assert segments
     for segment in segments:
-        assert segment.start >= 0.24 + 2.0 * segment.radius - 1e-9
+        assert segment.start == pytest.approx(0.24 + 2.0 * segment.radius, abs=1e-3)
     bare = [
         Cylinder(c.link, c.radius, c.side, c.start, c.end)  # without what encloses it
         for c in leg.cylinders
@@ -94,7 +122,9 @@ def test_a_rod_is_not_looked_for_inside_the_housing_of_its_leg() -> None:
     assert visible_segments(bare, length)[0].start < 0.1
 
 
-def test_plans_see_of_legs_what_the_simulation_shows_of_them() -> None:
+def test_plans_see_of_legs_what_the_simulation_shows_of_them(
+    with_solids: Callable[[str], Machine],
+) -> None:
     """Segments that a plan counts on are free for rays at the model."""
     machine, camera = with_solids("hexapod"), sample_camera()
     n, checked = 4, 0

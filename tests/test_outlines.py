@@ -6,13 +6,14 @@ import cv2
 import numpy as np
 import pytest
 from rendering import Bar, Light, render
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
+from legcal.machine.occluders import Carrier, Occluder
 from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
@@ -48,10 +49,15 @@ def cylinder(b: Bar, radius: float | None = None) -> tuple[Cylinder, ...]:
 
 
 def detect(
-    cam: Camera, bars: list[Bar], image: Image, off: float = 2e-3, radius: float | None = None
+    cam: Camera,
+    bars: list[Bar],
+    image: Image,
+    off: float = 2e-3,
+    radius: float | None = None,
+    solids: tuple[Occluder, ...] = (),
 ) -> Outlines:
     """Detect bars whose predicted joints are ``off`` metres wrong in every coordinate."""
-    return detect_with_blur(cam, bars, image, off, radius)[0]
+    return detect_with_blur(cam, bars, image, off, radius, solids=solids)[0]
 
 
 def detect_with_blur(
@@ -61,6 +67,7 @@ def detect_with_blur(
     off: float = 2e-3,
     radius: float | None = None,
     known: tuple[float, ...] = (),
+    solids: tuple[Occluder, ...] = (),
 ) -> tuple[Outlines, float]:
     """Return the blur of the image as well; that of the view may be known [px]."""
     rng = np.random.default_rng(0)
@@ -72,6 +79,7 @@ def detect_with_blur(
     size = float(np.linalg.norm(B - A, axis=2).mean())
     grey = image.astype(np.float32)
     search = Search(lambda row: grey, one_view, A, B, cylinders, wanted, names, size)
+    search = replace(search, occluders=solids)
     found, blur = measure_outlines(search, Placement(A, B, (IDENTITY,), blur=known), [0])
     return found, float(blur[0])
 
@@ -134,6 +142,42 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
         assert np.abs(error).max() < 0.2
         assert np.median(np.abs(error)) < 0.08
         assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
+
+
+@pytest.mark.parametrize("name", ["before it", "before half of it", "behind it", "along it",
+                                  "along it, far away", "at an angle"])  # fmt: skip
+def test_a_solid_hides_and_its_edges_are_not_taken_for_outlines(name: str) -> None:
+    cam, rod = camera(), bar(-0.09, 0.03, 170.0)
+    behind, bars = SCENES["bright on dark"][0], [rod]
+    image = np.rint(render(cam, bars, behind, Light(), blur=0.5, noise=2.0, supersample=3))
+    turn = Rotation.align_vectors([rod.B - rod.A], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    middle, half = 0.5 * (rod.A + rod.B), np.array([0.02, 0.02, 0.25])
+    aside = np.array([0.037, 0.0, 0.02])  # one edge is less than 5 px from an outline
+    if name.startswith("before"):
+        half, middle = np.array([0.05, 0.02, 0.3]), middle - [0.0, 0.0, 0.2]
+        if name == "before half of it":
+            half[2], middle = 0.08, middle - 0.08 * turn[:, 2]
+    elif name == "behind it":
+        middle = middle + np.array([0.0, 0.0, 0.2])
+        half[0] = 0.2
+    elif name == "along it, far away":
+        middle = middle + 3.0 * aside
+    else:
+        middle = middle + aside
+        if name == "at an angle":
+            turn = turn @ Rotation.from_rotvec([0.0, 0.3, 0.0]).as_matrix()
+    corners = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3) * half
+    solid = Occluder("box", Carrier(), corners @ turn.T + middle)
+    found = detect(cam, bars, image.astype(np.uint8), solids=(solid,))
+    if name in ("before it", "along it"):
+        assert set(found.reason) == {Rejection(Reason.HIDDEN, "box")}
+        return
+    assert np.all(found.used), found.reason
+    assert np.abs(errors(cam, bars, found)).max() < 0.2
+    length = np.linalg.norm(found.ends[:, 1] - found.ends[:, 0], axis=1)
+    whole = detect(cam, bars, image.astype(np.uint8))
+    share = length / np.linalg.norm(whole.ends[:, 1] - whole.ends[:, 0], axis=1)
+    assert np.all(share < 0.6) if name == "before half of it" else np.all(share == 1.0)
 
 
 @pytest.mark.parametrize(

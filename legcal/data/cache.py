@@ -146,11 +146,13 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
 
 
 def _files(dataset: Dataset) -> list[bytes]:
-    """Return digests of the mechanism's files and of the images, sorted by name."""
+    """Return meshes, and digests of the mechanism's files and of the images, sorted by name."""
     machine = dataset.machine
     models = [path for path in (machine.yaml_path, machine.urdf_path) if path is not None]
     images = sorted({image for image in dataset.measurements.image if image})
-    return [_digest(path) for path in (*models, *(dataset.folder / name for name in images))]
+    meshes = [o.corners.tobytes() for o in machine.occluders if o.triangles is not None]
+    files = [_digest(path) for path in (*models, *(dataset.folder / name for name in images))]
+    return meshes + files
 
 
 def _digest(path: Path) -> bytes:

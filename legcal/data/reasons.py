@@ -66,7 +66,7 @@ class Reason(StrEnum):
 WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.NONE: ("", ""),
     Reason.OUTSIDE: ("outside the image", ""),
-    Reason.HIDDEN: ("hidden by another leg", "hidden by {}"),
+    Reason.HIDDEN: ("hidden by another part", "hidden by {}"),
     Reason.NARROW: ("too narrow", "too narrow, {} px wide"),
     Reason.SHORT: ("too short", "too short, {}"),
     Reason.NOT_PLACED: ("the camera of its view could not be placed", ""),

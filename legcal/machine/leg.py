@@ -113,10 +113,10 @@ class JointType(StrEnum):
 
 
 class Cover(NamedTuple):
-    """A stretch of a leg inside a solid that moves with one half of it, as of a `Cylinder`."""
+    """A stretch of a leg that moves with one half of it, such as one inside a solid."""
 
     side: Literal["base", "platform"]
-    start: float  # [m]
+    start: float  # from A for base, from B for platform, positive from A to B [m]
     end: float
 
     def span(self, length: float) -> tuple[float, float]:
@@ -138,8 +138,7 @@ class Cylinder:
 
     def span(self, length: float) -> tuple[float, float]:
         """Return both ends as distances from A along a leg of that length [m]."""
-        shift = 0.0 if self.side == "base" else length
-        return self.start + shift, self.end + shift
+        return Cover(self.side, self.start, self.end).span(length)
 
 
 def with_radii(

@@ -1,17 +1,18 @@
-"""What of a model hides without being measured: boxes, spheres, cylinders off the axes of legs.
+"""What of a model hides without being measured: boxes, spheres, meshes, other cylinders.
 
-Housings and motors of legs, carriages, brackets, towers: each is a convex solid on what carries it.
-Where the joints A and B of the legs are says where carriers are; a leg's own solids turn about it
-as its joint at one end has them. Where a leg may turn about itself, what they sweep stands for
-them.
+Housings and motors of legs, carriages, brackets, towers: each is a convex solid, or a mesh, on what
+carries it. Where the joints A and B of the legs are says where carriers are; a leg's own solids
+turn about it as its joint at one end has them. Where a leg may turn about itself, what they sweep
+stands for them; of meshes only what they enclose of their leg counts there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -23,10 +24,13 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.bodies import Bodies
 from legcal.machine.cylinders import Half, VisualCylinder, halves_of_leg, is_measured
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
+from legcal.machine.meshes import mesh_file, read_mesh
 from legcal.machine.urdf import Urdf, number_list, origins_of, parse_robot
 
 SIDES = 24  # of the prism around what is round
-THICKER = 1.01  # radii of a cylinder that what hides it reaches beyond, at least
+THICKER = 1.2  # radii of a cylinder that what encloses it reaches beyond, at least
+SLICES, DIRECTIONS = 200, 12  # along and around a leg, where a mesh is looked for
+GRAZING = 1e-5  # sine of the angle of a ray to a triangle by which that hides nothing
 ALONG = 1e-6  # sine of the angle to a leg below which a revolute only turns the leg about itself
 EMPTY = 1e-9  # depth of a body [m] that is not worth a look
 
@@ -39,10 +43,11 @@ def _none() -> Array:
 
 
 class VisualSolid(NamedTuple):
-    """A visual of the file as the corners of a convex solid."""
+    """A visual of the file as the corners of a convex solid, or as triangles."""
 
     link: str
     corners: Array  # (m, 3) in the link [m]
+    triangles: IntArray | None = None  # (k, 3) of corners, where it is a mesh
     cylinder: VisualCylinder | None = None  # where it is one
 
 
@@ -113,15 +118,16 @@ def frame_along(u: Array, axis: Array, *, is_outer: bool) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Occluder:
-    """A convex solid that hides what is inside and behind it."""
+    """A convex solid or a mesh that hides what is inside and behind it."""
 
     link: str
     carrier: Carrier | LegHalf
     corners: Array  # (m, 3) in the frame of its carrier [m]
+    triangles: IntArray | None = None  # (k, 3) of the corners of a mesh
 
     @cached_property
     def planes(self) -> Array:
-        """Planes (k, 4) of its faces: n x + d > 0 is outside."""
+        """Planes (k, 4) of the faces around it: n x + d > 0 is outside."""
         return planes_around(self.corners)
 
     @property
@@ -176,26 +182,57 @@ class PlacedOccluders:
         """Return the corners of one of them (m, 3) [m]."""
         return np.asarray(self.occluders[i].corners @ self.R[i].T + self.t[i])
 
-    def hide(self, points: Array, own: IntArray, margin: Array) -> IntArray:
+    def silhouette(self, i: int) -> Array:
+        """Return the edges (k, 2, 2) around one of them, seen from the origin along z, at depth 1.
+
+        There are none of a mesh, nor where a part of it is not before the origin.
+        """
+        corners = self.corners(i)
+        if self.occluders[i].triangles is not None or corners[:, 2].min() <= EMPTY:
+            return np.zeros((0, 2, 2))
+        xy = corners[:, :2] / corners[:, 2:]
+        try:
+            around = xy[ConvexHull(xy).vertices]
+        except QhullError:  # a plate seen edge-on
+            return np.zeros((0, 2, 2))
+        return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
+
+    def hide(self, points: Array, own: IntArray, margin: Array, before: Array) -> IntArray:
         """Return which of them hides each point (n, 3) from the origin, -1 where none does.
 
-        ``own`` is the leg to which each point belongs, -1 of none, and ``margin`` what others reach
-        beyond themselves where they are as far away as it [m].
+        ``own`` is the leg to which each point belongs, -1 of none, ``margin`` what others reach
+        beyond themselves where they are as far away as it, and ``before`` by how much at least what
+        hides it is nearer [m].
         """
         front = np.full(len(points), -1, dtype=np.intp)
+        last = 1.0 - before / np.linalg.norm(points, axis=1)
         for i, occluder in enumerate(self.occluders):
             is_own = own == occluder.leg if occluder.leg >= 0 else np.zeros(len(own), np.bool_)
-            if occluder.turns and np.all(is_own):
+            if occluder.turns and (np.all(is_own) or occluder.triangles is not None):
                 continue
             reach = np.where(is_own, 0.0, margin)
-            hides = self._behind(i, points, reach)
+            behind = self._behind if occluder.triangles is None else self._behind_mesh
+            hides = behind(i, points, reach, last)
             if occluder.turns:
                 hides &= ~is_own
             front[hides] = i
         return front
 
-    def _behind(self, i: int, points: Array, reach: Array) -> BoolArray:
-        """Return which points (n, 3) are in one of them or behind it, seen from the origin."""
+    def _behind_mesh(self, i: int, points: Array, reach: Array, last: Array) -> BoolArray:
+        """Return the same as :meth:`_behind` of a mesh; ``reach`` is tried on four sides."""
+        R, t = self.R[i], self.t[i]
+        sides = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+        hidden = np.zeros(len(points), dtype=np.bool_)
+        for side in sides if np.any(reach > 0.0) else sides[:1]:
+            there = (points + reach[:, None] * side - t) @ R
+            hidden |= first_hits(self.occluders[i], -t @ R, there) < last
+        return hidden
+
+    def _behind(self, i: int, points: Array, reach: Array, last: Array) -> BoolArray:
+        """Return which points (n, 3) are in one of them or behind it, seen from the origin.
+
+        What counts on the way to each ends at a part ``last`` (n,) of it.
+        """
         planes = self.occluders[i].planes
         normal = planes[:, :3] @ self.R[i].T
         outside = planes[:, 3] - normal @ self.t[i] - reach[:, None]  # of the origin, (n, k)
@@ -205,12 +242,43 @@ class PlacedOccluders:
         enters = np.where(slope < 0.0, crossing, np.where(outside > 0.0, np.inf, -np.inf))
         enters[slope > 0.0] = -np.inf
         leaves = np.where(slope > 0.0, crossing, np.inf)
-        first, last = np.maximum(enters.max(axis=1), 0.0), leaves.min(axis=1)
-        return np.asarray((first < last) & (first < 1.0))
+        first = np.maximum(enters.max(axis=1), 0.0)
+        return np.asarray((first < leaves.min(axis=1)) & (first < last))
+
+
+def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
+    """Return where rays from an origin (3,) or (n, 3) to points (n, 3) meet a mesh first, (n,).
+
+    They are parts of the way, infinite where none is met. All are in the frame of its carrier.
+    """
+    way = points - origin
+    start = np.broadcast_to(origin, way.shape)
+    length = np.linalg.norm(way, axis=1)
+    ray = way / length[:, None]
+    hits = np.full(len(points), np.inf)
+    if mesh.triangles is None:
+        return hits
+    triangle, index = _caster(mesh).intersects_id(start, ray, multiple_hits=False)
+    corner = mesh.corners[mesh.triangles[triangle]]
+    normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    towards = np.sum(normal * ray[index], axis=1)
+    is_hit = np.abs(towards) > GRAZING * np.linalg.norm(normal, axis=1)
+    index, reached = index[is_hit], np.sum(normal * (corner[:, 0] - start[index]), axis=1)[is_hit]
+    hits[index] = reached / towards[is_hit] / length[index]
+    return hits
+
+
+@lru_cache(maxsize=256)
+def _caster(mesh: Occluder) -> Any:
+    """Return what casts rays at a mesh."""
+    import trimesh  # 30 MB and half a second: only where there are meshes
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    return RayMeshIntersector(trimesh.Trimesh(mesh.corners, mesh.triangles, process=False))
 
 
 def visual_solids(urdf: Urdf) -> list[VisualSolid]:
-    """Return the boxes, spheres and cylinders of a tree."""
+    """Return the boxes, spheres, cylinders and meshes of a tree that can be read."""
     shown = [
         (link.get("name", ""), visual, shape)
         for link in parse_robot(urdf.path, urdf.content).findall("link")
@@ -218,14 +286,17 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
         for shape in visual.findall("geometry/*")
     ]
     solids = []
-    for (link, _, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
-        corners = _corners(str(shape.tag), shape.attrib)
+    for (link, visual, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
+        if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
+            with suppress(ValueError):  # it hides nothing, and pictures of it say why
+                solids.append(VisualSolid(link, *read_mesh(urdf.path, visual)))
+        corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
             cylinder = None
             if shape.tag == "cylinder":
                 sizes = float(shape.get("radius", "")), float(shape.get("length", ""))
                 cylinder = VisualCylinder(link, T, *sizes)
-            solids.append(VisualSolid(link, matrix_applied(T, corners), cylinder))
+            solids.append(VisualSolid(link, matrix_applied(T, corners), None, cylinder))
     return solids
 
 
@@ -276,8 +347,8 @@ def occluders_of(
             continue
         carrier, T = places[body]
         corners = matrix_applied(matrix_product(T, bodies.T_body_link[solid.link]), solid.corners)
-        occluder = Occluder(solid.link, carrier, corners)
-        if occluder.turns:
+        occluder = Occluder(solid.link, carrier, corners, solid.triangles)
+        if occluder.turns and solid.triangles is None:
             radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
             low, high = corners[:, 2].min(), corners[:, 2].max()
             occluder = replace(occluder, corners=prism(radius, (float(low), float(high))))
@@ -299,6 +370,7 @@ def _places(
     """Return what each body is on, and the pose (4, 4) of the body in the frame of that."""
     T_base, T_platform = (matrix_inverse(bodies.T_body_link[link]) for link in (base, platform))
     free = [j for j, leg in enumerate(legs) if not leg.is_fixed_to_platform]
+    free = free if len(free) >= 3 else list(range(len(legs)))  # B of the others may be anywhere
     held = (_none(),) * 2 if normals is None else (normals[1][None], normals[0][None])
     on_base = Carrier()
     on_platform = Carrier(
@@ -393,6 +465,10 @@ def _covered(cylinder: Cylinder, leg: int, occluders: Sequence[Occluder]) -> Cyl
     for occluder in occluders:
         if not isinstance(occluder.carrier, LegHalf) or occluder.leg != leg:
             continue
+        if occluder.triangles is not None:
+            side, radius = occluder.carrier.side, THICKER * cylinder.radius
+            covers += [Cover(side, *ends) for ends in _enclosed(occluder, radius)]
+            continue
         reach = np.linalg.norm(occluder.corners[:, :2], axis=1).max()
         normal, outside = occluder.planes[:, 2], occluder.planes[:, 3]
         if reach < THICKER * cylinder.radius or np.any((np.abs(normal) < 1e-12) & (outside > 0.0)):
@@ -403,6 +479,25 @@ def _covered(cylinder: Cylinder, leg: int, occluders: Sequence[Occluder]) -> Cyl
         if low < high:
             covers.append(Cover(occluder.carrier.side, low, high))
     return replace(cylinder, covers=tuple(covers)) if covers else cylinder
+
+
+def _enclosed(mesh: Occluder, radius: float) -> list[tuple[float, float]]:
+    """Return the stretches along z that a mesh surrounds, farther out than a radius [m]."""
+    z = mesh.corners[:, 2]
+    size = (float(z.max()) - float(z.min())) / SLICES
+    if size <= EMPTY:
+        return []
+    height = z.min() + size * (np.arange(SLICES) + 0.5)
+    far = 2.0 * float(np.linalg.norm(mesh.corners[:, :2], axis=1).max()) + radius
+    turn = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    around = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(DIRECTIONS)])
+    axis = np.column_stack([np.zeros((SLICES, 2)), height])
+    start = (axis[:, None] + far * around).reshape(-1, 3)
+    hits = first_hits(mesh, start, np.repeat(axis, DIRECTIONS, axis=0))
+    is_thick = np.all((1.0 - hits.reshape(SLICES, DIRECTIONS)) * far > radius, axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_thick, [False]]).astype(np.int8)))
+    at = z.min() + size * edges
+    return [(float(low), float(high)) for low, high in zip(at[::2], at[1::2], strict=True)]
 
 
 def reordered(occluders: Sequence[Occluder], order: Sequence[int]) -> tuple[Occluder, ...]:

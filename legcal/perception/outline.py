@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.occluders import PlacedOccluders
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
@@ -41,7 +41,9 @@ MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
 # How far a lone outline may be from its prediction: of the window, of its partner's distance
 LONE_OFFSET, LONE_RATIO = 0.5, 0.5
 WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
+SLACK = 0.5  # radii by which a solid before an outline is nearer; others are the part as drawn
 NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
+SKEW = 0.09  # tangent of the angle, 5 deg, at which the edge of a solid passes for an outline
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
 
@@ -256,7 +258,8 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
 def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free.
 
-    Other solids of the machine count on from the legs and arms.
+    Other solids of the machine count on from the legs and arms. Where the edge of one goes along
+    most of an outline, within the window, it would be taken for it: that part counts as hidden.
     """
     if not searched:
         return []
@@ -273,9 +276,38 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     front = hidden_by(search.legs, own, P_camera, margin)
     if len(search.occluders):
         reach = margin * np.linalg.norm(P_camera, axis=1)
-        solid = search.occluders.hide(P_camera, np.where(own < search.n_legs, own, -1), reach)
+        along = np.where(own < search.n_legs, own, -1)
+        before = SLACK * np.repeat([part.segment.radius for part in searched], n)
+        solid = search.occluders.hide(P_camera, along, reach, before)
         front = np.where(solid >= 0, len(search.names) + solid, front)
-    return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
+    found = [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
+    for i, occluder in enumerate(search.occluders.occluders):
+        edges = search.occluders.silhouette(i)
+        for part, of_part in zip(searched, found, strict=True):
+            if part.leg.leg == occluder.leg or not len(edges):
+                continue
+            free = of_part < 0
+            beside = _beside(part, edges, float(search.window[part.leg.leg])) & free
+            if np.any(2 * beside.sum(axis=1) > free.sum(axis=1)):
+                of_part[free] = len(search.names) + i
+    return found
+
+
+def _beside(part: _Predicted, edges: Array, window: float) -> BoolArray:
+    """Return which blocks (2, n_blocks) of a part have an edge of a solid near an outline.
+
+    It is one of the edges (n, 2, 2) on the sensor plane that are as good as parallel to the part
+    and within the window, where an outline cannot be told from it.
+    """
+    at = block_positions(part.band)
+    outlines = part.v[:, :1] + (part.v[:, 1:] - part.v[:, :1]) * at / part.band.length
+    t, v = part.band.coordinates(edges)
+    along, across = np.diff(t, axis=1), np.diff(v, axis=1)  # (n, 1)
+    is_parallel = np.abs(across) < SKEW * np.abs(along)
+    share = (at - t[:, :1]) / np.where(is_parallel, along, 1.0)
+    is_there = is_parallel & (share > 0.0) & (share < 1.0)
+    offset = v[:, :1] + share * across - outlines[:, None]
+    return np.asarray(np.any(is_there & (np.abs(offset) < window), axis=1))
 
 
 def _with_verdict(

@@ -82,7 +82,7 @@ class LaidBoard:
         hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0, surely=False)[:, 0]
         nobody, beside = np.full(len(points), -1), np.full(len(points), self.board.side)
         for k, placed in enumerate(bodies.occluders):
-            hidden[k] |= placed.hide(P[k], nobody, beside) >= 0
+            hidden[k] |= placed.hide(P[k], nobody, beside, np.zeros(len(points))) >= 0
         return ~np.asarray(hidden.any(axis=1))
 
     def _narrowest(self, px: Array) -> float:

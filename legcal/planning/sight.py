@@ -178,7 +178,7 @@ def what_is_seen(
         np.repeat(x, N_SAMPLES) for x in (np.where(body < bodies.n_legs, body, -1), radius)
     )
     for k, placed in enumerate(bodies.occluders):
-        hides = placed.hide(P[k].reshape(-1, 3), own, beside) >= 0
+        hides = placed.hide(P[k].reshape(-1, 3), own, beside, beside) >= 0
         is_visible[k] &= ~hides.reshape(is_visible.shape[1:])
     thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
     is_visible &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -21,6 +20,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
 from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
+from legcal.machine.meshes import mesh_file, read_mesh
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
 from legcal.machine.urdf import number_list, origins_of, parse_robot
@@ -92,7 +92,7 @@ def _check(urdf_path: Path, element: etree._Element) -> None:
 def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
     """Check that a mesh has a file and a size."""
     name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
-    if _found(urdf_path, name) is None:
+    if mesh_file(urdf_path, name) is None:
         raise ValueError(
             f"found no mesh file '{name}', needed it beside the URDF; copy it or correct the name"
         )
@@ -110,7 +110,7 @@ def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransfo
     """
     shape = visual.find("geometry")[0]  # type: ignore[index]
     if shape.tag == "mesh":
-        return _mesh(urdf_path, visual), RigidTransform.identity()
+        return Mesh(*read_mesh(urdf_path, visual)), RigidTransform.identity()
     numbers = [float(x) for name in _SIZES[str(shape.tag)] for x in shape.get(name, "").split()]
     T = RigidTransform(origins_of([visual])[0], normalize=False, copy=False)
     if shape.tag == "cylinder":
@@ -119,60 +119,6 @@ def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransfo
         return Sphere(*numbers), T
     x, y, z = numbers
     return Box((x, y, z)), T
-
-
-def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
-    """Return the triangles of a mesh file in the link, from the scene that yourdfpy makes of it."""
-    from yourdfpy import URDF  # half a second: only where there is a mesh
-
-    name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
-    try:
-        scene: Any = URDF.load(
-            io.BytesIO(_alone(visual)),
-            filename_handler=lambda fname: str(_found(urdf_path, fname)),
-        ).scene
-        mesh = scene.to_geometry()
-        vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"found a mesh file '{name}' that cannot be read ({reason}), needed a complete one; "
-            "export it again"
-        ) from error
-    if not len(faces) or not np.all(np.isfinite(vertices)):
-        raise ValueError(
-            f"found no triangles in the mesh file '{name}', needed some; export it again"
-        )
-    return Mesh(vertices, faces.astype(np.intp))
-
-
-def _alone(visual: etree._Element) -> bytes:
-    """Return a URDF of one link with the shape and the place of a visual, and nothing else."""
-    robot = etree.Element("robot", {"name": "visual"})
-    shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
-    origin = visual.find("origin")
-    place = {}
-    for key in ("xyz", "rpy"):
-        numbers = None if origin is None else number_list(origin.get(key, ""), 3)
-        place[key] = " ".join(repr(x) for x in numbers or (0.0, 0.0, 0.0))
-    etree.SubElement(shown, "origin", place)
-    shape = visual.find("geometry")[0]  # type: ignore[index]
-    geometry = etree.SubElement(shown, "geometry")
-    etree.SubElement(geometry, str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
-    return etree.tostring(robot)
-
-
-def _found(urdf_path: Path, name: str) -> Path | None:
-    """Return the file that a URDF names: as it stands, or from a folder above the URDF."""
-    if not name.strip() or "\0" in name:
-        return None
-    plain = Path(name.split("://", 1)[-1])
-    tails = [plain, Path(*plain.parts[1:])] if "://" in name and len(plain.parts) > 1 else [plain]
-    for folder in urdf_path.absolute().parents:
-        for tail in tails:
-            if (folder / tail).is_file():
-                return folder / tail
-    return None
 
 
 def _rgb(material: etree._Element) -> tuple[float, float, float] | None:

@@ -1,0 +1,71 @@
+"""Mesh files that the visuals of a URDF name."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree
+
+from legcal.geometry.types import Array, IntArray
+from legcal.machine.urdf import number_list
+
+
+def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
+    """Return the corners (n, 3) in the link [m] and the triangles (m, 3) of a mesh file.
+
+    They are of the scene that yourdfpy makes of it. ValueError says what was found and needed where
+    the file holds none.
+    """
+    from yourdfpy import URDF  # half a second: only where there is a mesh
+
+    name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+    try:
+        scene: Any = URDF.load(
+            io.BytesIO(_alone(visual)),
+            filename_handler=lambda fname: str(mesh_file(urdf_path, fname)),
+        ).scene
+        mesh = scene.to_geometry()
+        vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
+    except (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"found a mesh file '{name}' that cannot be read ({reason}), needed a complete one; "
+            "export it again"
+        ) from error
+    if not len(faces) or not np.all(np.isfinite(vertices)):
+        raise ValueError(
+            f"found no triangles in the mesh file '{name}', needed some; export it again"
+        )
+    return vertices, faces.astype(np.intp)
+
+
+def _alone(visual: etree._Element) -> bytes:
+    """Return a URDF of one link with the shape and the place of a visual, and nothing else."""
+    robot = etree.Element("robot", {"name": "visual"})
+    shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
+    origin = visual.find("origin")
+    place = {}
+    for key in ("xyz", "rpy"):
+        numbers = None if origin is None else number_list(origin.get(key, ""), 3)
+        place[key] = " ".join(repr(x) for x in numbers or (0.0, 0.0, 0.0))
+    etree.SubElement(shown, "origin", place)
+    shape = visual.find("geometry")[0]  # type: ignore[index]
+    geometry = etree.SubElement(shown, "geometry")
+    etree.SubElement(geometry, str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
+    return etree.tostring(robot)
+
+
+def mesh_file(urdf_path: Path, name: str) -> Path | None:
+    """Return the file that a URDF names: as it stands, or from a folder above the URDF."""
+    if not name.strip() or "\0" in name:
+        return None
+    plain = Path(name.split("://", 1)[-1])
+    tails = [plain, Path(*plain.parts[1:])] if "://" in name and len(plain.parts) > 1 else [plain]
+    for folder in urdf_path.absolute().parents:
+        for tail in tails:
+            if (folder / tail).is_file():
+                return folder / tail
+    return None
