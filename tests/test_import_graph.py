@@ -76,6 +76,7 @@ PUBLIC: dict[str, set[str]] = {
         "image_facts",
         "image_file",
         "photograph_comparison",
+        "point_pose",
         "visibility",
     },
     "data": {
@@ -87,6 +88,7 @@ PUBLIC: dict[str, set[str]] = {
         "holdout",
         "image_causes",
         "image_tables",
+        "landmarks",
         "measurements",
         "new_dataset",
         "outlines",

@@ -260,7 +260,13 @@ def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
     """Return what is to be said of the cameras and the images."""
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
-    notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
+    notes = hint_notes(
+        [view.name for view in views],
+        hints,
+        placement.T_base_camera,
+        BEFORE_FIT,
+        by_landmarks=data.measurements.clicked_views,
+    )
     return [*notes, *placement.notes, *image_notes(data.measurements, placement.barely)]
 
 

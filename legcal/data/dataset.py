@@ -22,6 +22,12 @@ from legcal.data.dataset_file import (
     read_dataset_file,
     view_problems,
 )
+from legcal.data.landmarks import (
+    LANDMARKS_NAME,
+    Landmarks,
+    place_by_landmarks,
+    read_landmarks,
+)
 from legcal.data.measurements import Measurements, View, few, few_views, read_measurements
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
@@ -73,6 +79,7 @@ class Dataset:
     overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
+    landmarks: Landmarks | None = None  # the rows of ``landmarks.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
     file_notes: tuple[str, ...] = ()  # those of the notes that come from these
@@ -276,6 +283,12 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     if problems:
         raise DatasetError(problems)
     _refuse_two_tables(folder)
+    landmarks = None
+    of_clicks: list[str] = []
+    if os.path.exists(folder / LANDMARKS_NAME):
+        path = folder / LANDMARKS_NAME
+        landmarks = read_landmarks(path, machine.leg_names, measurements)
+        measurements, of_clicks = place_by_landmarks(path, machine, measurements, landmarks)
     axes, left_out = read_given_axes(folder / AXES_NAME, machine.leg_names, measurements)
     dataset = Dataset(
         folder=folder,
@@ -285,11 +298,12 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         machine=machine,
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
-        notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
+        notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
+        landmarks=landmarks,
     )
     if problems := _invisible(dataset):
         raise DatasetError(problems)

@@ -58,6 +58,7 @@ class View:
     T_base_camera: RigidTransform | None = None  # rough: good to 2 cm and 2 degrees
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
     hand_held: bool = False  # one image of a camera in the hand, which only the board can place
+    by_landmarks: bool = False  # whether the rough pose is that of clicks on joints
 
     def uses(self, leg: str) -> bool:
         """Say whether a leg, by its name, is to be used in this view."""
@@ -102,6 +103,11 @@ class Measurements:
     def n_poses(self) -> int:
         """Number of different platform poses."""
         return int(self.pose.max()) + 1 if len(self.pose) else 0
+
+    @property
+    def clicked_views(self) -> tuple[str, ...]:
+        """The views whose rough poses are those of clicks on joints."""
+        return tuple(view.name for view in self.views if view.by_landmarks)
 
     def sigma_of(self, legs: Sequence[Leg]) -> Array:
         """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""

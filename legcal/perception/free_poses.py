@@ -21,6 +21,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import (
@@ -258,7 +259,8 @@ def require_rough_cameras(
         raise NotIdentifiable(
             f"{few_views(missing)}: the images could not be searched: found no rough camera pose, "
             "needed one (2 cm, 2 deg), since the motors do not determine the pose of the platform; "
-            "write T_base_camera into dataset.yaml."
+            f"click its joints at the base ({LANDMARKS_NAME}), or write T_base_camera into "
+            "dataset.yaml."
         )
 
 

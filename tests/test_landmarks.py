@@ -1,0 +1,107 @@
+"""Clicks on joints place cameras: of every kind of machine, before recognition begins."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clicked_joints import camera_beside, seen_from, write_clicks
+from dataset_folder import dataset_of_readings
+from refusal_table import GONE, keyed
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data.dataset import load_dataset
+from legcal.errors import DatasetError
+from legcal.geometry.motions import pose_distance
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import readings_at
+
+KINDS = ["hexapod", "3-rpr", "delta", "linear-delta", "servo-hexapod", "orthoglide"]
+ROOT = Path(__file__).parents[1]
+
+
+def without_motors(text: str) -> str:
+    """Return the text of the model of a hexapod that is moved by hand."""
+    motors = "".join(f"- leg{j}_prismatic\n" for j in range(1, 7))
+    assert f"name_mot:\n{motors}" in text
+    text = text.replace(f"name_mot:\n{motors}", "name_mot: []\n")
+    return text.replace("../urdf/", f"{ROOT}/urdf/")
+
+
+def dataset(folder: Path, model: str, n_rows: int = 2, **view: object) -> Path:
+    """Write a dataset of one view of a machine, at home and near it."""
+    machine = load_mechanism(model)
+    home = readings_at(machine, machine.home)[list(machine.motors)]
+    travel = np.array([machine.legs[j].travel for j in machine.motors])
+    width = np.where(np.isfinite(np.ptp(travel, axis=1)), np.ptp(travel, axis=1), 0.1)
+    away = np.random.default_rng(3).uniform(-0.05, 0.05, (n_rows, len(home)))
+    q = home + width * away
+    camera = str(ROOT / "examples/hexapod/camera_info.yaml")
+    sigma = {name: "0.1deg" if machine.legs[j].reads_angle else 1e-5
+             for name, j in zip(machine.motor_names, machine.motors, strict=True)}  # fmt: skip
+    entry = {"views": {"c1": {"camera": camera, **view}}, "encoder_sigma": sigma}
+    return dataset_of_readings(folder, q, entry, model, machine.motor_names)
+
+
+def off(folder: Path, true: RigidTransform) -> tuple[float, float]:
+    """Return how far the rough pose of the first view is from the truth [m], [rad]."""
+    placed = load_dataset(folder, check_images=False).measurements.views[0].T_base_camera
+    assert placed is not None
+    return pose_distance(placed, true)
+
+
+@pytest.mark.parametrize("model", KINDS)
+def test_clicks_place_the_camera_of_any_machine(model: str, tmp_path: Path) -> None:
+    folder = dataset(tmp_path, model)
+    true = camera_beside(folder, 0.7)
+    write_clicks(folder, {1: seen_from(folder, 1, true)})
+    far, turned = off(folder, true)
+    assert far < 1e-5
+    assert turned < 1e-5
+
+
+def test_noise_of_clicks_leaves_a_rough_pose_that_wins(tmp_path: Path) -> None:
+    rough = {"xyz": [0.0, 3.0, 0.3], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    folder = dataset(tmp_path, "hexapod", T_base_camera=rough)
+    for seed in range(4):
+        true = camera_beside(folder, 1.5 * seed)
+        rng = np.random.default_rng(seed)
+        clicks = {
+            row: {joint: px + 3.0 * rng.normal(size=2) for joint, px in seen.items()}
+            for row in range(2)
+            if (seen := seen_from(folder, row, true))
+        }
+        write_clicks(folder, clicks)
+        far, turned = off(folder, true)
+        assert 0.0 < far < 0.03
+        assert turned < np.deg2rad(2.0)
+        (folder / "landmarks.csv").unlink()
+
+
+def test_a_click_on_another_joint_is_named_with_its_distance(tmp_path: Path) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    true = camera_beside(folder, 0.7)
+    seen = seen_from(folder, 0, true)
+    shown, clicked = "leg5.base", "leg1.base"
+    clicks = {joint: px for joint, px in seen.items() if joint != shown}
+    clicks[clicked] = seen[shown]
+    write_clicks(folder, {0: clicks})
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(folder, check_images=False)
+    (what,) = refused.value.problems
+    apart = np.linalg.norm(seen[shown] - seen[clicked])
+    assert f"the click on {clicked} in 0.png (view c1) is {apart:.0f} px" in what
+    assert f"perhaps it shows {shown}" in what
+
+
+def test_base_joints_place_the_camera_where_readings_give_no_pose(tmp_path: Path) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    true = camera_beside(folder, 0.7)
+    seen = seen_from(folder, 0, true)
+    model = folder / "by_hand.yaml"
+    model.write_text(without_motors((ROOT / "models/hexapod.yaml").read_text()))
+    (folder / "measurements.csv").write_text("view,image\nc1,0.png\n")
+    keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
+    write_clicks(folder, {0: {j: px for j, px in seen.items() if j.endswith(".base")}})
+    far, turned = off(folder, true)
+    assert far < 1e-5
+    assert turned < 1e-5
