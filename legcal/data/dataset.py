@@ -230,7 +230,9 @@ def _encoder_sigmas(
     return min(linear, default=ENCODER_SIGMAS[0]), {name: known[name] for name in motors}
 
 
-def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
+def load_dataset(
+    folder: str | Path, *, check_images: bool = True, check_clicks: bool = True
+) -> Dataset:
     """Read a dataset and check everything in it that can be checked without decoding images.
 
     Parameters
@@ -240,6 +242,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     check_images : bool
         Also check that every image that must be read exists, is complete and has the size of
         its camera file.
+    check_clicks : bool
+        Refuse clicks in ``landmarks.csv`` that do not place the camera of their view. Without, such
+        a view starts as if it had none, and a note says why.
 
     Returns
     -------
@@ -288,7 +293,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     if os.path.exists(folder / LANDMARKS_NAME):
         path = folder / LANDMARKS_NAME
         landmarks = read_landmarks(path, machine.leg_names, measurements)
-        measurements, of_clicks = place_by_landmarks(path, machine, measurements, landmarks)
+        measurements, of_clicks = place_by_landmarks(
+            path, machine, measurements, landmarks, may_be_wrong=not check_clicks
+        )
     axes, left_out = read_given_axes(folder / AXES_NAME, machine.leg_names, measurements)
     dataset = Dataset(
         folder=folder,

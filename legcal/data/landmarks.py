@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
@@ -67,6 +68,11 @@ class Landmarks(ImageTable):
         return list(zip(self.row.tolist(), self.leg.tolist(), self.end.tolist(), strict=True))
 
 
+def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return leg and end of each joint, by the name that the table has for it."""
+    return {joint_name(leg, end): (j, end) for end in (0, 1) for j, leg in enumerate(leg_names)}
+
+
 def joint_name(leg: str, end: int) -> str:
     """Return what the table calls a joint."""
     return f"{leg}.{ENDS[end]}"
@@ -111,7 +117,7 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
     )
     row = find_rows(table, measurements)
     refuse_unknown_rows(table, row, measurements)
-    joints = {joint_name(leg, end): (j, end) for j, leg in enumerate(leg_names) for end in (0, 1)}
+    joints = joint_names(leg_names)
     chosen = table.text("joint")
     for i, name in enumerate(chosen):
         if name not in joints:
@@ -138,11 +144,17 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
 
 
 def place_by_landmarks(
-    path: Path, machine: Machine, measurements: Measurements, landmarks: Landmarks
+    path: Path,
+    machine: Machine,
+    measurements: Measurements,
+    landmarks: Landmarks,
+    *,
+    may_be_wrong: bool = False,
 ) -> tuple[Measurements, list[str]]:
     """Return measurements whose views with clicks start from these, and notes on such views.
 
-    The clicks of a view win over its ``T_base_camera``.
+    The clicks of a view win over its ``T_base_camera``. Where they *may_be_wrong*, what is wrong is
+    a note, and the view is left as it is.
 
     Raises
     ------
@@ -150,21 +162,40 @@ def place_by_landmarks(
         If a view has too few clicks to place its camera, or clicks contradict the others of their
         view: with one sentence for each view or click.
     """
-    joints, has_place = joints_at_readings(machine, measurements, landmarks.row)
     views, problems, notes = list(measurements.views), list[str](), list[str]()
-    view_of = measurements.view[landmarks.row]
-    for v in np.unique(view_of).tolist():
-        own = np.flatnonzero(view_of == v)
-        clicks = Clicks(path, machine, measurements, v, landmarks.choose(own), joints, has_place)
-        pose, wrong, odd = clicks.camera()
-        problems += wrong
-        notes += odd
-        if pose is not None:
-            T = pose.T_camera_base.inv()
-            views[v] = replace(views[v], T_base_camera=T, by_landmarks=True)
-    if problems:
+    for v, found in cameras_by_landmarks(path, machine, measurements, landmarks).items():
+        problems += found.problems
+        notes += found.notes
+        if found.T_base_camera is not None and not found.problems:
+            views[v] = replace(views[v], T_base_camera=found.T_base_camera, by_landmarks=True)
+    if problems and not may_be_wrong:
         raise DatasetError(problems)
-    return replace(measurements, views=tuple(views)), notes
+    return replace(measurements, views=tuple(views)), [*problems, *notes]
+
+
+@dataclass(frozen=True, eq=False)
+class ClickedCamera:
+    """The camera of a view by its clicks."""
+
+    # By all clicks, or, where some are wrong, by the others; None where they do not place it
+    T_base_camera: RigidTransform | None
+    problems: list[str]  # what is wrong with them
+    notes: list[str]  # what they leave open
+
+
+def cameras_by_landmarks(
+    path: Path, machine: Machine, measurements: Measurements, landmarks: Landmarks
+) -> dict[int, ClickedCamera]:
+    """Return the cameras of the views that have clicks, by their index."""
+    joints, has_place = joints_at_readings(machine, measurements, landmarks.row)
+    view_of, found = measurements.view[landmarks.row], dict[int, ClickedCamera]()
+    for v in np.unique(view_of).tolist():
+        own = landmarks.choose(view_of == v)
+        clicks = _Clicks(path, machine, measurements, v, own, joints, has_place)
+        pose, problems, notes = clicks.camera()
+        T = None if pose is None else pose.T_camera_base.inv()
+        found[v] = ClickedCamera(T, problems, notes)
+    return found
 
 
 def joints_at_readings(
@@ -195,7 +226,7 @@ def joints_at_readings(
 
 
 @dataclass(frozen=True, eq=False)
-class Clicks:
+class _Clicks:
     """The clicks of one view, and where the nominal model has their joints."""
 
     path: Path
@@ -226,8 +257,10 @@ class Clicks:
             return None, [self._too_few(n, left_out)], []
         best = poses[0]
         wrong = np.flatnonzero(best.off_px > TRUNCATION * sigma)
+        if 2 * len(wrong) > n or n - len(wrong) < MIN_POINTS:
+            return None, [some.disagreement(best)], []
         if len(wrong):
-            return None, some.contradictions(best, wrong, sigma), []
+            return best, some.contradictions(best, wrong, sigma), []
         return best, [], some.doubts(poses)
 
     @property
@@ -261,17 +294,19 @@ class Clicks:
             "joints in its pictures, or remove those of this view."
         )
 
+    def disagreement(self, pose: PointPose) -> str:
+        """Say that clicks contradict each other, and not which of them are wrong."""
+        return (
+            f"{self.path}: view {self.name}: its camera could not be placed: found "
+            f"{len(self.landmarks)} clicks that no camera shows where they are (up to "
+            f"{pose.off_px.max():.0f} px off), needed clicks on the joints that they name; check "
+            "them, the readings of their images, the camera file and the model, or click more "
+            "joints."
+        )
+
     def contradictions(self, pose: PointPose, wrong: IntArray, sigma: Array) -> list[str]:
         """Return what to say of clicks that are far from where the others have them."""
-        n, names = len(self.landmarks), row_names(self.measurements)
-        if 2 * len(wrong) > n or n - len(wrong) < MIN_POINTS:
-            return [
-                f"{self.path}: view {self.name}: its camera could not be placed: found {n} clicks "
-                f"that no camera shows where they are (up to {pose.off_px.max():.0f} px off), "
-                "needed clicks on the joints that they name; check them, the readings of their "
-                "images, the camera file and the model, or click more joints."
-            ]
-        said = []
+        names, said = row_names(self.measurements), list[str]()
         for i in wrong.tolist():
             row, leg, end = self.landmarks.row_keys()[i]
             name = joint_name(self.machine.leg_names[leg], end)

@@ -23,6 +23,7 @@ MAX_SUBSETS, SEED = 120, 1965  # of four points whose poses are tried
 N_REFINED = 8
 TRUNCATION = 4.0  # standard deviations from where a point counts as wrong
 SAME_ANGLE = np.deg2rad(3.0)
+MAX_STEPS, SMALL_STEP = 60, 1e-10  # of a refinement; of rotation and distance
 LINE = 0.02  # of the length of points, below which their width makes a line of them
 
 
@@ -129,32 +130,54 @@ def _cost(camera: Camera, pose: RigidTransform, points: Array, px: Array, sigma_
 def _refined(
     camera: Camera, start: RigidTransform, points: Array, px: Array, sigma_px: Array
 ) -> PointPose:
-    """Return the pose of least cost near a start."""
-    from scipy.optimize import least_squares  # most commands need none
-
-    near = 1e-3 * float(np.linalg.norm(start.translation))  # of the lens: no point is nearer
-
-    def moved(step: Array) -> RigidTransform:
-        R = Rotation.from_rotvec(step[:3]) * start.rotation
-        return RigidTransform.from_components(start.translation + step[3:], R)
-
-    def residual(step: Array) -> Array:
-        P = moved(step).apply(points)
-        P[:, 2] = np.maximum(P[:, 2], near)
-        off = (camera.project(P) - px) / sigma_px[:, None]
-        return np.asarray(np.clip(off, -1e4, 1e4).ravel())
-
-    scale = np.repeat([1.0, float(np.linalg.norm(start.translation))], 3)
-    found = least_squares(
-        residual, np.zeros(6), x_scale=scale, loss="cauchy", f_scale=0.5 * TRUNCATION
-    )
-    pose = moved(found.x)
-    off = np.linalg.norm(residual(found.x).reshape(-1, 2), axis=1)
+    """Return the pose of least robust cost near a start, by Levenberg-Marquardt steps."""
+    R, t = start.rotation.as_matrix(), start.translation
+    scale = np.repeat([1.0, float(np.linalg.norm(t))], 3)
+    value, JtJ, gradient = _normal_equations(camera, R, t, points, px, sigma_px)
+    damping = 1e-3
+    for _ in range(MAX_STEPS):
+        A = JtJ * np.outer(scale, scale)
+        step = -scale * np.linalg.solve(A + damping * np.diag(np.diag(A)) + 1e-12 * np.eye(6),
+                                        scale * gradient)  # fmt: skip
+        there = Rotation.from_rotvec(step[:3]).as_matrix() @ R, t + step[3:]
+        tried = _normal_equations(camera, *there, points, px, sigma_px)
+        if tried[0] < value:
+            (R, t), (value, JtJ, gradient) = there, tried
+            damping = max(0.2 * damping, 1e-9)
+        else:
+            damping *= 5.0
+        if np.abs(step / scale).max() < SMALL_STEP or damping > 1e9:
+            break
+    pose = RigidTransform.from_components(t, Rotation.from_matrix(R))
+    P = pose.apply(points)
+    ahead = P[:, 2] > 0.0
+    off = np.full(len(P), np.inf)
+    off[ahead] = np.linalg.norm(camera.project(P[ahead]) - px[ahead], axis=1)
     # Of a turn about the middle of the points and its shift, to those of the camera
-    C = scale[:, None] * np.linalg.pinv((found.jac * scale).T @ (found.jac * scale)) * scale
-    x, y, z = pose.translation
+    C = scale[:, None] * np.linalg.pinv(JtJ * np.outer(scale, scale), hermitian=True) * scale
+    x, y, z = t
     by = np.eye(6)
     by[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
     by[3:, 3:] *= -1.0
-    cost = _cost(camera, pose, points, px, sigma_px)
-    return PointPose(pose, cost, off * sigma_px, by @ C @ by.T)
+    return PointPose(pose, _cost(camera, pose, points, px, sigma_px), off, by @ C @ by.T)
+
+
+def _normal_equations(
+    camera: Camera, R: Array, t: Array, points: Array, px: Array, sigma_px: Array
+) -> tuple[float, Array, Array]:
+    """Return cost, matrix (6, 6) and gradient by a turn and a shift of points; Cauchy's loss."""
+    turned = points @ R.T
+    P = turned + t
+    ahead = P[:, 2] > 1e-3 * np.linalg.norm(t)
+    width = 0.5 * TRUNCATION
+    behind = float(np.count_nonzero(~ahead)) * 0.5 * width**2 * np.log1p(1e4)
+    seen, by_point = camera.project_with_derivative(P[ahead])
+    r = (seen - px[ahead]) / sigma_px[ahead, None]
+    square = np.sum(r**2, axis=1) / width**2
+    x, y, z = turned[ahead].T
+    zero = np.zeros_like(x)
+    by_turn = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), -1, 0)
+    J = np.concatenate([by_point @ by_turn, by_point], axis=2) / sigma_px[ahead, None, None]
+    weighted = J / (1.0 + square)[:, None, None]
+    cost = behind + 0.5 * width**2 * float(np.log1p(square).sum())
+    return cost, np.einsum("nki,nkj->ij", weighted, J), np.einsum("nki,nk->i", weighted, r)
