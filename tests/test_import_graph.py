@@ -73,6 +73,7 @@ PUBLIC: dict[str, set[str]] = {
         "camera_file",
         "cylinder",
         "distortion",
+        "exif_camera",
         "heic",
         "image_facts",
         "image_file",
