@@ -198,6 +198,32 @@ def cameras_by_landmarks(
     return found
 
 
+def platforms_by_landmarks(
+    machine: Machine, measurements: Measurements, landmarks: Landmarks
+) -> dict[int, tuple[RigidTransform, ...]]:
+    """Return T_base_platform of poses whose images have clicks on the platform, likeliest first.
+
+    They are before the rough cameras of their views; images with fewer than four such clicks give
+    none.
+    """
+    found = dict[int, list[tuple[float, RigidTransform]]]()
+    B, on_platform = machine.B_platform, landmarks.end == 1
+    for row in np.unique(landmarks.row).tolist():
+        view = measurements.views[int(measurements.view[row])]
+        own = landmarks.choose((landmarks.row == row) & on_platform)
+        points = B[own.leg]
+        if view.T_base_camera is None or len(own) < MIN_POINTS or on_a_line(points):
+            continue
+        of_pose = found.setdefault(int(measurements.pose[row]), [])
+        for one in camera_poses_by_points(view.camera, points, own.px, own.sigma_px)[:2]:
+            of_pose.append((one.cost, view.T_base_camera * one.T_camera_base))
+    return {
+        pose: tuple(T for _, T in sorted(every, key=lambda one: one[0]))
+        for pose, every in found.items()
+        if every
+    }
+
+
 def joints_at_readings(
     machine: Machine, measurements: Measurements, rows: IntArray
 ) -> tuple[Mapping[int, Array], Mapping[int, BoolArray]]:
