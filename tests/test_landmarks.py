@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from dataset_folder import dataset_of_readings
-from refusal_table import GONE, keyed
+from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
@@ -93,15 +93,40 @@ def test_a_click_on_another_joint_is_named_with_its_distance(tmp_path: Path) -> 
     assert f"perhaps it shows {shown}" in what
 
 
-def test_base_joints_place_the_camera_where_readings_give_no_pose(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unknown", ["no motors", "all empty", "three empty"])
+def test_base_joints_place_the_camera_where_readings_give_no_pose(
+    unknown: str, tmp_path: Path
+) -> None:
     folder = dataset(tmp_path, "hexapod")
     true = camera_beside(folder, 0.7)
     seen = seen_from(folder, 0, true)
-    model = folder / "by_hand.yaml"
-    model.write_text(without_motors((ROOT / "models/hexapod.yaml").read_text()))
-    (folder / "measurements.csv").write_text("view,image\nc1,0.png\n")
-    keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
+    table, joints = folder / "measurements.csv", [f"leg{j}_prismatic" for j in range(1, 7)]
+    if unknown == "no motors":
+        model = folder / "by_hand.yaml"
+        model.write_text(without_motors((ROOT / "models/hexapod.yaml").read_text()))
+        table.write_text("view,image\nc1,0.png\n")
+        keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
+    else:
+        empty = joints if unknown == "all empty" else joints[3:]
+        cell("measurements.csv", None, **dict.fromkeys(empty, ""))(folder)
     write_clicks(folder, {0: {j: px for j, px in seen.items() if j.endswith(".base")}})
     far, turned = off(folder, true)
     assert far < 1e-5
     assert turned < 1e-5
+    loaded = load_dataset(folder, check_images=False)
+    assert not loaded.machine.is_determined
+    assert any("leg4_prismatic" in note for note in loaded.notes) == (unknown != "no motors")
+
+
+def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints(
+    tmp_path: Path,
+) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    cell("measurements.csv", 2, leg1_prismatic="")(folder)
+    with pytest.raises(DatasetError, match=r"row 2 .*column leg1_prismatic.*an empty cell"):
+        load_dataset(folder, check_images=False)
+    folder = dataset(tmp_path, "linear-delta")
+    motor = load_mechanism("linear-delta").motor_names[0]
+    cell("measurements.csv", None, **{motor: ""})(folder)
+    with pytest.raises(DatasetError, match=rf"column {motor}.*moves joints at the base"):
+        load_dataset(folder, check_images=False)

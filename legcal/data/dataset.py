@@ -28,7 +28,14 @@ from legcal.data.landmarks import (
     place_by_landmarks,
     read_landmarks,
 )
-from legcal.data.measurements import Measurements, View, few, few_views, read_measurements
+from legcal.data.measurements import (
+    Measurements,
+    View,
+    few,
+    few_views,
+    read_measurements,
+    unread_motors,
+)
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
@@ -270,7 +277,8 @@ def load_dataset(
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
-    machine = load_mechanism(_mechanism_path(folder, entry.mechanism))
+    mechanism = _mechanism_path(folder, entry.mechanism)
+    machine = load_mechanism(mechanism)
     problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
     if problems:
         raise DatasetError(problems)
@@ -281,9 +289,16 @@ def load_dataset(
     table_path = folder / entry.measurements
     units = reading_units(yaml_path, machine.legs, entry.readings)
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
+    unread = unread_motors(table_path, machine.legs)
+    if unread:
+        _check_unread(table_path, machine, unread)
+        machine = load_mechanism(mechanism, without=unread)
+        by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
     rows, notes = read_measurements(
-        table_path, folder, views, machine.legs, sigma_q, by_joint, units
+        table_path, folder, views, machine.legs, sigma_q, by_joint, units, unread
     )
+    if unread:
+        notes = (*notes, _without_readings(table_path, machine, unread))
     measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
     if problems:
         raise DatasetError(problems)
@@ -320,6 +335,29 @@ def load_dataset(
     if unusable:
         raise DatasetError(_without_photographs(dataset) or [what for _, what in unusable])
     return dataset
+
+
+def _check_unread(path: Path, machine: Machine, unread: Sequence[str]) -> None:
+    """Refuse that motors which move joints at A are not read: nothing says where legs begin."""
+    moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
+    if moving:
+        columns = f"column{'s' * (len(moving) > 1)} {few(moving)}"
+        raise DatasetError(
+            f"{path}, {columns}: the readings could not be left open: found empty cells in all "
+            "rows of what moves joints at the base, needed its readings, since the images alone do "
+            "not say where the rods begin; record them."
+        )
+
+
+def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> str:
+    """Return a note on motors without readings."""
+    said = f"{path}: the readings of {few(unread)} are not known (empty cells): "
+    if machine.is_determined:
+        return said + "the others give the pose of the platform, and these legs are passive."
+    return (
+        f"{said}the pose of the platform is found in each image, and the offsets of these legs "
+        "stay as the model has them."
+    )
 
 
 def _without_photographs(dataset: Dataset) -> str:
