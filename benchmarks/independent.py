@@ -150,6 +150,8 @@ def click_joints(folder: Path, truth: Path) -> None:
     for view, camera in zip(of_clicks, true["cameras"], strict=True):
         T = np.array(camera["T_cam_base"])
         T[:3, 3] *= 1e-3
+        if view.T_base_camera is None:
+            continue
         placed = dataset.machine.T_base_Rb.inv() * view.T_base_camera
         far, turned = pose_distance(placed, RigidTransform.from_matrix(T).inv())
         print(f"    {view.name}: clicks {1e3 * far:.1f} mm, {np.degrees(turned):.2f} deg off")

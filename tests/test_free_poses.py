@@ -221,13 +221,15 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_
     )
     clicked: dict[int, tuple[RigidTransform, ...]] = {}
     if by_clicks:  # on all joints of each picture; cameras follow from those of the base
-        row, end, leg = (x.ravel() for x in np.meshgrid(range(4), (0, 1), every, indexing="ij"))
-        X = np.where(end[:, None] == 0, A[row, leg], B[row, leg])
-        px = [CAMERA.project(true[view[r]].inv().apply(x)) for r, x in zip(row, X, strict=True)]
-        px += 3.0 * rng.normal(size=(len(X), 2))
-        landmarks = Landmarks(row, leg, end, px, np.full(len(X), 3.0))
-        place = Path("landmarks.csv")
-        measurements, _ = place_by_landmarks(place, machine, measurements, landmarks)
+        place = np.meshgrid(range(4), (0, 1), every, indexing="ij")
+        image, end, leg = (x.ravel() for x in place)
+        X = np.where(end[:, None] == 0, A[image, leg], B[image, leg])
+        shown = [
+            CAMERA.project(true[view[r]].inv().apply(x)) for r, x in zip(image, X, strict=True)
+        ]
+        px = np.array(shown) + 3.0 * rng.normal(size=(len(X), 2))
+        landmarks = Landmarks(image, leg, end, px, np.full(len(X), 3.0))
+        measurements, _ = place_by_landmarks(Path("a.csv"), machine, measurements, landmarks)
         rough = [one.T_base_camera for one in measurements.views if one.T_base_camera is not None]
         assert max(pose_distance(*both)[0] for both in zip(rough, true, strict=True)) < 0.04
         clicked = platforms_by_landmarks(machine, measurements, landmarks)

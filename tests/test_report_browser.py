@@ -548,15 +548,15 @@ class Placer:
         from selenium.webdriver.common.action_chains import ActionChains
 
         actions = ActionChains(self.browser)
-        actions.w3c_actions.pointer_action.move_to_location(*self.on_screen(px))
-        actions.w3c_actions.pointer_action.click()
+        pointer: Any = actions.w3c_actions.pointer_action
+        pointer.move_to_location(*self.on_screen(px)).click()
         actions.perform()
 
     def drag(self, start: Any, end: Any) -> None:
         from selenium.webdriver.common.action_chains import ActionChains
 
         actions = ActionChains(self.browser)
-        pointer = actions.w3c_actions.pointer_action
+        pointer: Any = actions.w3c_actions.pointer_action
         pointer.move_to_location(*self.on_screen(start)).pointer_down()
         pointer.move_to_location(*self.on_screen(end)).pointer_up()
         actions.perform()

@@ -270,12 +270,12 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
     if dataset.landmarks is not None:
         place = {joint: i for i, joint in enumerate(joints.values())}
         given = dataset.landmarks
-        for (row, *joint), (u, v), sigma in zip(
+        for (row, leg, end), (u, v), sigma in zip(
             given.row_keys(), given.px.tolist(), given.sigma_px.tolist(), strict=True
         ):
             if row in number_of:
                 stated = "" if sigma == SIGMA_PX else f"{sigma:g}"
-                clicks.append((number_of[row], place[tuple(joint)], u, v, stated))
+                clicks.append((number_of[row], place[leg, end], u, v, stated))
     unplaced = [k for row, k in number_of.items() if detection.view_of(row) in detection.unplaced]
     return LandmarkEditor(
         file=LANDMARKS_NAME,
