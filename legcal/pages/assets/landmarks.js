@@ -9,7 +9,7 @@
   const { images, joints, file, clicks: given, token } = JSON.parse(document.getElementById("placer-data").textContent);
   const SIGMAS = [0.01, 200], MOVED = 4, DELAY = 150; // px; of the screen; ms
   const clicks = new Map(), past = []; // by image and joint: u, v and sigma, "" for the usual one
-  let at = 0, chosen = 0, drag = null, saved = true, drawn = null, asked = 0;
+  let at = 0, chosen = 0, drag = null, saved = true, drawn = null, asked = 0, silent = 0; // silent: up to which answers say nothing
   const key = (image, joint) => `${image} ${joint}`;
   for (const [image, joint, u, v, sigma] of given) clicks.set(key(image, joint), { u, v, sigma });
   const say = (text) => { said.textContent = text; };
@@ -85,7 +85,7 @@
       if (mine !== asked) return;
       drawn = answer;
       const { problems, notes } = answer;
-      say(problems[0] ?? notes[0] ?? "The legs are drawn at the camera of these clicks.");
+      if (mine > silent) say(problems[0] ?? notes[0] ?? "The legs are drawn at the camera of these clicks.");
       said.classList.toggle("warning", problems.length > 0);
       dialog.dataset.drawn = String(mine);
       draw();
@@ -95,6 +95,7 @@
     let answer;
     try { answer = await post("save"); } catch { say("The clicks could not be saved: legcal detect --edit has ended; download them."); return; }
     say(answer.problems[0] ?? `${answer.saved} was saved: legcal calibrate begins there.`);
+    silent = asked;
     if (answer.problems.length) return;
     saved = true;
     summarise("were saved");
