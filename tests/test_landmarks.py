@@ -91,6 +91,11 @@ def test_a_click_on_another_joint_is_named_with_its_distance(tmp_path: Path) -> 
     apart = np.linalg.norm(seen[shown] - seen[clicked])
     assert f"the click on {clicked} in 0.png (view c1) is {apart:.0f} px" in what
     assert f"perhaps it shows {shown}" in what
+    opened = load_dataset(folder, check_images=False, check_clicks=False)  # as to correct them
+    assert what in opened.notes
+    assert opened.measurements.views[0].T_base_camera is None
+    assert opened.landmarks is not None
+    assert len(opened.landmarks) == len(clicks)
 
 
 @pytest.mark.parametrize("unknown", ["no motors", "all empty", "three empty"])
