@@ -1,19 +1,25 @@
 """Clicks on joints place cameras: of every kind of machine, before recognition begins."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from dataset_folder import dataset_of_readings
+from hexapod_example import Run
 from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.result import Verdict
+from legcal.calibration.verdict import judge
 from legcal.data.dataset import load_dataset
+from legcal.data.landmarks import Landmarks
 from legcal.errors import DatasetError
-from legcal.geometry.motions import pose_distance
+from legcal.geometry.motions import components, pose_distance
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import readings_at
+from legcal.machine.rods import ends_at_poses
 
 KINDS = ["hexapod", "3-rpr", "delta", "linear-delta", "servo-hexapod", "orthoglide"]
 ROOT = Path(__file__).parents[1]
@@ -135,3 +141,31 @@ def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints
     cell("measurements.csv", None, **{motor: ""})(folder)
     with pytest.raises(DatasetError, match=rf"column {motor}.*moves joints at the base"):
         load_dataset(folder, check_images=False)
+
+
+def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run) -> None:
+    calibration = example_run.calibration
+    dataset, solution = calibration.dataset, calibration.solution
+    m = dataset.measurements
+    rows = np.array([int(np.flatnonzero(m.view == v)[0]) for v in range(2)])
+    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(6), (0, 1), indexing="ij"))
+    A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    joints = np.stack([A, B], axis=2)[m.pose[row], leg, end]
+    seen = [
+        solution.cameras[v].project(solution.T_camera_Rb[v].apply(P))
+        for v, P in zip(m.view[row], joints, strict=True)
+    ]
+    noise = np.random.default_rng(1).normal(size=(len(row), 2))
+    clicks = Landmarks(row, leg, end, np.array(seen) + 3.0 * noise, np.full(len(row), 3.0))
+
+    def judged(clicks: Landmarks) -> Verdict:
+        with_clicks = replace(dataset, landmarks=clicks)
+        return judge(with_clicks, solution, calibration.steps, ()).verdict
+
+    assert judged(clicks) == calibration.verdict
+    assert calibration.verdict.trustworthy
+    away = np.where((row == rows[1])[:, None], clicks.px + np.array([30.0, 0.0]), clicks.px)
+    verdict = judged(replace(clicks, px=away))
+    assert not verdict.trustworthy
+    name = m.views[1].name
+    assert f"clicks on joints in view {name} (" in verdict.sentence
