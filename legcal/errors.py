@@ -1,12 +1,18 @@
 """What legcal refuses, and why.
 
 Every message is one sentence a problem: what could not be done, what was found, what is
-needed, what to do. Errors that describe a file carry all of its problems at once.
+needed, what to do. Errors that describe a file carry all of its problems at once, as facts
+(:class:`Problem`): whoever adds where something is, or looks for its cause, reads no sentence.
 """
+
+from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
 MAX_SENTENCE = 4000  # characters of one problem
@@ -20,15 +26,90 @@ _SPELT_OUT = 5
 _PARTICULAR = re.compile(r"'[^']*'|[^\s\d]*+\d\S*")  # what differs between problems of one kind
 
 
+class Place(NamedTuple):
+    """Where something is named."""
+
+    file: str = ""
+    row: int | None = None  # of a table, from 1 below its header
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong, and where. Its text is the sentence that a message has.
+
+    Where found, needed and remedy are empty, ``what`` is all that is said, as it stands: a sentence
+    that ends with a command has no full stop.
+    """
+
+    what: str  # what could not be done: "the number could not be used"
+    found: str = ""
+    needed: str = ""
+    remedy: str = ""
+    file: str = ""
+    row: int | None = None  # of a table, from 1 below its header
+    line: int | None = None  # of the file, from 1
+    columns: tuple[str, ...] = ()  # of the table, or the place in the line
+    name: str = ""  # of the entry, element or image that it is about; ``what`` says it as well
+
+    def __str__(self) -> str:
+        where = self.file
+        if self.row is not None:
+            where += f", row {self.row}" + f" (line {self.line})" * (self.line is not None)
+        elif self.line is not None:
+            where += f", line {self.line}"
+        if self.columns:
+            where += f", column{'s' * (len(self.columns) > 1)} {', '.join(self.columns)}"
+        said = f"{where}: {self.what}" if where else self.what
+        if not (self.found or self.needed or self.remedy):
+            return said
+        said += f": found {self.found}" * bool(self.found)
+        said += f", needed {self.needed}" * bool(self.needed)
+        said += f"; {self.remedy}" * bool(self.remedy)
+        return said if said.endswith((".", "?")) else f"{said}."
+
+    @property
+    def is_told_apart(self) -> bool:
+        """Whether there is more than a sentence."""
+        return self != Problem(self.what)
+
+    def in_file(self, file: object) -> Problem:
+        """Return the problem with the file that it is in, where it does not say one."""
+        return self if self.file else replace(self, file=str(file))
+
+    def moved(self, old: Path, new: Path) -> Problem:
+        """Return the problem of a file that goes from one folder to another."""
+        if not Path(self.file).is_relative_to(old):
+            return self
+        return replace(self, file=str(new / Path(self.file).relative_to(old)))
+
+    def document(self) -> dict[str, Any]:
+        """Return the facts that there are, as ``--json`` has them."""
+        facts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {
+            key: printable(value) if isinstance(value, str) else value
+            for key, value in facts.items()
+            if value not in ("", None, ())
+        }
+
+
+class BadValue(ValueError):
+    """A value cannot be used: what was found and what is needed; its reader knows where."""
+
+    def __init__(self, found: str, needed: str, remedy: str) -> None:
+        super().__init__(f"found {found}, needed {needed}; {remedy}.")
+        self.found, self.needed, self.remedy = found, needed, remedy
+
+
 class LegcalError(Exception):
     """Anything that legcal refuses to do, in words meant for the person who asked.
 
     Attributes
     ----------
+    facts : tuple of Problem
+        What is wrong, in the order in which it was found.
     problems : tuple of str
-        One sentence for each problem found, in the order in which they were found. The message
-        has them all, but of more than ten of a kind only five and how many there are besides,
-        and as many as a screen or two can hold.
+        One sentence for each of them. The message has them all, but of more than ten of a kind
+        only five and how many there are besides, and as many as a screen or two can hold.
     exit_code : int
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
@@ -39,13 +120,20 @@ class LegcalError(Exception):
     exit_code = 1
     diagnosis: tuple[dict[str, object], ...] = ()
 
-    def __init__(self, problems: str | Sequence[str]) -> None:
-        found = (problems,) if isinstance(problems, str) else problems
-        self.problems = tuple(printable(problem) for problem in found)
-        super().__init__("\n".join(_shortened(self.problems)))
+    def __init__(self, problems: str | Problem | Sequence[str | Problem]) -> None:
+        said = [problems] if isinstance(problems, str | Problem) else problems
+        self.facts = tuple(Problem(one) if isinstance(one, str) else one for one in said)
+        self.problems = tuple(printable(str(problem)) for problem in self.facts)
+        super().__init__("\n".join(_shortened(self.facts, self.problems)))
 
-    def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]], dict[str, object]]:
-        return type(self), (self.problems,), {"diagnosis": self.diagnosis}
+    def __reduce__(self) -> tuple[type, tuple[tuple[Problem, ...]], dict[str, object]]:
+        return type(self), (self.facts,), {"diagnosis": self.diagnosis}
+
+    def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
+        """Return an error of the same kind whose problems are changed."""
+        error = type(self)([change(problem) for problem in self.facts])
+        error.diagnosis = self.diagnosis
+        return error
 
 
 def printable(text: str) -> str:
@@ -74,10 +162,10 @@ def _cut(text: str, most: int) -> str:
     return f"{text[: 2 * most // 3]} ... {text[-most // 4 :]}"
 
 
-def _shortened(problems: Sequence[str]) -> list[str]:
+def _shortened(facts: Sequence[Problem], problems: Sequence[str]) -> list[str]:
     """Return sentences; of more than ten of a kind five, and how many there are besides."""
-    kinds = [_PARTICULAR.sub("", problem) for problem in problems]
-    total, shown = Counter(kinds), Counter[str]()
+    kinds = [_kind(fact, problem) for fact, problem in zip(facts, problems, strict=True)]
+    total, shown = Counter(kinds), Counter[tuple[str, ...]]()
     lines = []
     for kind, problem in zip(kinds, problems, strict=True):
         shown[kind] += 1
@@ -91,6 +179,13 @@ def _shortened(problems: Sequence[str]) -> list[str]:
         if k and length > MAX_MESSAGE:
             return [*lines[:k], f"... and {len(lines) - k} more."]
     return lines
+
+
+def _kind(fact: Problem, sentence: str) -> tuple[str, ...]:
+    """Return what problems of one kind share: what is needed, or a sentence without particulars."""
+    if fact.needed:
+        return (*fact.columns, fact.needed, fact.remedy)
+    return (_PARTICULAR.sub("", sentence),)
 
 
 class UsageError(LegcalError):

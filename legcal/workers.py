@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from itertools import islice
 from multiprocessing import connection, get_context
@@ -120,7 +120,7 @@ def worker_pool(
             submit, slots = lambda *call: started().submit(*call), int(workers)
         elif isinstance(workers, str):
             client = _client(workers, failure)
-            stack.callback(client.close, timeout=2)
+            stack.callback(_close, client)
             submit, slots = stack.enter_context(_cluster(client, failure))
         elif hasattr(workers, "get_executor"):
             submit, slots = stack.enter_context(_cluster(workers, failure))
@@ -290,28 +290,50 @@ def _client(address: str, failure: str) -> Any:
         )
     for name in ("distributed", "distributed.client"):  # what they say is said here
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    answer: list[Any] = []
+    clients: list[Client] = []
+    failures: list[str] = []
+
+    class Connecting(Client):
+        """A client that can be closed before its constructor returns."""
+
+        def start(self, **settings: Any) -> None:
+            """Connect to the scheduler."""
+            clients.append(self)
+            super().start(**settings)  # type: ignore[no-untyped-call]
 
     def connect() -> None:
         try:
-            answer.append(Client(address, timeout=CONNECTING, set_as_default=False))  # type: ignore[no-untyped-call]
+            Connecting(address, timeout=CONNECTING, set_as_default=False)  # type: ignore[no-untyped-call]
         except (
             OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, WebSocketError,
+            UnboundLocalError,  # in the library, where the client is closed meanwhile
         ) as error:  # fmt: skip
-            answer.append(error)
+            failures.append(f"'{error}'")
 
     # By a thread: the library waits for ever for a port that takes connections and does not answer.
     thread = Thread(target=connect, daemon=True)
     thread.start()
     thread.join(CONNECTING + 0.5)
-    if answer and isinstance(answer[0], Client):
-        return answer[0]
-    said = "no answer" if not answer else f"'{answer[0]}'"
+    if clients and clients[0].status == "running":
+        return clients[0]
+    said = failures[0] if failures else "no answer"
+    for client in clients:
+        _close(client)
     raise OutOfResources(
         f"{failure}: found no Dask scheduler at {address} ({said}), needed one; see that it runs "
         "(dask scheduler), and that the address is its own, with the port 8786 unless it was "
         "started with another one, not that of its page (8787)."
     )
+
+
+def _close(client: Any) -> None:
+    """Close a client, whatever its scheduler does.
+
+    One that is left to be collected closes in the thread where that happens: it would block the
+    loop of another client.
+    """
+    with suppress(OSError):
+        client.close(timeout=2)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import shutil
 import signal
 import tempfile
 from collections.abc import Generator, Iterator
@@ -15,6 +14,7 @@ import process_settings  # noqa: F401
 import pytest
 import typer.main
 from hexapod_example import Run, copy_of_the_example
+from xdist.scheduler import LoadScopeScheduling
 
 from legcal import calibrate
 from legcal.machine import loader
@@ -26,9 +26,6 @@ from legcal.machine.spanning_tree import Source
 # Plugins that other packages bring into Hypothesis (trio's, with selenium) warn when they load.
 os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")
 
-LEFT = ("observations.csv", ".legcal-cache.json")  # beside a dataset, for the next run
-STAGES = "stages.txt"
-
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
@@ -39,6 +36,26 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Let one process run what shares fixtures: a file; all files about the example's result."""
+
+    def scope_of(nodeid: str) -> str:
+        file = nodeid.partition("::")[0]
+        if "test_recorded_sessions" in file:
+            return nodeid
+        return "example" if _is_about_the_example(config.rootpath / file) else file
+
+    scheduler = LoadScopeScheduling(config, log)
+    scheduler._split_scope = scope_of
+    return scheduler
+
+
+@cache
+def _is_about_the_example(path: Path) -> bool:
+    return "example_run" in path.read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -113,42 +130,11 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def example_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Calibrate a copy of the example once for all tests that look at the result.
-
-    Of several processes that run tests, those that come later take the outlines of the first.
-    """
+    """Calibrate a copy of the example once for all tests that look at the result."""
     folder = copy_of_the_example(tmp_path_factory.mktemp("example") / "hexapod")
     output = folder.parent / "calibrated"
-    shared = _shared(tmp_path_factory)
     stages: list[str] = []
-    earlier = shared is not None and shared.exists()
-    if shared is not None and earlier:
-        for name in LEFT:
-            shutil.copy(shared / name, folder)
     calibration = calibrate(
         folder, output=output, progress=lambda stage, done, total: stages.append(stage)
     )
-    if shared is not None and earlier:
-        stages = (shared / STAGES).read_text().splitlines()
-    elif shared is not None:
-        _leave(folder, stages, shared)
     return Run(folder, output, calibration, tuple(dict.fromkeys(stages)))
-
-
-def _shared(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
-    """Return where the processes of one run of the tests find the example; None of a single one."""
-    run = os.environ.get("PYTEST_XDIST_TESTRUNUID")
-    return None if run is None else tmp_path_factory.getbasetemp().parent / f"example-{run}"
-
-
-def _leave(folder: Path, stages: list[str], shared: Path) -> None:
-    """Leave the outlines to other processes, all at once."""
-    part = folder.parent / "shared"
-    part.mkdir()
-    for name in LEFT:
-        shutil.copy(folder / name, part)
-    (part / STAGES).write_text("\n".join(dict.fromkeys(stages)))
-    try:
-        part.rename(shared)
-    except OSError:  # another process was faster
-        shutil.rmtree(part)

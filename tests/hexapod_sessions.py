@@ -14,7 +14,7 @@ from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import KinematicParameters, point_like_legs
+from legcal.machine.leg import point_like_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import from_vector, to_vector
@@ -37,7 +37,7 @@ from legcal.simulation.settings import (
     SimulationSettings,
     Spread,
 )
-from legcal.simulation.truth import write_model_with, write_true_model
+from legcal.simulation.truth import write_true_model
 from legcal.vision.camera import Camera
 
 SIGMA_Q = 2e-6  # [m]
@@ -71,13 +71,6 @@ def disturbed_hexapod(seed: int = 0, *, coplanar: bool = False) -> Machine:
     with tempfile.TemporaryDirectory() as folder:
         rng = np.random.default_rng(seed)
         return write_true_model(load_mechanism("hexapod"), errors, rng, Path(folder))
-
-
-def with_parameters(machine: Machine, parameters: KinematicParameters) -> Machine:
-    """Return a machine of point-like joints with other parameters."""
-    with tempfile.TemporaryDirectory() as folder:
-        legs = point_like_legs(parameters)
-        return load_mechanism(write_model_with(machine, legs, machine.home, Path(folder), {}))
 
 
 def nominal_of(machine: Machine) -> NominalMachine:

@@ -277,6 +277,7 @@ def _use() -> Iterable[Refusal]:
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
+        ("two-datasets", "calibrate a b -o out", ("needed one dataset", "docs/python.md")),
     ]
     yield from _worded("use", "", rows)
     existing = [text("thesis.tex", "years of work")]
@@ -335,7 +336,15 @@ def _options() -> Iterable[Refusal]:
         ("error-size", "--error joints=2m", ("2m", "1m")),
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
+        ("error-number", "--error joints=2", ("joints", "a number and its unit")),
+        ("error-shape", "--error joints=2mm:gauss", ("joints", "'gauss'")),
         ("camera", "--camera none.yaml", ("none.yaml",)),
+        ("camera-kind", "--camera webcm", ("'webcm'", "webcam, phone")),
+        ("camera-quality", "--camera phone:best", ("--camera", "'phone:best'")),
+        ("camera-two", "--camera phone --camera webcam", ("0 files and 2 kinds",)),
+        ("camera-level", "--camera phone --level outlines", ("--camera phone", "--level outlines")),
+        ("plan-poses", "--plan session --poses 3", ("--plan and --poses",)),
+        ("plan-held", "--plan session --hand-held", ("--plan and --hand-held",)),
         ("board", "--board chess", ("chess",)),
         ("hand-held", "--hand-held", ("--board",)),
         ("level", "--level pictures", ("--level", "pictures", "outlines")),
@@ -407,7 +416,7 @@ def _datasets() -> Iterable[Refusal]:
         ("sigma-0", entry(encoder_sigma=0.0), ("encoder_sigma", "0.0")),
         ("sigma-negative", entry(encoder_sigma=-1e-6), ("encoder_sigma", "-1e-06")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
-        ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90")),
+        ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("sigma-text", entry(encoder_sigma="small"), ("encoder_sigma", "'small'")),
         ("no-views", entry(views={}), ("views",)),
         ("view-list", entry(views=["c1"]), ("views",)),
@@ -959,6 +968,8 @@ def _models() -> Iterable[Refusal]:
     rows: Rows = [
         ("frame", swap(y, "- - leg1_end", "- - leg1_ned"), ("closed_loop.0.0", "'leg1_end'")),
         ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
+        ("frame-of-another", swap(y, "  - leg5_seat", "  - leg2_seat"),
+         ("closed_loop.4", "'leg2_seat'", "closed_loop.1", "write 'leg5_seat'")),
         ("three", swap(y, "  - leg1_seat\n", "  - leg1_seat\n  - base\n"), ("closed_loop.0",)),
         ("motor", swap(y, "- leg1_prismatic\n", "- leg9_prismatic\n"), ("name_mot.0",)),
         ("motor-twice", swap(y, "- leg1_prismatic\n", "- leg2_prismatic\n"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from dataset_folder import dataset_of_readings
-from machines import ROOT, check_same, read_table, with_round_arms
+from machines import ROOT, read_table, with_round_arms
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.pipeline import calibrate
@@ -24,7 +24,7 @@ from legcal.machine.family import description_of
 from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, joint_values, readings_at
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
 from legcal.machine.parameter_id import ARMS as ARM_KINDS
@@ -182,33 +182,6 @@ def test_linear_deltas_and_orthoglides_move_by_three_spheres() -> None:
 # --- tables -------------------------------------------------------------------------------------
 
 
-def test_a_csv_gives_the_same_model_as_its_yaml(tmp_path: Path) -> None:
-    table = yaml.safe_load((TABLES / "delta.yaml").read_text())
-    header = (
-        "type,base_x,base_y,base_z,platform_x,platform_y,platform_z,length,radius,hangs_on,"
-        "point_x,point_y,point_z,axis_x,axis_y,axis_z,travel_deg_low,travel_deg_high,unit"
-    )
-    rows, told = [header], set[str]()
-    for a, b, motor in zip(
-        table["base_joints"], table["platform_joints"], table["hangs_on"], strict=True
-    ):
-        entry = table["actuators"][motor]
-        motion = [*entry["point"], *entry["axis"], *entry["travel_deg"]]
-        cells = [""] * 8 if motor in told else motion  # once is enough
-        told.add(motor)
-        rows.append(",".join(map(str, ["RSS", *a, *b, 400, 5, motor, *cells, "mm"])))
-    path = tmp_path / "delta.csv"
-    path.write_text("\n".join(rows))
-    described = description_of(path, Dimensions(height=table["home"]["xyz"][2]))
-    machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
-    check_same(machine, read_table(TABLES / "delta.yaml"))
-    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
-    other = rows[2].replace("," * 8, ",,,,1,0,0,,")
-    path.write_text("\n".join([*rows[:2], other]))
-    with pytest.raises(ModelError, match=r"line 3.*another axis.*'arm1'"):
-        read_table(path)
-
-
 def test_a_table_says_at_which_of_two_readings_a_motor_stands_at_home(tmp_path: Path) -> None:
     table = yaml.safe_load((TABLES / "linear-delta.yaml").read_text())
     for entry in table["actuators"].values():
@@ -277,13 +250,6 @@ def delta_with(folder: Path, old: str, new: str) -> Path:
     return folder / "delta.yaml"
 
 
-def test_a_home_above_the_base_closes_in_the_mode_of_its_readings(tmp_path: Path) -> None:
-    machine = load_mechanism(delta_with(tmp_path, "- -0.374", "- 0.374"))
-    at_home = joint_values(machine, machine.home_configuration)
-    np.testing.assert_allclose(at_home, readings_at(machine, machine.home), atol=1e-9)
-    np.testing.assert_allclose(at_home, np.radians(-20.0), atol=1e-9)
-
-
 def test_legs_that_nobody_can_see_are_named_before_images_are_searched(tmp_path: Path) -> None:
     seen = re.search(r'<link name="leg1_a3_link">.*', (ROOT / "urdf/delta.urdf").read_text())
     assert seen is not None
@@ -325,20 +291,6 @@ def test_what_files_of_motors_cannot_be(
     with pytest.raises(LegcalError) as caught:
         load_mechanism(delta_with(tmp_path, old, new))
     assert all(word in str(caught.value) for word in named), str(caught.value)
-
-
-@pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])
-def test_exported_robots_are_the_same_machine(to: str, suffix: str, tmp_path: Path) -> None:
-    machine = load_mechanism("delta")
-    export(Subject(machine, "delta"), to, tmp_path / f"delta.{suffix}")
-    back = load_mechanism(tmp_path / f"delta.{suffix}")
-    assert sorted(back.motor_names) == sorted(machine.motor_names)
-    q = dict(zip(machine.motor_names, np.radians([5.0, 40.0, 25.0]), strict=True))
-    poses = [
-        forward_kinematics(m, np.array([q[leg.prismatic or ""] for leg in m.legs]))
-        for m in (machine, back)
-    ]
-    np.testing.assert_allclose(poses[1].as_matrix(), poses[0].as_matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize(("to", "suffix"), [("urdf", "urdf"), ("mjcf", "xml")])

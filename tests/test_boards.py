@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,14 +21,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.board import observe_board
 from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.perception.board_corners import (
     SeenBoard,
-    board_in_words,
     describe_image,
     detect_corners,
     find_corners,
@@ -43,10 +39,10 @@ from legcal.perception.board_poses import camera_poses_by_board, plane_poses
 from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
-from legcal.vision.board import Board, FixedBoard, charuco_board
+from legcal.vision.board import Board, charuco_board
 from legcal.vision.board_file import board_document, parse_board
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey, possible_scale, reduced, rescaled
+from legcal.vision.image_file import Grey, reduced, rescaled
 from legcal.workers import in_turn
 
 PATH = Path("dataset.yaml")
@@ -159,14 +155,6 @@ def test_corners_are_where_the_camera_sees_them_and_as_good_as_they_claim(kind: 
     assert np.all(sigma < 0.06)
 
 
-def test_corners_of_a_blurred_picture_have_larger_sigmas() -> None:
-    board, T, sharp = plain_picture("chessboard")
-    number, px, sigma = find_corners(board, picture(board, T, blur=1.5))
-    error = px - seen_at(board, T)[number]
-    assert np.median(sigma) > 1.15 * np.median(find_corners(board, sharp)[2])
-    assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
-
-
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
 def test_images_of_anything_else_show_no_board(board: Board) -> None:
     rng = np.random.default_rng(1)
@@ -197,44 +185,6 @@ def test_pixels_of_a_rescaled_image_are_put_back_where_they_were(scale: float) -
     assert reduced(centroid, scale) == pytest.approx([31.3, 17.8], abs=0.03)
 
 
-def test_images_are_searched_at_no_more_pixels_than_memory_allows() -> None:
-    image = np.zeros((300, 400), dtype=np.uint8)
-    assert possible_scale(image, 2, 480_000) == 2
-    assert possible_scale(image, 2, 270_000) == 1.5
-    assert possible_scale(image, 1, 30_000) == 0.5
-
-
-def test_corners_of_a_large_picture_are_searched_in_a_smaller_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """They are measured in the large one all the same."""
-    board, _, image = plain_picture("chessboard")
-    number, px, _ = find_corners(board, image)
-    monkeypatch.setattr("legcal.perception.board_corners._SEARCHED", (image.size // 6,))
-    again, px_again, _ = find_corners(board, image)
-    assert np.array_equal(again, number)
-    assert np.abs(px_again - px).max() < 0.01
-
-
-def test_gamma_does_not_move_corners() -> None:
-    board, T, _ = plain_picture("charuco")
-    looks: dict[str, Any] = {"bits": 16, "electrons": np.inf}
-    (a, one, _), (b, other, _) = (
-        find_corners(board, picture(board, T, gamma=gamma, **looks)) for gamma in (1.0, 2.4)
-    )
-    both = np.intersect1d(a, b)
-    shift = one[np.isin(a, both)] - other[np.isin(b, both)]
-    assert len(both) > 10
-    assert np.abs(shift.mean(axis=0)).max() < 0.004
-
-
-def test_a_chessboard_turned_in_the_picture_keeps_its_numbers() -> None:
-    T = before(CHESSBOARD, 0.55) * RigidTransform.from_rotation(Rotation.from_euler("z", np.pi))
-    number, px, _ = find_corners(CHESSBOARD, picture(CHESSBOARD, T))
-    assert len(number) >= 0.8 * CHESSBOARD.n_corners
-    assert np.abs(px - seen_at(CHESSBOARD, T)[number]).max() < 0.2
-
-
 @pytest.mark.parametrize("kind", [board.kind for board in BOARDS])
 def test_cameras_that_sharpen_move_no_corner(kind: str) -> None:
     """Edges overshoot by a tenth of the contrast and more, and a JPEG is coarse."""
@@ -256,14 +206,6 @@ def test_a_hidden_corner_is_left_out_and_the_others_are_found(board: Board) -> N
     assert hidden not in number
     assert len(number) >= 0.5 * board.n_corners
     assert np.abs(px - seen_at(board, T)[number]).max() < 0.3
-
-
-def test_corners_of_a_tag_that_is_not_decoded_are_measured() -> None:
-    T, code = before(APRILGRID), APRILGRID.points[[14, 21]].mean(axis=0)  # the middle of tag 4
-    image = picture(APRILGRID, T, hidden=code + np.array([0.0, 0.0, 0.011]))
-    number, px, _ = find_corners(APRILGRID, image)
-    assert {14, 15, 20, 21} <= set(number.tolist())
-    assert np.abs(px - seen_at(APRILGRID, T)[number]).max() < 0.3
 
 
 def test_corners_are_found_from_a_few_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,64 +286,12 @@ def test_squares_or_inner_corners_are_told_by_all_images(
     assert bool(words) == bool(said)
 
 
-@pytest.mark.parametrize(
-    ("stated", "kind", "words"),
-    [
-        (replace(CHARUCO, columns=5, rows=3), "charuco", "markers with numbers up to 11"),
-        (replace(APRILGRID, columns=2), "aprilgrid", "tags with numbers up to 5"),
-        (replace(CHARUCO, dictionary="DICT_5X5_50"), "charuco", "markers of DICT_4X4"),
-        (replace(CHESSBOARD, columns=6, rows=5), "chessboard", "a chessboard of 6 x 7 squares"),
-        (APRILGRID, "chessboard", "squares without such tags"),
-    ],
-)
-def test_a_board_of_other_dimensions_is_named(stated: Board, kind: str, words: str) -> None:
-    assert words in str(describe_image(stated, plain_picture(kind)[2]))
-
-
 @pytest.mark.parametrize("kind", ["aprilgrid", "charuco"])
 def test_tags_of_a_mirrored_picture_are_named(kind: str) -> None:
     board, _, image = plain_picture(kind)
     assert not tags_are_mirrored(board, image)
     assert tags_are_mirrored(board, image[:, ::-1])
     assert "mirrored" in str(describe_image(board, image[:, ::-1]))
-
-
-def _tags_of(board: Board) -> SeenBoard:
-    """Return the tags of an AprilGrid as a camera sees them."""
-    corners = board.points.reshape(board.rows, 2, board.columns, 2, 3)
-    middles = corners.mean(axis=(1, 3)).reshape(-1, 3)
-    px = LENS.project(before(board, 1.0, np.array([0.4, -0.3, 0.2])).apply(middles))
-    nothing = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp)
-    return SeenBoard("aprilgrid", *nothing, np.arange(len(px)), px)
-
-
-@pytest.mark.parametrize(
-    ("board", "changes", "words"),
-    [
-        (replace(APRILGRID, columns=6, rows=5), {}, ""),
-        (replace(APRILGRID, columns=6, rows=5), {"columns": 5, "rows": 6}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"columns": 7, "rows": 6}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"rows": 4}, "found"),
-        (replace(APRILGRID, columns=6, rows=5), {"rows": 7}, "or that part of one is seen in 3 of"),
-        (CHARUCO, {}, ""),
-        (CHARUCO, {"columns": CHARUCO.rows, "rows": CHARUCO.columns}, "found"),
-        (CHARUCO, {"columns": CHARUCO.columns - 1}, "found"),
-    ],
-)
-def test_numbers_of_tags_say_how_many_columns_and_rows_there_are(
-    board: Board, changes: dict[str, int], words: str
-) -> None:
-    stated = replace(board, **changes)  # type: ignore[arg-type]
-    is_charuco = board.kind == "charuco"
-    seen = search_board(stated, plain_picture("charuco")[2]) if is_charuco else _tags_of(board)
-    shown, said = shown_board(stated, [seen] * 3)
-    if words == "found":
-        assert shown is None
-        assert said == f"{board_in_words(board)} in 3 of its 3 images"
-    else:
-        assert shown is stated
-        assert words in said
-        assert bool(words) == bool(said)
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -447,35 +337,6 @@ def test_images_are_searched_by_row_and_a_view_without_the_board_is_refused() ->
     require_board(other, nothing, lambda _: image, _measurements((1,)), [])
     with pytest.raises(NotVisible, match=r"c1: .* any of its 1 image: found tags with numbers up"):
         require_board(other, nothing, lambda _: image, _measurements((1,)), ["c1"])
-
-
-def test_of_photographs_by_hand_some_but_not_most_may_miss_the_board() -> None:
-    board, T, image = plain_picture("aprilgrid")
-    blank = np.full_like(image, 100.0)
-    measurements = _measurements((1, 1, 1))
-    measurements = replace(
-        measurements, views=tuple(replace(view, hand_held=True) for view in measurements.views)
-    )
-
-    def observed(images: list[Any]) -> Any:
-        machine = SimpleNamespace(size=0.4)
-        dataset = SimpleNamespace(
-            boards=(FixedBoard(board, "base"),), corners=None, yaml_path=PATH, machine=machine
-        )
-        photographs = SimpleNamespace(load=images.__getitem__)
-        data: Any = SimpleNamespace(
-            dataset=dataset, measurements=measurements, photographs=photographs,
-            pool=in_turn, progress=no_progress,
-        )  # fmt: skip
-        return observe_board(data)
-
-    first, missing, last = observed([image, blank, image]).T_board_camera
-    assert missing is None
-    for found in (first, last):
-        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=2e-3)
-    with pytest.raises(NotVisible) as refusal:
-        observed([image, blank, blank])
-    assert [problem[:8] for problem in refusal.value.problems] == ["view c2:", "view c3:"]
 
 
 # Where cameras stand before it.

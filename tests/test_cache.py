@@ -24,10 +24,7 @@ from legcal.data.cache import (
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
 from legcal.data.outlines import (
     Outlines,
-    is_edited,
     join_outlines,
-    merge_edited,
-    no_outlines,
     write_observations,
 )
 from legcal.errors import DatasetError
@@ -115,15 +112,6 @@ def test_what_is_searched_and_what_is_kept(
         assert len(plan.keep) == 0
     else:
         assert_same(plan.keep, table.choose(np.isin(table.row, kept)))
-
-
-def test_edited_rows_win_over_detected_ones() -> None:
-    detected, by_hand = outlines_of(1), _edited(outlines_of(2, rows=(1,), legs=(0, 2)))
-    merged = merge_edited(detected, by_hand)
-    assert merged.row_keys() == detected.row_keys()
-    assert_same(merged.choose(is_edited(merged)), by_hand)
-    assert_same(merge_edited(no_outlines(), by_hand), by_hand)
-    assert_same(merge_edited(detected, outlines_of(2)), detected)  # those of before do not return
 
 
 def test_stored_outlines_are_found_again(folder: Folder) -> None:
@@ -214,28 +202,6 @@ def test_settings_model_and_version_make_them_stale(
     settings = detection_settings()
     monkeypatch.setattr("legcal.perception.photographs.DETECTOR_VERSION", 0)
     assert detection_settings() != settings
-
-
-def test_rows_of_a_removed_image_do_not_matter(folder: Folder) -> None:
-    _store(folder)
-    del folder.rows[0]
-    folder.write()
-    plan = _plan(folder)
-    assert plan.detect.tolist() == [0, 1, 2]
-    assert len(plan.keep) == 0
-
-
-def test_a_table_of_edited_rows_alone_does_not_stand_for_all_that_was_found(
-    folder: Folder,
-) -> None:
-    dataset = _store(folder)
-    edited = _edited(_hexapod_outlines(rows=(1,)))
-    names = dataset.machine.leg_names
-    write_observations(folder.path / OBSERVATIONS_NAME, edited, dataset.measurements, names)
-    plan = _plan(folder)
-    assert plan.detect.tolist() == list(ALL)
-    assert plan.keep.row_keys() == edited.row_keys()
-    assert is_edited(plan.keep).all()
 
 
 def test_given_rows_are_remembered_by_their_image(folder: Folder) -> None:

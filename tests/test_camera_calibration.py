@@ -15,14 +15,12 @@ from camera_sessions import (
     PINHOLE,
     SIZE,
     drawings,
-    photographs,
     seen_corners,
     together,
 )
 from thinned import thinned
 
 from legcal import calibrate_camera
-from legcal.calibration.camera_calibration import calibration
 from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.diagnostics import (
     refuse_divided,
@@ -35,16 +33,14 @@ from legcal.calibration.camera_calibration.picture import write_picture
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages
-from legcal.perception.board_corners import SeenBoard
-from legcal.vision.board import Board
-from legcal.vision.board_file import board_of
 from legcal.vision.camera import intrinsic_values
 from legcal.vision.camera_file import read_camera
 from legcal.vision.distortion import DistortionModel
 
 MODELS: tuple[DistortionModel, ...] = ("plumb_bob", "rational_polynomial", "equidistant")
 SPEC = "chessboard:9x6:30mm"
-CHARUCO = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_4X4_50")
+
+
 N_IMAGES = 3
 
 
@@ -90,16 +86,6 @@ def test_boards_that_all_lean_alike_give_the_camera_within_its_sigma(
     assert 0.5 < sigmas(found)[0] < 30.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
-def test_sigmas_are_the_spread_of_many_calibrations(model: DistortionModel) -> None:
-    runs = [fitted(seen_corners(CAMERAS[model], 12, seed), model) for seed in range(30)]
-    rms = np.sqrt(np.mean(np.array([pulls(run, model) for run in runs]) ** 2, axis=0))
-    # coefficients of a ratio may cancel: they are held by a prior
-    assert np.all((rms[:4] > 0.65) & (rms[:4] < 1.4))
-    assert np.all(rms < 1.5)
-
-
 def test_sigmas_are_those_of_opencv_and_a_little_for_what_the_sheet_may_be() -> None:
     seen = seen_corners(CAMERAS["plumb_bob"], 12, 5)
     found = fitted(seen)
@@ -131,18 +117,6 @@ def test_a_board_that_is_bent_and_printed_too_wide_gives_the_same_camera() -> No
     assert found.adjusted.residual.std() < 1.05 * NOISE_PX
 
 
-def test_parts_of_a_bent_board_numbered_one_square_off_spoil_nothing() -> None:
-    """What a shift does to a paraboloid is a tilt."""
-    seen = seen_corners(CAMERAS["plumb_bob"], 14, 2, sheet=SHEET)
-    across = np.rint(seen.points[:, 0] / 0.03)
-    part = (seen.image < 4) & (across < 7)
-    keep = part | (seen.image >= 4)
-    points = seen.points + np.where(part, 0.03, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    found = fitted(BoardImages(seen.image[keep], points[keep], seen.px[keep], seen.sigma_px[keep]))
-    assert found.left_out == {}
-    assert np.abs(pulls(found)).max() < 3.0
-
-
 def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
     squares = []
     for seed in range(4):
@@ -151,19 +125,6 @@ def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
         squares.append(off @ np.linalg.solve(found.covariance, off) / len(off))
         assert np.median(found.seen.sigma_px) < 0.1
     assert 0.4 < np.mean(squares) < 1.8
-
-
-def test_claims_of_corners_count_relative_to_each_other() -> None:
-    """Half of the corners three times as noisy, and said so: the answer is as good as its sigma."""
-    seen = seen_corners(CAMERAS["plumb_bob"], 12, 11)
-    rng = np.random.default_rng(2)
-    worse = np.arange(len(seen.px)) % 2 == 0
-    sigma = np.where(worse, 1.0, NOISE_PX)
-    px = seen.px + np.where(worse, 1.0, 0.0)[:, None] * rng.standard_normal(seen.px.shape)
-    alone = fitted(BoardImages(seen.image[~worse], seen.points[~worse], px[~worse], sigma[~worse]))
-    both = fitted(replace(seen, px=px, sigma_px=sigma))
-    assert np.abs(pulls(both)).max() < 3.5
-    assert np.all(sigmas(both) < 4.0 * sigmas(alone))
 
 
 def test_single_corners_and_images_that_disagree_are_left_out() -> None:
@@ -246,16 +207,6 @@ def test_a_third_of_the_images_wrong_alike_is_named_and_moves_nothing(
     refuse_divided(found, [str(k) for k in range(15)])
 
 
-@pytest.mark.slow
-def test_a_richer_lens_model_does_not_take_in_images_that_are_wrong() -> None:
-    """Its residuals, with them, are so large that nothing contradicts it."""
-    good = seen_corners(TRUTH, 8, 2, sheet=SHEET)
-    chosen = chosen_lens(together(shifted(seen_corners(TRUTH, 4, 8, sheet=SHEET)), good), SIZE)
-    assert chosen is not None
-    assert chosen.fit.adjusted.camera.model == "plumb_bob"
-    assert set(chosen.fit.left_out) == set(range(4))
-
-
 def test_two_groups_of_one_size_are_refused_and_named() -> None:
     found = fitted(together(seen_corners(ZOOMED, 5, 8), seen_corners(TRUTH, 5, 2)))
     with pytest.raises(NotIdentifiable) as refused:
@@ -293,13 +244,6 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     assert given is not None
     assert "as given" in given.why
     assert "leave out --model" in " ".join(given.warnings)
-
-
-def test_noise_that_corners_do_not_claim_is_seen_and_counted() -> None:
-    seen = seen_corners(CAMERAS["plumb_bob"], 12, 9, noise=0.2)
-    found = fitted(replace(seen, sigma_px=np.full(len(seen.px), NOISE_PX)))
-    assert np.median(found.seen.sigma_px) == pytest.approx(0.2, rel=0.2)
-    assert np.abs(pulls(found)).max() < 3.0
 
 
 def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:
@@ -398,37 +342,6 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert [i["sigma"] for i in document["intrinsics"]] == found.sigma.tolist()
 
 
-def test_inner_corners_that_are_stated_for_squares_are_found_out(
-    found: CameraCalibration, folder: Path
-) -> None:
-    again = calibrate_camera(folder, "chessboard:8x5:30mm")
-    assert (again.board.columns, again.board.rows) == (9, 6)
-    assert "write --board chessboard:9x6" in again.warnings[0]
-    assert np.abs((again.values - found.values) / found.sigma).max() < 1e-4  # the same minimum
-
-
-def test_sigmas_follow_residuals_and_not_what_corners_claim(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = seen_corners(CAMERAS["plumb_bob"], N_IMAGES, 1)
-    board = board_of(SPEC)
-
-    def stated(claim: float) -> Array:
-        images = iter(range(N_IMAGES))
-
-        def corners(*_: object) -> SeenBoard:
-            own = seen.image == next(images)
-            ij = np.rint(seen.points[own, :2] / board.side).astype(np.intp)
-            black = np.where(ij.sum(axis=1) % 2 == 0, 1, -1)
-            return SeenBoard(board.kind, ij, seen.px[own], claim * seen.sigma_px[own], black)
-
-        monkeypatch.setattr(calibration, "search_board", corners)
-        paths = [folder / f"b{k:02d}.png" for k in range(N_IMAGES)]
-        return calibrate_camera(paths, SPEC, workers=1).sigma
-
-    np.testing.assert_allclose(stated(4.0), stated(1.0), rtol=0.01)
-
-
 def test_the_file_is_a_camera_info_with_the_whole_covariance(
     found: CameraCalibration, folder: Path
 ) -> None:
@@ -490,20 +403,6 @@ def test_what_is_no_covariance_is_refused_by_name(
     assert len(refused.value.problems) == 1
 
 
-@pytest.mark.usefixtures("found")
-def test_intrinsics_that_a_covariance_does_not_name_are_exact(folder: Path, tmp_path: Path) -> None:
-    document, path = yaml.safe_load((folder / "camera.yaml").read_text()), tmp_path / "camera.yaml"
-    document["legcal_camera"] = _block()
-    path.write_text(yaml.safe_dump(document))
-    covariance = read_camera(path).covariance
-    assert covariance is not None
-    assert np.argwhere(covariance).tolist() == [[0, 0], [0, 2], [2, 0], [2, 2]]
-    assert (covariance[0, 0], covariance[0, 2], covariance[2, 2]) == (4.0, -0.9, 0.25)
-    document["legcal_camera"] = _block(names=None, covariance=None, sigma={"fx": 2.0})
-    path.write_text(yaml.safe_dump(document))
-    assert read_camera(path).covariance is None  # standard deviations without correlations
-
-
 def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(
     found: CameraCalibration, folder: Path
 ) -> None:
@@ -561,26 +460,3 @@ def test_images_that_give_no_camera_are_refused_by_name(
         calibrate_camera(images(folder), board, output=tmp_path / "c.yaml")
     assert [word for word in named if word not in str(refused.value)] == []
     assert not (tmp_path / "c.yaml").exists()
-
-
-def test_boards_are_described_in_a_word_or_a_file(tmp_path: Path) -> None:
-    board = board_of("charuco:7x5:40mm:29mm:DICT_4X4_50:legacy")
-    assert (board.columns, board.rows, board.side, board.legacy) == (7, 5, 0.04, True)
-    board = board_of("aprilgrid:6x5:88mm:0.3")
-    assert (board.kind, board.columns, board.rows, board.spacing) == ("aprilgrid", 6, 5, 0.3)
-    assert board_of("chessboard:9x7").grid == (8, 6)  # looks the same after half a turn
-    path = tmp_path / "dataset.yaml"
-    path.write_text("board: {kind: chessboard, squares_x: 9, squares_y: 6, square: 0.03}\n")
-    assert board_of(path).side == 0.03
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
-def test_photographs_of_other_lenses_and_boards_give_their_cameras(
-    model: DistortionModel, tmp_path: Path
-) -> None:
-    paths = photographs(tmp_path, CAMERAS[model], 10, board=CHARUCO)
-    found = calibrate_camera(paths, CHARUCO, model=model)
-    errors = (found.values - intrinsic_values(CAMERAS[model])) / found.sigma
-    assert np.abs(errors[:2]).max() < 3.0
-    assert np.abs(errors).max() < 4.0

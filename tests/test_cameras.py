@@ -1,8 +1,7 @@
 """Cameras: distortion both ways, their files, and cylinders seen by them (eqs 1 to 5)."""
 
-import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,13 +9,11 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.lines import distance_to_line, moment
 from legcal.geometry.types import Array
 from legcal.vision.camera import (
-    DISTORTION_MODELS,
     Camera,
     intrinsic_names,
     intrinsic_unit,
@@ -54,14 +51,6 @@ def field(n: int = 7) -> Array:
     return np.stack([x, y], axis=-1)
 
 
-def test_every_distortion_model_is_in_the_table_and_the_type() -> None:
-    names = tuple(DISTORTION_MODELS)
-    assert names == get_args(DistortionModel)
-    assert {model for model, _ in LENSES} == set(names)
-    for model in DISTORTION_MODELS.values():
-        assert max(model.counts) == len(model.coefficients)
-
-
 @EACH
 def test_undistort_undoes_distort_all_over_the_image(camera: Camera) -> None:
     pixels = camera.distort(field())
@@ -81,33 +70,6 @@ def test_undistort_undoes_distort_all_over_the_image(camera: Camera) -> None:
     np.testing.assert_allclose(
         2.0 * by_point @ dP, camera.project(P + dP) - camera.project(P - dP), atol=1e-5
     )
-
-
-@FAST
-@given(
-    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1)),
-    st.tuples(st.floats(-2e-3, 2e-3), st.floats(-2e-3, 2e-3)),
-    st.tuples(st.floats(-0.35, 0.35), st.floats(-0.3, 0.3)),
-)
-def test_undistort_undoes_distort_for_any_ordinary_lens(
-    radial: tuple[float, float], tangential: tuple[float, float], point: tuple[float, float]
-) -> None:
-    camera = Camera(K, *SIZE, np.array([*radial, *tangential, 0.0]))
-    xy = np.array(point)
-    np.testing.assert_allclose(camera.undistort(camera.distort(xy)), xy, atol=1e-10)
-
-
-def test_lenses_without_coefficients_project_by_their_definition() -> None:
-    P = np.array([0.1, -0.2, 0.8])
-    np.testing.assert_allclose(PINHOLE.project(P), (K @ P / P[2])[:2], atol=1e-12)
-    np.testing.assert_allclose(
-        PINHOLE.pixels_per_unit(field()), np.broadcast_to(K[:2, :2], (7, 7, 2, 2))
-    )
-    zero = Camera(K, *SIZE, np.zeros(5))
-    assert not zero.has_distortion
-    np.testing.assert_array_equal(zero.distort(field()), PINHOLE.distort(field()))
-    pixel = CAMERAS[-1].distort(np.array([np.tan(0.35), 0.0]))  # grows with the angle
-    np.testing.assert_allclose(pixel, [K[0, 0] * 0.35 + K[0, 2], K[1, 2]], atol=1e-9)
 
 
 @EACH
@@ -294,25 +256,9 @@ def test_kalibr_files_are_read(
     assert_camera(read_camera(path), model, D, skew=0.0)
 
 
-def test_every_problem_is_listed_at_once(tmp_path: Path) -> None:
-    singular = [[0.0, 0.0, 518.3], [0.0, -3.0, 900.0], [0.0, 0.0, 1.0]]
-    with pytest.raises(DatasetError) as caught:
-        read_camera(write(tmp_path, ros(K=singular, D=PLUMB_BOB[:3])))
-    text = "\n".join(caught.value.problems)
-    assert len(caught.value.problems) == 4
-    for words in ("3 coefficients", "fx = 0, so that it is singular", "fy = -3", "cy = 900"):
-        assert words in text
-    path = write_opencv(tmp_path / "camera.yaml", PLUMB_BOB, np.zeros((3, 3)))
-    with pytest.raises(DatasetError, match="fx = 0, so that it is singular"):
-        read_camera(path)
-    with pytest.raises(DatasetError, match="found a folder"):
-        read_camera(tmp_path)
-
-
 # A cylinder in the camera frame.
 
 SEEDS = st.integers(0, 2**32 - 1)
-TRUTH = Path(__file__).parent / "data" / "hexapod-truth" / "truth.json"
 
 
 def cylinder(seed: int) -> tuple[Array, Array, float]:
@@ -356,32 +302,6 @@ def test_eq05_outlines_give_back_the_axis_at_any_scale(seed: int, scale: float) 
     u_hat, M_hat = axis_of_outlines(-h2, -h1, radius)
     np.testing.assert_allclose(u_hat, -u, atol=1e-9)
     assert distance_to_line(M_hat, u, M) < 1e-9
-
-
-def test_outlines_turn_with_the_camera_and_many_are_those_of_each() -> None:
-    cylinders = [cylinder(seed) for seed in range(6)]
-    u, M = (np.array([c[i] for c in cylinders]).reshape(2, 3, 3) for i in (0, 1))
-    radius = np.array([c[2] for c in cylinders]).reshape(2, 3)
-    h = outlines_of_axis(u, M, radius)
-    np.testing.assert_allclose(h[1, 2], outlines_of_axis(*cylinders[5]), atol=1e-15)
-    R = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
-    np.testing.assert_allclose(outlines_of_axis(u @ R.T, M @ R.T, radius), h @ R.T, atol=1e-12)
-    u_hat, M_hat = axis_of_outlines(h[..., 0, :], h[..., 1, :], radius)
-    np.testing.assert_allclose(u_hat, u, atol=1e-9)
-    np.testing.assert_allclose(np.cross(M_hat - M, u), 0.0, atol=1e-9)
-
-
-def test_eqs_hold_on_the_rendered_hexapod() -> None:
-    truth = json.loads(TRUTH.read_text())
-    legs = [leg for image in truth["images"] for leg in image["legs"]]
-    u, M, h1, h2 = (np.array([leg[name] for leg in legs]) for name in ("u", "M", "h1", "h2"))
-    radius = np.array([leg["R"] for leg in legs], dtype=np.float64)
-    np.testing.assert_allclose(outlines_of_axis(u, M, radius), np.stack([h1, h2], 1), atol=1e-9)
-    u_hat, M_hat = axis_of_outlines(h1, h2, radius)
-    np.testing.assert_allclose(u_hat, u, atol=1e-9)
-    M_zero = np.array([leg["M_LS"] for leg in legs])
-    found = M_hat - u_hat * (M_hat[:, 1:2] / u_hat[:, 1:2])  # where it meets the plane y = 0
-    np.testing.assert_allclose(found, M_zero, rtol=1e-6, atol=1e-3)
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.01])

@@ -7,9 +7,6 @@ from rendering import Bar, Light, render
 
 from legcal.geometry.types import Array
 from legcal.perception.candidate_pairs import (
-    MAX_WIDTH,
-    MIN_OVERLAP,
-    MIN_WIDTH,
     EdgeSegments,
     find_candidate_pairs,
     find_segments,
@@ -75,16 +72,6 @@ def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Arr
             assert left @ (axis[:2] - start) > 0.0  # the bar is brighter
 
 
-def test_a_dark_bar_has_its_brighter_side_outside() -> None:
-    camera = _camera()
-    dark = Bar(BARS[0].A, BARS[0].B, BARS[0].radius, 30.0)
-    found = find_segments(_picture(camera, [dark], background=150.0), camera)
-    axis = (dark.A + dark.B) / (dark.A + dark.B)[2]
-    for line in _lines(dark):
-        start, end = found.ends[_nearest(found, line)]
-        assert np.array([end[1] - start[1], start[0] - end[0]]) @ (axis[:2] - start) < 0.0
-
-
 def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_seen() -> None:
     camera = _camera()
     across = Bar(np.array([-0.3, 0.02, 0.6]), np.array([0.3, -0.02, 0.6]), 0.03, 90.0)
@@ -145,28 +132,6 @@ def test_the_outlines_of_legs_are_pairs_with_their_axes_and_widths(seed: int) ->
         )
 
 
-def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_pairs() -> None:
-    for width, length, n in (
-        (MIN_WIDTH - 0.5, 60.0, 0),
-        (MIN_WIDTH + 0.5, 60.0, 1),
-        (MAX_WIDTH + 5.0, 400.0, 0),
-        (MAX_WIDTH - 5.0, 400.0, 1),
-        (40.0, 50.0, 0),  # more a square than a bar
-    ):
-        assert len(find_candidate_pairs(lp.segments(_edges(width, length)))) == n
-
-
-def test_edges_beside_each_other_must_overlap_and_be_nearly_parallel() -> None:
-    lines = _edges(12.0, 80.0)
-    for part, n in ((0.9 * (1.0 - MIN_OVERLAP), 1), (1.1 * (1.0 - MIN_OVERLAP), 0)):
-        moved = lines.copy()
-        moved[1, :, 0] += part * 80.0 * lp.PIXEL
-        assert len(find_candidate_pairs(lp.segments(moved))) == n
-    skew = lines.copy()
-    skew[1, 1, 1] -= 20.0 * lp.PIXEL
-    assert len(find_candidate_pairs(lp.segments(skew))) == 0
-
-
 def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
     opposite, same = (
         find_candidate_pairs(lp.segments(_edges(12.0, 80.0, same_way=way))) for way in (False, True)
@@ -178,12 +143,3 @@ def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
     np.testing.assert_allclose(turned.width, opposite.width)
     nothing = find_segments(np.full((240, 320), 90.0, dtype=np.float32), _camera())
     assert len(nothing) == len(find_candidate_pairs(nothing)) == 0
-
-
-def test_the_best_pairs_come_first_and_copies_of_a_pair_are_left_out() -> None:
-    short, long = _edges(12.0, 40.0) + 60.0 * lp.PIXEL, _edges(10.0, 90.0, turn=1.2)
-    copy = long + 0.5 * lp.PIXEL
-    pairs = find_candidate_pairs(lp.segments(np.concatenate([short, long, copy])))
-    assert np.all(np.diff(pairs.merit) <= 0.0)
-    assert len(pairs) == 2
-    assert len(pairs.take(np.array([1]))) == 1

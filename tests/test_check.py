@@ -22,7 +22,6 @@ from legcal.calibration.change_detection import (
     noise_dof,
     possible_changes,
 )
-from legcal.calibration.documents import Result
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.geometry.motions import frame_on_points
@@ -37,11 +36,10 @@ from legcal.machine.parameters import (
     turns_between,
     vector_of,
 )
-from legcal.simulation.observe import OutlineNoise, shifted_outlines
 
 MODEL = "3-rpr"
-EXACT = 1e-4  # [px]: errors of outlines to which others are added
-NOISE = OutlineNoise(0.1, 150)
+
+
 Rows = list[dict[str, str]]
 
 
@@ -158,42 +156,7 @@ def test_images_without_used_outlines_are_refused(
         check(blank, result)
 
 
-def test_priors_of_intrinsics_belong_to_the_whole_camera(result: Path, images: Path) -> None:
-    new = load_dataset(images)
-    assert not any("exact" in note for note in Result.read(result / "result.json").notes)
-    assert "c1.fx" in check(new, result).solution.estimates.names
-    view = new.measurements.views[0]
-    larger = replace(view, camera=replace(view.camera, height=view.camera.height + 1))
-    other = replace(new, measurements=replace(new.measurements, views=(larger,)))
-    assert "c1.fx" not in check(other, result).solution.estimates.values
-
-
-def test_notes_on_images_are_passed_on_once(
-    result: Path, images: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from legcal.calibration.pipeline import estimate_parameters
-
-    left_out, outlier = "view c1, image k01: was left out.", "view c1, image k02: disagrees."
-
-    def noted(*arguments: Any) -> Any:
-        found = estimate_parameters(*arguments)
-        return replace(found, image_notes=(left_out, outlier), fit_notes=(outlier,))
-
-    monkeypatch.setattr("legcal.calibration.verification.estimate_parameters", noted)
-    found = check(images, result)
-    assert [note for note in found.notes if "view c1, image" in note] == [left_out, outlier]
-    assert set(found.document()["notes"]) >= {left_out, outlier, *found.solution.notes}
-
-
 # Results that are read back. More refusals are in refusal_table.py.
-
-
-def test_a_result_is_read_back_as_it_was_written(result: Path) -> None:
-    path = result / "result.json"
-    written = json.loads(path.read_text())
-    read = Result.read(path).document()
-    assert read == written
-    assert list(read) == list(written)
 
 
 def _row_of_held(document: dict[str, Any]) -> None:
@@ -337,25 +300,6 @@ def test_priors_that_data_dominate_are_no_degrees_of_freedom() -> None:
     assert noise_dof(n, np.asarray(np.diag(narrow**2), dtype=np.float64), narrow) == n
 
 
-@pytest.mark.parametrize(("model", "size"), [("hexapod", 7), ("3-rpr", 5), ("3-upu-tilted", 11)])
-def test_a_joint_of_a_frame_leg_moves_the_coordinates_of_all_others(model: str, size: int) -> None:
-    machine = load_mechanism(model)
-    parametrization = parametrization_of(machine)
-    single, joints, whole = possible_changes(machine, parametrization)
-    assert {change.what for change in single} == {f"offset of {name}" for name in machine.leg_names}
-    first, second = (machine.leg_names[leg] for leg in machine.frame_legs[:2])
-    origin = next(change for change in joints if change.what == f"base joint of {first}")
-    # The origin of R_b moves: x of another joint, off the x axis or not, goes the other way.
-    x = parametrization.names.index(f"{second}.base.x")
-    n = len(origin.components)
-    along_x = machine.T_base_Rb.rotation.as_matrix()[:n, 0]  # in the link
-    np.testing.assert_allclose(origin.columns[x] @ along_x, -1.0, atol=1e-6)
-    assert len(origin.components) == (3 if machine.spatial else 2)
-    assert [len(change.components) for change in whole] == [size] * machine.n_legs
-    everything = np.concatenate([change.columns for change in whole], axis=1)
-    assert np.linalg.matrix_rank(everything, tol=1e-6) == len(parametrization)
-
-
 def _turned(actuator: Actuator, angle: float) -> Actuator:
     """Return a motor whose arm, if it is a cylinder, stands where it does at a reading."""
     if actuator.arm is None:
@@ -418,47 +362,3 @@ def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
 
 
 # Rates of the whole check.
-
-
-def _with_errors(dataset: Dataset, rng: np.random.Generator, shared: float = 0.0) -> Dataset:
-    """Return outlines with errors, some of them shared by each edge of a leg in a view [px]."""
-    o, m = dataset.observations, dataset.measurements
-    assert o is not None
-    offsets = rng.multivariate_normal(np.zeros(2), NOISE.covariance(0.0), size=len(o))
-    shift = shared * rng.standard_normal((len(m.views), 1 + o.leg.max(), 2))
-    offsets += shift[m.view[o.row], o.leg, o.edge - 1][:, None]
-    h, ends = o.h.copy(), o.ends.copy()
-    for v, view in enumerate(m.views):
-        here = m.view[o.row] == v
-        h[here], ends[here] = shifted_outlines(view.camera, h[here], ends[here], offsets[here])
-    covariance = np.tile(NOISE.covariance(0.0), (len(o), 1, 1))
-    return replace(dataset, observations=replace(o, h=h, ends=ends, covariance=covariance))
-
-
-@pytest.mark.slow
-def test_alarms_of_the_whole_check_are_as_rare_as_stated(tmp_path: Path) -> None:
-    rng = np.random.default_rng(11)
-    first = load_dataset(_simulated(tmp_path / "set", poses=8, views=2, sigma_px=EXACT))
-    new = load_dataset(_simulated(tmp_path / "new", poses=3, sigma_px=EXACT))
-    p_values = []
-    for _ in range(20):
-        calibrate(_with_errors(first, rng), output=tmp_path / "result")
-        p_values += [
-            check(_with_errors(new, rng), tmp_path / "result").movement.p_value for _ in range(2)
-        ]
-    assert np.mean(np.array(p_values) < 0.05) < 0.2
-    assert 0.3 < np.mean(p_values) < 0.7
-
-
-@pytest.mark.slow
-def test_edge_biases_that_outlines_share_are_no_movement(tmp_path: Path) -> None:
-    rng = np.random.default_rng(9)
-    first = load_dataset(_simulated(tmp_path / "set", "hexapod", poses=15, views=3, sigma_px=EXACT))
-    earlier = calibrate(_with_errors(first, rng, shared=0.05), output=tmp_path / "result")
-    assert max(earlier.solution.quality.shared_px.values()) > 0.02
-    new = load_dataset(_simulated(tmp_path / "new", "hexapod", poses=8, sigma_px=EXACT))
-    for _ in range(3):
-        found = check(_with_errors(new, rng, shared=0.05), tmp_path / "result")
-        assert found.movement.p_value > 1e-3
-        for kind, size in earlier.solution.quality.shared_px.items():
-            assert found.solution.quality.shared_px[kind] >= size

@@ -1,7 +1,6 @@
 """Parameters fixed, freed and given priors by name: what overrides come to, and their refusals."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,17 +8,15 @@ import pytest
 from chosen import HEXAPOD, choose, known
 from dataset_folder import Folder, folder
 
-from legcal import calibrate, load_dataset, load_mechanism
+from legcal import load_dataset, load_mechanism
 from legcal.calibration.joint_fit.parameter_choices import (
-    NO_CHOICES,
     Choices,
     Prior,
     known_parameters,
     resolve,
 )
-from legcal.data.overrides import overrides_of_call, overrides_of_settings
-from legcal.errors import DatasetError, UsageError
-from legcal.machine.parameter_id import ParameterId
+from legcal.data.overrides import overrides_of_call
+from legcal.errors import UsageError
 from legcal.machine.parameters import parametrization_of
 
 __all__ = ["folder"]
@@ -92,22 +89,6 @@ def test_units_are_those_of_the_parameter() -> None:
     assert found.priors["c1.k1"] == Prior(-0.1, 0.01)
 
 
-def test_a_pattern_stands_for_all_that_it_matches() -> None:
-    found = choose(
-        {"*.radius.*_tube": (0.011, 1e-4)}, fixed=["leg2.base.*", "*.offset"], free=["tele.k?"]
-    )
-    assert set(found.priors) == {f"leg{j}.radius.leg{j}_tube" for j in range(1, 7)}
-    assert found.fixed == {f"leg2.base.{axis}" for axis in "xyz"} | {
-        f"leg{j}.offset" for j in range(1, 7)
-    }
-    assert found.free == {"tele.k1", "tele.k2", "tele.k3"}
-
-
-def test_views_of_one_camera_have_one_set_of_intrinsics() -> None:
-    assert choose(free=["c2.fx"]) == choose(free=["c1.fx"]) == choose(free=["c[12].fx"])
-    assert choose(free=["*.fx"]).free == {"c1.fx", "tele.fx"}
-
-
 def test_a_parameter_can_be_fixed_away_from_nominal() -> None:
     found = choose(fixed=["leg1.offset=351mm", "leg2.offset", "c2.cx=512.5"])
     assert found.fixed == {"leg1.offset", "leg2.offset", "c1.cx"}
@@ -128,13 +109,6 @@ def test_a_twist_is_an_angle_between_lines() -> None:
             assert found.priors["leg1.twist"].mean == pytest.approx(nominal + 0.01)
 
 
-def test_a_prior_wins_over_free_and_a_value_over_fixed() -> None:
-    found = choose({"c1.fx": (1290.0, 3.0)}, free=["c1.f?"])
-    assert found.free == {"c1.fy"}
-    assert set(found.priors) == {"c1.fx"}
-    assert choose(fixed=["*.offset", "leg1.offset=0.35"]).values == {"leg1.offset": 0.35}
-
-
 def test_overrides_of_a_call_win_over_the_dataset() -> None:
     in_file = [
         replace(override, in_file=True)
@@ -148,18 +122,6 @@ def test_overrides_of_a_call_win_over_the_dataset() -> None:
     assert found.notes == (
         "This run overrides the choices of the dataset for leg1.offset, leg2.offset.",
     )
-
-
-def test_what_was_chosen_is_a_document() -> None:
-    assert choose() == NO_CHOICES
-    assert NO_CHOICES.document() == {}
-    found = choose({"c1.fx": (1290.0, 3.0)}, ["leg2.offset", "leg1.offset=0.35"], ["c1.k1"])
-    assert found.document() == {
-        "fixed": ["leg2.offset"],
-        "fixed_at": {"leg1.offset": 0.35},
-        "free": ["c1.k1"],
-        "priors": {"c1.fx": [1290.0, 3.0]},
-    }
 
 
 def chosen(folder: Folder, block: dict[str, Any], **call: Any) -> Choices:
@@ -182,21 +144,6 @@ def test_the_block_of_a_dataset_says_what_a_call_can_say(folder: Folder) -> None
     assert by_file == chosen(folder, {}, **call)
     assert by_file.priors["leg1.offset"] == Prior(0.35, 1e-4)
     assert by_file.notes == ()
-
-
-def test_a_run_that_says_the_same_needs_no_note(folder: Folder) -> None:
-    block = {"priors": {"leg1.offset": "0.35±0.0001"}, "fixed": ["leg2.offset"]}
-    assert chosen(folder, block, priors=["leg1.offset=350±0.1mm"]).notes == ()
-    assert "leg1.offset, leg2.offset." in chosen(folder, block, free=["*.offset"]).notes[0]
-
-
-def test_a_call_is_refused_before_any_work(folder: Folder, tmp_path: Path) -> None:
-    before = sorted(folder.path.rglob("*"))
-    for call in ({"free": ["leg9.offset"]}, {"priors": {"leg1.offset": (0.35, 0.0)}}):
-        with pytest.raises(UsageError, match="could not be used"):
-            calibrate(folder.path, output=tmp_path / "out", **call)
-    assert not (tmp_path / "out").exists()
-    assert sorted(folder.path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(
@@ -233,64 +180,3 @@ def test_names_that_are_no_parameters_and_values_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=found):
         choose(fixed=[name], parameters=known(model))
-
-
-def test_problems_are_refused_as_those_of_their_source() -> None:
-    in_file = [replace(o, in_file=True) for o in overrides_of_call(fixed=["leg9.offset"])]
-    with pytest.raises(DatasetError, match="unknown name"):
-        resolve(in_file, HEXAPOD)
-    with pytest.raises(UsageError, match=r"c2\.fx, measured axes"):
-        choose(free=["c2.fx"], parameters=known(axes_given=True))
-
-
-def test_a_machine_of_which_all_is_fixed_is_refused() -> None:
-    parameters = known("3-upu-tilted")
-    names = [name for name, p in parameters.by_name.items() if p.kind == "kinematic"]
-    with pytest.raises(UsageError, match="all of its parameters are fixed"):
-        choose(fixed=names, parameters=parameters)
-    assert choose(fixed=names[1:], parameters=parameters).fixed == set(names[1:])
-
-
-@pytest.mark.parametrize(
-    ("block", "found"),
-    [
-        ({"fixed": "leg1.offset"}, r"parameters\.fixed"),
-        ({"fixed": ["leg1.offset=x"]}, r"parameters\.fixed\.0"),
-        ({"free": [{"leg1": "offset"}]}, r"parameters\.free\.0"),
-        ({"priors": {"leg1.offset": "9±1"}}, r"leg1\.offset .*9 m"),
-    ],
-)
-def test_a_malformed_block_of_a_dataset_is_refused(
-    folder: Folder, block: dict[str, Any], found: str
-) -> None:
-    with pytest.raises(DatasetError, match=found) as refusal:
-        chosen(folder, block)
-    assert "dataset.yaml" in str(refusal.value)
-
-
-@pytest.mark.parametrize("leg", ["leg1", "z_axis", "left.front", "base.x"])
-def test_a_name_says_whose_number_it_is_whatever_the_leg_is_called(leg: str) -> None:
-    kinds = [
-        *((kind, axis) for kind in ("base", "platform") for axis in "xyz"),
-        *((kind, angle) for kind in ("base_axis", "platform_axis", "arm_point") for angle in "12"),
-        *((kind, "") for kind in ("offset", "length", "twist", "gain")),
-        ("radius", f"{leg}.rod"),
-    ]
-    for kind, component in kinds:
-        parameter = ParameterId(leg, kind, component)
-        assert ParameterId.parse(str(parameter)) == parameter
-
-
-@pytest.mark.parametrize(
-    ("text", "argument"),
-    [
-        ("leg1.offset", {"fixed": ["leg1.offset"]}),
-        ("leg1.offset=350mm", {"fixed": ["leg1.offset=350mm"]}),
-        ("leg1.offset=350±0.1mm", {"priors": ["leg1.offset=350±0.1mm"]}),
-        ("leg1.offset=0.35+-1e-4", {"priors": ["leg1.offset=0.35+-1e-4"]}),
-        ("*.radius.*=free", {"free": ["*.radius.*"]}),
-    ],
-)
-def test_one_option_fixes_frees_and_gives_priors(text: str, argument: dict[str, Any]) -> None:
-    nothing: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
-    assert overrides_of_settings([text]) == nothing | argument

@@ -222,12 +222,6 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(workers, "CONNECTING", 5.0)
-    with (
-        local_cluster(tmp_path / "cluster", 0) as local,
-        pytest.raises(OutOfResources, match="found no worker at the scheduler"),
-    ):
-        run_study(Draws(), 3, workers=local.address)
     monkeypatch.setattr(workers, "CONNECTING", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
@@ -248,3 +242,10 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
     for address in ("host", "tcp://host", "http://host:8787"):
         with pytest.raises(UsageError, match="like tcp://host:8786"):
             run_study(Draws(), 3, workers=address)
+    # Clients that failed before do not keep another one from its scheduler.
+    monkeypatch.setattr(workers, "CONNECTING", 5.0)
+    with (
+        local_cluster(tmp_path / "cluster", 0) as local,
+        pytest.raises(OutOfResources, match="found no worker at the scheduler"),
+    ):
+        run_study(Draws(), 3, workers=local.address)

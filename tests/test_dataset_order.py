@@ -16,7 +16,6 @@ from legcal.data.image_tables import (
     Order,
     canonical_order,
     inverse,
-    measurements_at,
     reorder_measurements,
 )
 from legcal.data.measurements import Measurements
@@ -108,14 +107,6 @@ def test_the_fraction_is_held_out_of_every_view(fraction: float, count: int) -> 
     assert of_view.max() <= np.ceil(15 * fraction)
 
 
-def test_images_of_one_pose_are_held_out_together() -> None:
-    m = _example().measurements
-    shared = replace(m, pose=np.tile(np.arange(15), 3), q=np.tile(m.q[:15], (3, 1)))
-    _, held_out = split_images(replace(_example(), measurements=shared), 0.2)
-    assert len(held_out) == 9
-    assert len(set(shared.pose[held_out].tolist())) == 3
-
-
 def test_the_choice_does_not_depend_on_the_order_of_the_rows() -> None:
     rows = np.random.default_rng(3).permutation(45)
     order = Order(rows, np.array([2, 0, 1]), np.arange(6))
@@ -135,23 +126,6 @@ def test_a_leg_that_few_images_show_stays_in_them() -> None:
         fitted, _ = split_images(dataset, fraction)
         assert 4 in fitted  # alone in its view
         assert set(fitted.tolist()) & {20, 21}
-
-
-def test_a_part_is_a_dataset_of_its_own() -> None:
-    m = _example().measurements
-    labels = tuple(f"p{k}" for k in range(15))
-    shared = replace(m, pose=np.tile(np.arange(15), 3), pose_labels=labels)
-    table, rows = outlines_of(2, range(45), legs=(0, 1)), np.array([17, 2, 5, 35])
-    part = dataset_at(replace(_example(), measurements=shared, observations=table), rows)
-    assert part.measurements.pose.tolist() == [0, 0, 1, 1]
-    assert part.measurements.pose_labels == ("p2", "p5")
-    assert [part.image_path(k) for k in range(4)] == [_example().image_path(k) for k in rows]
-    assert part.observations is not None
-    kept = np.isin(table.row, rows)
-    np.testing.assert_array_equal(rows[part.observations.row], table.row[kept])
-    np.testing.assert_array_equal(part.observations.h, table.h[kept])
-    assert len(outlines_of(3, range(4)).at(np.zeros(0, dtype=np.intp))) == 0
-    np.testing.assert_array_equal(measurements_at(shared, rows).q, part.measurements.q)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.2, 20.0, float("nan"), float("inf")])

@@ -159,46 +159,11 @@ def test_a_3_upu_near_its_constraint_singularity_is_judged_and_at_it_is_named(
     assert any("singular at home" in note for note in tripod(tmp_path / "at", 319.9).diagnostics)
 
 
-@pytest.mark.slow
-def test_a_3_upu_not_far_from_its_constraint_singularity_is_calibrated(tmp_path: Path) -> None:
-    """Errors of the nominal model are magnified there to centimetres, and found all the same."""
-    folder = simulate(
-        tripod(tmp_path, 280.0), tmp_path / "set", settings(poses=15, views=3, seed=1)
-    ).folder
-    calibration = calibrate(folder, output=tmp_path / "out")
-    before, after = errors(calibration, folder, tmp_path / "out")
-    assert calibration.platform is not None
-    assert calibration.verdict.trustworthy
-    assert before > 1e-2
-    assert after < 3.0 * calibration.platform.sigma.mean_displacement
-
-
 @pytest.fixture(scope="module")
 def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outlines of a hexapod in two views."""
     folder = tmp_path_factory.mktemp("two") / "set"
     return simulated(folder, "hexapod", poses=8, seed=1).folder
-
-
-@pytest.fixture(scope="module")
-def halves(two_views: Path) -> Path:
-    """Outlines of a hexapod of which two cameras see three legs each, and no leg in common."""
-    folder = Path(shutil.copytree(two_views, two_views.parent / "halves"))
-    text = (folder / "dataset.yaml").read_text()
-    for view, legs in (("c1", "leg1, leg2, leg3"), ("c2", "leg4, leg5, leg6")):
-        text = re.sub(
-            rf"(  {view}:\n)((?:    .*\n)*?)(?=  c|\Z)", rf"\1    legs: [{legs}]\n\2", text
-        )
-    (folder / "dataset.yaml").write_text(text)
-    return folder
-
-
-@pytest.mark.system
-def test_views_that_share_no_leg_are_joined_by_the_readings(halves: Path, tmp_path: Path) -> None:
-    calibration = calibrate(halves, output=tmp_path / "out")
-    before, after = errors(calibration, halves, tmp_path / "out")
-    assert calibration.verdict.trustworthy
-    assert after < 0.1 * before
 
 
 def test_a_leg_that_no_view_shows_is_found_from_its_readings(

@@ -4,7 +4,6 @@ import base64
 import gzip
 import http.client
 import json
-import re
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -22,27 +21,16 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor, load_dataset
 from legcal.calibration.detection import Detection
-from legcal.calibration.detection_folder import _caption
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import examination_page
-from legcal.data.corners import found_corners
-from legcal.data.image_tables import canonical_order
 from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
 from legcal.perception.overlays import (
-    COLOURS,
-    LabelPlaces,
-    Mark,
     PartMarks,
-    draw,
-    marks_of_corners,
     marks_of_image,
-    marks_of_pairs,
 )
-from legcal.perception.photographs import MeasuredImages, Photographs, place_and_measure
 from legcal.viewer.click_server import TOKEN_HEADER, ClickServer
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -199,71 +187,6 @@ def test_a_served_page_answers_its_own_browser_alone(
         server.close()
 
 
-def test_pages_of_many_images_show_the_worst_and_leave_out_a_table_that_is_too_long(
-    examined: Examination, found: Detection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("legcal.calibration.examination_page.MAX_ROWS", 2)
-    monkeypatch.setattr("legcal.calibration.examination_page.MAX_BYTES", 1000)
-    page: Any = html.fromstring(examination_page(examined, found))
-    captions = page.xpath("//figure//figcaption/text()")
-    assert [text.split(":")[0] for text in captions] == [BLANK, ASIDE]
-    assert "The 2 of 5 images with the fewest used outlines are shown." in page.xpath("string()")
-    assert "There are more outlines than a page should hold." in page.xpath("string()")
-    assert page.xpath("//dialog[@id='editor'] | //button[@data-edit]") == []
-
-
-def test_views_without_a_camera_pose_are_told_and_drawn_where_they_were_expected(
-    found: Detection,
-) -> None:
-    assert list(found.unplaced) == ["c2"]
-    assert {found.view_of(row) for row in found.outlines.row.tolist()} == {"c1"}
-    assert len(found.predicted(4)) == 6
-
-
-def test_captions_say_only_of_a_camera_with_a_hint_where_it_was_expected(
-    found: Detection,
-) -> None:
-    assert _caption(found, 0).startswith("c1  images/p0_0.png  1")
-    assert _caption(found, 4).endswith(
-        "the camera could not be placed: edge pairs that were found, and legs where it was expected"
-    )
-    unknown = replace(found, T_base_camera=(found.T_base_camera[0], None))
-    assert unknown.predicted(4) == []
-    caption = _caption(unknown, 4)
-    assert caption.endswith("the camera could not be placed: edge pairs that were found")
-
-
-def test_pictures_of_a_view_that_is_not_placed_show_the_edge_pairs_that_were_found() -> None:
-    cam = Camera(np.array([[500.0, 0.0, 199.5], [0.0, 500.0, 149.5], [0.0, 0.0, 1.0]]), 400, 300)
-    image = np.full((300, 400), 200.0, dtype=np.float32)
-    image[:, 180:210] = 40.0
-    part = marks_of_pairs(cam, image)
-    where = sorted(float(mark.points[:, 0].mean()) for mark in part.marks)
-    assert where == pytest.approx([179.5, 209.5], abs=1.0)
-    drawn = draw(image, [part], "c1 a.png").astype(int)
-    near = np.abs(drawn - COLOURS["pair"]).max(axis=2) < 60
-    assert near[: 4 * 280].any(axis=1).mean() > 0.9
-
-
-def test_legs_are_drawn_by_the_radii_that_were_searched_by(
-    one_image: RepeatedImages, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def thicker(photographs: Photographs, *others: Any) -> MeasuredImages:
-        machine = photographs.machine.with_radii(lambda j, c: c.radius * (2.0 + j))
-        wrong = replace(photographs, machine=machine)
-        return replace(place_and_measure(photographs, *others), photographs=wrong)
-
-    monkeypatch.setattr("legcal.calibration.detection.place_and_measure", thicker)
-    found = detect(one_image.path)
-    legs = {leg.leg: leg for leg in found.predicted(0)}
-    assert len(legs) == 6
-    order = canonical_order(found.dataset.measurements, found.dataset.machine.leg_names).legs
-    for at, j in enumerate(order.tolist()):
-        nominal = {c.link: c.radius for c in found.dataset.machine.legs[j].cylinders}
-        for piece in legs[j].segments:
-            assert piece.radius == pytest.approx((2.0 + at) * nominal[piece.link])
-
-
 def test_the_written_table_is_read_as_what_was_found(
     rendered: RepeatedImages, found: Detection, folder: Path
 ) -> None:
@@ -272,21 +195,6 @@ def test_the_written_table_is_read_as_what_was_found(
     assert_same(read_observations(path, legs, dataset.measurements), found.outlines)
     for name in QUALITY:
         assert np.all(np.isfinite(getattr(found.outlines, name)[found.outlines.used]))
-
-
-def test_people_read_a_table_of_views(
-    one_image: RepeatedImages,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    assert run(monkeypatch, "detect", one_image.path, "-o", tmp_path / "out") == 0
-    printed = capsys.readouterr()
-    assert "outlines can be used" in printed.out
-    assert re.search(r"1[12]/12", printed.out)  # of one leg little is seen
-    assert f"Look at {tmp_path}/out/index.html" in printed.out.replace("\n", "")
-    assert "Drawing overlays: 2/2" in printed.err
 
 
 def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
@@ -327,44 +235,6 @@ def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
     with pytest.raises(UsageError, match=r"overlays/c1/p0_1.jpg, which legcal did not write"):
         detect(one_image.path, output=out)
     assert (out / "overlays" / "c1" / "p0_0.jpg").exists()
-
-
-def test_images_of_the_same_name_have_pictures_of_their_own(found: Detection) -> None:
-    measurements = found.dataset.measurements
-    views = (replace(measurements.views[0], name="../left cam"), *measurements.views[1:])
-    images = ("images/a.png", "more/A.png", "b/c.png", "b/d.png", "images/a.png")
-    renamed = replace(measurements, views=views, image=images)
-    pictures = replace(found, dataset=replace(found.dataset, measurements=renamed)).overlay_files
-    assert list(pictures.values()) == [
-        "overlays/_left_cam/images_a.png.jpg",
-        "overlays/_left_cam/more_A.png.jpg",
-        "overlays/_left_cam/b_c.png.jpg",
-        "overlays/_left_cam/b_d.png.jpg",
-        "overlays/c2/a.jpg",
-    ]
-
-
-def test_a_folder_with_other_files_is_refused_before_any_work(
-    rendered: RepeatedImages, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "detect", rendered.path, "-o", rendered.path, "--json") == 2
-    error: dict[str, Any] = json.loads(capsys.readouterr().out)["error"]
-    assert "found a folder with other files and no detection.json of legcal" in error["message"]
-
-
-def test_images_that_cannot_be_read_are_refused_and_nothing_is_written(
-    one_image: RepeatedImages,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    path = one_image.path / one_image.rows[1]["image"]
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert run(monkeypatch, "detect", one_image.path, "-o", tmp_path / "out") == 2
-    said = capsys.readouterr().err
-    assert "p0_1.png" in said
-    assert len(said.strip().splitlines()) <= 2
-    assert not (tmp_path / "out").exists()
 
 
 # What is drawn over images.
@@ -466,80 +336,3 @@ def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_
         assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
     gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
     assert marks_of_image(cam, gone, predicted(cam), NAMES) == []
-
-
-def test_an_edited_outline_and_a_leg_without_rows_are_named() -> None:
-    cam = camera("plumb_bob")
-    part = marked(cam, replace(outlines(cam), source=("detected", "edited")))
-    assert part.name == "leg1 (edited)"
-    found = outlines(cam)
-    empty = replace(found, leg=found.leg + 1)
-    names = [part.name for part in marks_of_image(cam, empty, predicted(cam), ("leg1", "leg2"))]
-    assert names == ["leg2", "leg1"]
-
-
-@pytest.mark.parametrize("factor", [0.3, 1.5])
-def test_pictures_of_every_size_have_lines_and_letters_of_the_same_share(factor: float) -> None:
-    width, height = round(1600 * factor), round(1200 * factor)
-    curve = np.column_stack([np.linspace(0.2, 0.8, 30) * width, np.full(30, 0.5 * height)])
-    part = PartMarks("leg1", "low contrast", (Mark("edge 1", curve),))
-    picture = draw(np.full((height, width), 100.0), [part], "c1 a.png")
-    assert picture.shape[1] >= 1600
-    image = picture[: round(picture.shape[1] * 0.75)].astype(int)
-    column = np.abs(image[:, image.shape[1] // 4] - COLOURS["edge 1"]).max(axis=1)
-    thick = np.count_nonzero(column < 60)
-    assert 0.0008 < thick / picture.shape[1] < 0.0025
-    lit = np.flatnonzero(np.any(image[..., 2] > 200, axis=1))  # the name is red
-    assert 0.02 < np.ptp(lit) / picture.shape[1] < 0.06
-
-
-def test_corners_of_boards_are_crosses_where_they_were_found() -> None:
-    px, none = np.array([[300.2, 200.0], [1200.0, 700.5]]), np.zeros(2, dtype=np.intp)
-    found = found_corners(none, none, px, np.ones(2))
-    found = replace(
-        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.OTHER, "far off"))
-    )
-    grey = np.full((1200, 1600), 100.0)
-    picture = draw(grey, [], "c1 a.png", marks_of_corners(found)).astype(int)
-    for (x, y), colour in zip(px, (COLOURS["corner"], COLOURS["rejected"]), strict=True):
-        is_lit = np.abs(picture[:1200] - np.array(colour)).max(axis=2) < 60
-        rows, columns = np.nonzero(is_lit)
-        assert abs(rows.mean() - y) < 0.6
-        assert abs(columns.mean() - x) < 0.6
-    assert np.any(picture[1200:] != draw(grey, [], "c1 a.png")[1200:])  # the legend says so
-
-
-def test_texts_stand_inside_the_picture_and_apart() -> None:
-    curve = np.column_stack([np.full(20, 10.0), np.linspace(10.0, 290.0, 20)])
-    places = LabelPlaces(400, 300, curve)
-    corners = [places.place(curve, (80, 20), 10.0)[0] for _ in range(5)]
-    assert len(set(corners)) == 5
-    for x, y in corners:
-        assert 0 <= x <= 320
-        assert 0 <= y <= 280
-    for i, (x, y) in enumerate(corners):
-        assert all(abs(x - p) >= 80 or abs(y - q) >= 20 for p, q in corners[:i])
-
-
-def test_texts_of_rods_in_parallel_pairs_stand_apart() -> None:
-    width, height, distance = 1600, 1200, 25.0
-    tops = np.array([700.0, 500.0]) + 20.0 * np.array(
-        [[0, 0], [1, 1], [4, 2], [5, 2], [8, 1], [9, 0]]
-    )
-    feet = np.array([[450, 900], [470, 920], [780, 800], [800, 800], [1150, 930], [1170, 910]])
-    share = np.linspace(0.0, 1.0, 40)[:, None]
-    rods = [a + share * (b - a) for a, b in zip(tops, feet, strict=True)]
-    stubs = [np.array([780.0 + x, 820.0]) + share * [20.0, 2.0] for x in (0.0, 25.0, 50.0)]
-    curves = [*rods, *stubs]
-    places = LabelPlaces(width, height, np.concatenate(curves))
-    sizes = [(420, 50), (150, 30), (420, 50), (420, 50), (150, 30), (420, 50), *3 * [(240, 50)]]
-    boxes = []
-    for curve, size in zip(curves, sizes, strict=True):
-        corner, leader = places.place(curve, size, distance)
-        boxes.append(np.array([corner, np.add(corner, size)]))
-        assert np.linalg.norm(curve - leader[0], axis=1).min() < 1e-9  # on its own rod
-        assert np.linalg.norm(np.diff(leader, axis=0)) < 250.0
-    for i, box in enumerate(boxes):
-        assert np.all(box >= 0)
-        assert np.all(box <= [width, height])
-        assert all(np.any((box[0] >= o[1]) | (box[1] <= o[0])) for o in boxes[:i])

@@ -1,6 +1,5 @@
 """Common mistakes of owners are named: in readings, models and images that disagree."""
 
-import pickle
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from simulated import settings, simulated
@@ -16,18 +14,16 @@ from simulated import settings, simulated
 from legcal import calibrate, load_dataset
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, as_given, mistakes
+from legcal.calibration.diagnosis.mistakes import Assumed, Mistake, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
 from legcal.data.measurements import row_names
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError
 from legcal.geometry.types import Array
 from legcal.progress import no_progress
 from legcal.simulation.dataset import simulate
 from legcal.workers import in_turn
-
-COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
 
 
 def _exchange(one: str, other: str) -> Callable[[Spoiled], None]:
@@ -36,14 +32,6 @@ def _exchange(one: str, other: str) -> Callable[[Spoiled], None]:
             row[one], row[other] = row[other], row[one]
 
     return change
-
-
-def _numbers(change: Callable[[float], float]) -> Callable[[Spoiled], None]:
-    def of_all(session: Spoiled) -> None:
-        for row in session.rows:
-            row.update({name: f"{change(float(row[name])):.9f}" for name in COLUMNS})
-
-    return of_all
 
 
 @pytest.mark.system  # fifty mistakes are tried
@@ -60,19 +48,6 @@ def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path
     assert calibration.notes[0] == found.sentence
     block = calibration.result.document()["diagnosis"]
     assert [one["kind"] for one in block] == ["columns exchanged"]
-
-
-def test_refusals_carry_the_diagnosis_to_other_processes() -> None:
-    error = NotVisible(["Columns look exchanged.", "No view could be placed."])
-    error.diagnosis = ({"kind": "columns exchanged"},)
-    again = pickle.loads(pickle.dumps(error))
-    assert (again.problems, again.diagnosis) == (error.problems, error.diagnosis)
-
-
-def test_nothing_is_wrong_with_a_session_that_is_right(tmp_path: Path) -> None:
-    session = spoiled(tmp_path / "set", 4, ("c1", "c2"))
-    data = order_dataset(load_dataset(session.write()), in_turn, no_progress)
-    assert diagnose(data) == ()
 
 
 @pytest.mark.parametrize(
@@ -199,31 +174,6 @@ def _with_readings(d: Dataset, change: Callable[[Array], Array]) -> Dataset:
     return replace(d, measurements=replace(d.measurements, q=q))
 
 
-def test_motors_that_move_joints_at_A_are_mistaken_as_encoders_of_legs_are(delta: Dataset) -> None:
-    small = _with_readings(delta, lambda q: 0.5 * q)  # so that another zero is in their travel
-    data = order_dataset(small, in_turn, no_progress)
-    tried, rows = mistakes(data), list(range(6))
-    of_kinds = {one.kind: one for one in tried}
-    assert "deg too" in of_kinds["zero of an encoder"].what
-    assert "motors arm" in of_kinds["columns exchanged"].same_as[0]
-    given, mirrored = as_given(data).joints(rows), of_kinds["handedness"].true.joints(rows)
-    for ends, of_mirror in zip(given, mirrored, strict=True):
-        assert np.allclose(ends[rows] * [1.0, -1.0, 1.0], of_mirror[rows], atol=1e-9)
-
-
-@pytest.mark.parametrize(("model", "directions"), [("servo-hexapod", 0), ("linear-delta", 4)])
-def test_of_travels_that_are_as_far_both_ways_a_direction_is_a_sign(
-    model: str, directions: int, tmp_path: Path
-) -> None:
-    """Else one mistake would be named twice, as if images did not tell two apart."""
-    simulate(model, tmp_path / "set", settings(poses=3))
-    data = order_dataset(load_dataset(tmp_path / "set"), in_turn, no_progress)
-    tried = [one.what for one in mistakes(data)]
-    n_motors = len(data.machine.motors)
-    assert sum("opposite sign" in what for what in tried) in (0, n_motors + 1)
-    assert sum("opposite direction" in what for what in tried) == directions
-
-
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("change", "kinds", "what"),
@@ -292,52 +242,6 @@ def _of_few_poses(d: Dataset) -> Dataset:
     return dataset_at(d, np.flatnonzero(d.measurements.pose % 10 < 7))
 
 
-@pytest.mark.system
-def test_mirrored_outlines_of_one_view_lose_to_no_mistake_of_all_views(
-    of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Exchanged columns would mend that view alike, and spoil the other one."""
-    d = _mirrored(_of_few_poses(of_symmetric_machine), 1)
-    found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
-    assert found.what == "the outlines of view c2 look mirrored"
-    assert (found.after, found.same_as) == (14, ())
-
-
-@pytest.mark.system
-def test_single_images_that_are_mirrored_are_named(
-    of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """None of them is among the few images that say which mistakes are worth a closer look."""
-    d = _mirrored(of_symmetric_machine, 1, [1, 3, 6])
-    found = _diagnosed(d, {"diameter for radius"}, monkeypatch)
-    name = row_names(d.measurements)[int(np.flatnonzero(d.measurements.view == 1)[1])]
-    assert found.what == f"the outlines {name} and 2 more of view c2 look mirrored"
-    assert found.after > found.before
-
-
-NEARLY_SYMMETRIC = """leg,type,bx,by,bz,px,py,pz
-1,RPS,200.0,0.0,0,120.0,0.0,0
-2,RPS,-80.0,183.2,0,-70.0,123.9,0
-3,RPS,-110.0,-157.2,0,-76.0,-113.9,0
-"""
-
-
-def test_rough_camera_poses_find_what_a_nearly_symmetric_machine_hides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its images nearly agree with cameras elsewhere, near which the right one is not found."""
-    (tmp_path / "tripod.csv").write_text(NEARLY_SYMMETRIC)
-    lengths = ("--min-length", "380", "--max-length", "520", "--leg-radius", "9", "--height", "430")
-    assert (
-        run(monkeypatch, "new", tmp_path / "tripod.csv", "--unit", "mm", *lengths, "-o", tmp_path)
-        == 0
-    )
-    simulate(str(tmp_path / "models/tripod.yaml"), tmp_path / "set", settings(poses=5))
-    d = _with_readings(load_dataset(tmp_path / "set"), lambda q: q[:, [1, 0, 2]])
-    found = _diagnosed(d, {"columns exchanged", "images mirrored"}, monkeypatch)
-    assert found.what == "columns leg1_prismatic and leg2_prismatic look exchanged"
-
-
 def test_a_view_whose_camera_was_moved_is_named(
     outlines: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -382,28 +286,6 @@ def test_a_row_from_which_on_readings_are_late_is_named(
     assert found.after > found.before
 
 
-def test_columns_of_a_symmetric_machine_that_begin_with_another_leg_are_no_mistake(
-    of_symmetric_machine: Dataset,
-) -> None:
-    d = _of_few_poses(of_symmetric_machine)
-    d = replace(d, measurements=replace(d.measurements, q=np.roll(d.measurements.q, 1, axis=1)))
-    assert diagnose(order_dataset(d, in_turn, no_progress)) == ()
-
-
-def test_an_encoder_that_stands_still_is_not_said_to_have_another_zero(outlines: Dataset) -> None:
-    """A constant would suit some images by chance: 27 of 45 of the example against 22."""
-    q = outlines.measurements.q.copy()
-    q[:, 2] = q[0, 2]
-    still = replace(outlines, measurements=replace(outlines.measurements, q=q))
-    of_encoders = [
-        one.what
-        for one in mistakes(order_dataset(still, in_turn, no_progress))
-        if one.kind.endswith("of an encoder")
-    ]
-    assert any("leg2_prismatic" in what for what in of_encoders)
-    assert not any("leg3_prismatic" in what for what in of_encoders)
-
-
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
@@ -438,46 +320,3 @@ def test_a_table_of_outlines_in_another_form_is_called_what_it_looks_like(
         load_dataset(folder)
     assert (len(refusal.value.problems) == 1) == bool(cause)
     assert f"they would suit them if {cause}" in refusal.value.problems[0] or not cause
-
-
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        (lambda q: 1e3 * q, "millimetres: divide them by 1000"),
-        (lambda q: q + 0.345, "whole leg lengths: subtract"),
-        (lambda q: 1e3 * (q + 0.345), "whole leg lengths in millimetres"),
-        (lambda q: 1e2 * q, "centimetres"),
-        (lambda q: q / 0.0254, "inches"),
-        (lambda q: -q - 0.01, "readings with the opposite sign"),
-    ],
-)
-def test_readings_outside_the_travel_are_called_what_they_look_like(
-    change: Callable[[float], float], cause: str, tmp_path: Path
-) -> None:
-    session = spoiled(tmp_path / "set", 4, ("c1",))
-    _numbers(change)(session)
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(session.write())
-    (problem,) = refusal.value.problems
-    assert f"these look like {cause}" in problem
-    assert "columns leg1_prismatic, leg2_prismatic" in problem
-
-
-def test_one_motor_that_runs_backwards_is_not_called_another_unit(tmp_path: Path) -> None:
-    session = spoiled(tmp_path / "set", 4, ("c1",))
-    for row in session.rows:
-        row["leg2_prismatic"] = repr(-float(row["leg2_prismatic"]) - 0.01)
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(session.write())
-    (problem,) = refusal.value.problems
-    assert "column leg2_prismatic" in problem
-    assert "these look like readings with the opposite sign" in problem
-
-
-def test_a_missing_reading_is_not_called_outside_the_travel(tmp_path: Path) -> None:
-    session = spoiled(tmp_path / "set", 4, ("c1",))
-    session.rows[1]["leg2_prismatic"] = ""
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(session.write())
-    (problem,) = refusal.value.problems
-    assert "found an empty cell" in problem

@@ -73,15 +73,6 @@ def test_photographs_that_cannot_be_used_are_named_and_the_others_judged(tmp_pat
     assert sum(black in one.what for one in found.findings) == 1
 
 
-def test_photographs_of_another_size_are_one_finding(tmp_path: Path) -> None:
-    session = made(tmp_path)
-    names = [session.change("c1", k, lambda picture: picture[::2, ::2]) for k in range(2)]
-    (scaled,) = found_of(doctor(session.write()), "files", "error")
-    assert scaled.images == tuple(names)
-    assert f"2 images of view c1 ({', '.join(names)}) could not be read" in scaled.what
-    assert "rescaled by 0.5" in scaled.what
-
-
 def test_readings_are_compared_with_travel_digits_and_stated_noise(tmp_path: Path) -> None:
     folder = simulated(tmp_path / "set", "hexapod", poses=2, views=3).folder
     rows = read_rows(folder / "measurements.csv")
@@ -125,32 +116,6 @@ def test_what_photographs_say_of_camera_and_compression_is_told(tmp_path: Path) 
     assert [one.jpeg_quality for one in found.views] == [60, 60, 60]
     assert not found.is_ready
     assert found.is_usable
-
-
-@pytest.mark.system
-def test_blurred_and_bright_views_are_named(tmp_path: Path) -> None:
-    session = made(tmp_path)
-    for k in range(2):
-        session.change("c1", k, lambda picture: np.minimum(picture.astype(float) + 180.0, 255.0))
-        for view in ("c1", "c2", "c3"):
-            session.change(view, k, lambda picture: cv2.GaussianBlur(picture, (0, 0), 6.0))
-    found = doctor(session.write())
-    (soft,) = found_of(found, "photographs", "warning")
-    assert "of views c1, c2, c3 are blurred by" in soft.what
-    (bright,) = found_of(found, "photographs", "note")
-    assert "In photographs of view c1 " in bright.what
-    assert len(found_of(found, "legs", "error")) >= 1  # no camera can be placed
-    assert not found.views[0].legs_found
-
-
-def test_legs_that_no_photograph_shows_and_open_parameters_are_named(tmp_path: Path) -> None:
-    session = made(tmp_path, 1)
-    for name in ("c2", "c3"):
-        session.entry["views"][name]["legs"] = ["leg1", "leg2"]
-    found = doctor(session.write())
-    (open_,) = found_of(found, "parameters", "error")
-    assert "cannot be identified" in open_.what
-    assert not found.is_ready
 
 
 def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(

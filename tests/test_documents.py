@@ -130,23 +130,6 @@ def test_every_option_that_a_page_names_exists() -> None:
     assert missing == []
 
 
-def test_options_of_benchmarks_that_a_page_names_exist() -> None:
-    lost = []
-    for path in PAGES:
-        for name, words in re.findall(
-            r"python (benchmarks/\w+\.py)([^`\n]*)`", path.read_text(encoding="utf-8")
-        ):
-            source = (ROOT / name).read_text(encoding="utf-8")
-            source += "".join(  # options that programs share
-                (ROOT / f"benchmarks/{other}.py").read_text(encoding="utf-8")
-                for other in re.findall(r"^from (\w+) import", source, re.MULTILINE)
-                if (ROOT / f"benchmarks/{other}.py").exists()
-            )
-            options = re.findall(r"(?<!\S)--[a-z][\w-]*", words)
-            lost += [f"{path.name}: {name} {o}" for o in options if f'"{o}"' not in source]
-    assert lost == []
-
-
 DAY = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 
 
@@ -208,21 +191,6 @@ def test_the_first_commands_of_the_site_run(
             shutil.copy(example_run.folder / name, "hexapod")
 
 
-@pytest.mark.system
-def test_the_rehearsal_of_a_delta_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    block = next(text for language, text, _ in _blocks(ROOT / "docs/arms.md") if language == "sh")
-    for line in _commands(block):
-        quiet = ["--quiet"] * ("export" not in line)
-        assert run(monkeypatch, *_words(line), *quiet) == 0
-    truth = load_mechanism(tmp_path / "rehearsal/truth/models/delta.yaml")
-    off, was = (
-        evaluate(model, truth, dataset="rehearsal").displacement.mean()
-        for model in ("calibrated", "delta")
-    )
-    assert off < 0.05 * was
-
-
 def _write_files_as_people_have_them() -> None:
     """Write joints, photographs and lengths of legs of the example into the current folder."""
     shipped = load_mechanism(HEXAPOD / "models/hexapod.yaml")
@@ -260,16 +228,3 @@ def test_the_three_commands_of_the_readme_lead_from_files_to_a_calibration(
     )
     assert found < 0.2 * nominal
     assert found < 2e-4
-
-
-def test_the_commands_that_take_a_cluster_are_those_that_the_page_names() -> None:
-    def takes_it(command: Any) -> bool:
-        parts = [command, *getattr(command, "commands", {}).values()]
-        return any("--cluster" in option.opts for part in parts for option in part.params)
-
-    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    (sentence,) = re.findall(
-        r"uses a Dask cluster that runs already\.(.*?) take it\.", text, re.DOTALL
-    )
-    taking = {name for name, command in _root().commands.items() if takes_it(command)}
-    assert taking == set(re.findall(r"`(\w+)`", sentence))

@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_legs import changed, closed_leg, leg_and_pose, twist_of
+from random_legs import changed, closed_leg, leg_and_pose
 from scipy.spatial.transform import Rotation
 
-from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations, pose_equations, pose_sensitivity
-from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
+from legcal.machine.leg import JointType, Leg, LegColumns, LegKind
 from legcal.machine.parameters import (
     Parametrization,
-    geometries,
-    parametrization_of,
     parametrize,
-    to_vector,
     vector_of,
 )
 
@@ -97,18 +93,6 @@ def test_equations_of_a_leg_do_not_depend_on_the_frames(seed: int) -> None:
     np.testing.assert_allclose(same[0, 1:], here[0, 1:], atol=1e-12)
 
 
-def test_a_leg_without_an_s_joint_keeps_the_twist_of_a_line() -> None:
-    for seed in range(20):
-        leg, R, t = leg_and_pose("UR", seed)
-        assert leg.twist is not None
-        assert -0.5 * np.pi < leg.twist <= 0.5 * np.pi
-        again = twist_of(replace(leg, twist=None if seed % 2 else 1.0), R, t)
-        assert again == pytest.approx(leg.twist, abs=1e-12)
-    length, twist = EquationKind.LENGTH, EquationKind.TWIST
-    assert leg_and_pose("UU", 0)[0].equations == (length, twist)
-    assert leg_and_pose("RS", 0)[0].equations == (length, EquationKind.BASE_AXIS)
-
-
 # --- parameters ---------------------------------------------------------------------------------
 
 
@@ -180,15 +164,6 @@ def test_names_and_units_say_what_each_number_of_a_leg_is() -> None:
     assert {"leg3.length", "leg1.twist", "leg2.base_axis.2", "leg4.platform_axis.1"} < set(unit)
     assert not {"leg4.offset", "leg2.platform_axis.1"} & set(unit)
     assert sum(name.startswith("leg4.platform.") for name in unit) == 2  # not along its axis
-
-
-def test_a_hexapod_has_the_parameters_of_its_joint_centres() -> None:
-    machine = load_mechanism("hexapod")
-    found, legs = parametrization_of(machine), geometries(machine)
-    assert found.names[::24] == ("leg2.base.x", "leg1.offset")
-    np.testing.assert_array_equal(
-        vector_of(found, legs, legs), to_vector(machine.parameters, machine.frame_legs)
-    )
 
 
 @FAST

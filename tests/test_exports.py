@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
-from command_line import run
 from hexapod_example import Run
 from layouts import Layout, write_machine
 from lxml import etree
@@ -30,7 +29,7 @@ from thinned import thinned
 import legcal
 from legcal import load_mechanism
 from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, UsageError
-from legcal.exports.formats import FORMATS, export, formats_of
+from legcal.exports.formats import export, formats_of
 from legcal.exports.identifiers import identifiers
 from legcal.exports.subject import ExportOptions, Subject, load_subject
 from legcal.geometry.types import Array
@@ -269,19 +268,6 @@ def test_a_urdf_with_its_loops_is_the_same_machine_without_a_yaml(
     assert len(robot.findall("link/inertial/mass")) == len(robot.findall("link"))
 
 
-def test_meshes_are_left_out_of_a_urdf_and_named(tmp_path: Path) -> None:
-    machine = load_mechanism("hexapod")
-    mesh = (
-        b'<link name="base"><visual><geometry><mesh filename="a/b.stl"/></geometry></visual></link>'
-    )
-    content = machine.urdf.content.replace(b'<link name="base"/>', mesh)
-    assert content != machine.urdf.content
-    shown = replace(machine, urdf=replace(machine.urdf, content=content))
-    found = export(Subject(shown, "hexapod"), "urdf", tmp_path / "alone.urdf")
-    assert "a/b.stl" in " ".join(found.notes)
-    assert b"mesh" not in (tmp_path / "alone.urdf").read_bytes()
-
-
 def closed_in_mujoco(model: Any, data: Any, machine: Machine, q: Array) -> RigidTransform:
     """Return the pose at readings by Newton's method on MuJoCo's own constraints."""
     motors = [model.joint(machine.legs[j].prismatic) for j in machine.motors]
@@ -325,25 +311,6 @@ def test_mujoco_loads_the_mjcf_closed_and_has_the_same_forward_kinematics(
         assert sorted(leg.type for leg in back.legs) == sorted(leg.type for leg in machine.legs)
         np.testing.assert_allclose(back.A_base, machine.A_base, atol=1e-9)
         np.testing.assert_allclose(back.q0, machine.q0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "inside",
-    [
-        '<inertial><mass value="1"/><inertia ixx="0" iyy="0" izz="0"/></inertial>',
-        '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1"/></inertial>',
-        '<visual><geometry><cylinder radius="0.01" length="0"/></geometry></visual>',
-    ],
-)
-def test_mujoco_loads_links_with_what_no_body_has(inside: str, tmp_path: Path) -> None:
-    machine = load_mechanism("hexapod")
-    content = machine.urdf.content.replace(
-        b'<link name="platform"/>', f'<link name="platform">{inside}</link>'.encode()
-    )
-    assert content != machine.urdf.content
-    odd = replace(machine, urdf=replace(machine.urdf, content=content))
-    path = written(Subject(odd, "hexapod"), "mjcf", tmp_path / "machine.xml")
-    assert mujoco.MjModel.from_xml_path(str(path)).nu == len(machine.motors)
 
 
 # --- controllers --------------------------------------------------------------------------------
@@ -486,25 +453,9 @@ def test_the_folder_for_ros_has_model_and_covariance(example_run: Run, tmp_path:
     assert sorted(path.name for path in found.paths) == ["calibration.yaml", "hexapod.urdf"]
 
 
-def test_the_nominal_model_of_a_result_is_the_one_it_started_from(example_run: Run) -> None:
-    nominal = load_mechanism(example_run.folder / "models/hexapod.yaml")
-    found = load_subject(example_run.output).nominal
-    assert found is not None
-    np.testing.assert_allclose(found.A_base, nominal.A_base, atol=1e-15)
-    np.testing.assert_allclose(found.B_platform, nominal.B_platform, atol=1e-15)
-    np.testing.assert_allclose(found.q0, nominal.q0, atol=1e-15)
-
-
 # --- names, places, refusals --------------------------------------------------------------------
 
 HOSTILE = ("*/ exit(1); /*", '1 leg\'s "end"', "leg?", "leg!", "if", "für\u202e")
-
-
-def test_names_of_any_kind_are_identifiers_that_differ() -> None:
-    found = identifiers([*HOSTILE, "leg_2", "LEG", "leg"])
-    assert len(set(found)) == len(found)
-    assert all(name.isidentifier() and name.isascii() and len(name) <= 63 for name in found)
-    assert "if" not in found
 
 
 def test_hostile_names_end_no_string_and_no_comment(tmp_path: Path) -> None:
@@ -587,19 +538,3 @@ def test_places_and_options_that_cannot_be_used_are_refused_and_nothing_is_writt
     assert there.read_text().startswith("hexapod")
     export("hexapod", "ros", tmp_path / "ros", force=True)
     assert yaml.safe_load((tmp_path / "ros/calibration.yaml").read_text())["robot"] == "hexapod"
-
-
-def test_the_command_says_what_it_wrote(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        run(monkeypatch, "export", "hexapod", "--to", "csv", "-o", tmp_path / "a.csv", "--json")
-        == 0
-    )
-    found = json.loads(capsys.readouterr().out)
-    assert found["written"] == [str(tmp_path / "a.csv")]
-    assert (
-        run(monkeypatch, "export", "3-rps", "--to", "linuxcnc", "-o", tmp_path / "b", "--json") == 1
-    )
-    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "OutOfClass"
-    assert set(FORMATS) >= {"table", "csv", "json", "urdf", "mjcf", "linuxcnc", "ros", "correction"}

@@ -29,7 +29,6 @@ from fit_sessions import (
     disturbed_start,
     irregular_hexapod,
     machine_session,
-    shifted,
     with_board,
     with_boards,
 )
@@ -54,7 +53,7 @@ from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import Frames, Problem, linearize
+from legcal.estimation.problem import Problem, linearize
 from legcal.estimation.solver import normal_equations
 from legcal.geometry.types import Array
 from legcal.perception import board_adjustment, view_fit
@@ -150,16 +149,6 @@ def test_offsets_are_those_of_the_camera_s_lines_from_the_cylinder(camera: Camer
     assert np.abs(offsets).max() > 1.0
     linear = linearize(problem, state)
     np.testing.assert_allclose(linear.prior_r, 0.5, rtol=1e-9)  # 1 % off, known to 2 %
-
-
-def test_offsets_are_pixels_by_which_an_outline_is_shifted() -> None:
-    session = _session("hexapod")
-    by = np.random.default_rng(0).uniform(-0.5, 0.5, (len(session.outlines), 2))
-    problem = build_fit(session.legs, session.measurements, shifted(session, session.outlines, by))
-    offsets = problem.offsets(problem.begin(session.truth))
-    np.testing.assert_allclose(np.abs(offsets), np.abs(by[problem.outlines.index]), atol=2e-3)
-    exact = build_fit(session.legs, session.measurements, session.outlines)
-    np.testing.assert_allclose(exact.offsets(exact.begin(session.truth)), 0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["hexapod", "nategh-agheli"])
@@ -398,15 +387,6 @@ def test_angles_of_axes_follow_their_turns_as_finite_differences_do(name: str) -
         np.testing.assert_allclose(J[:, j], (ahead - behind) / (2.0 * h), rtol=0.0, atol=2e-9)
 
 
-def test_damping_turns_a_step_towards_the_gradient_and_shortens_it() -> None:
-    problem, state = _problem("3-rps")
-    normal = normal_equations(problem, state, linearize(problem, state), LOSS)
-    sizes = [float(np.linalg.norm(normal.step(damping)[0])) for damping in (0.0, 1e-3, 1.0, 1e3)]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[-1] < 1e-2 * sizes[0]
-    assert all(normal.step(damping)[1] > 0.0 for damping in (0.0, 1e-3, 1.0, 1e3))
-
-
 @pytest.mark.parametrize("name", ["3-rps", "tricept", "3-rpr"])
 def test_constraints_hold_at_every_state_that_the_solver_looks_at(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -438,29 +418,6 @@ def _heights(problem: FitProblem, begin: State) -> Array:
     return heights
 
 
-def test_poses_go_back_to_their_constraints_the_shortest_way() -> None:
-    session = _session("3-rps")
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.begin(session.truth)
-    x = np.zeros(problem.size)
-    x[problem.n_kept :] = 1e-6 * np.random.default_rng(0).normal(size=6 * problem.n_elements)
-    back = problem.projected(problem.moved(state, x))
-    done = x[problem.n_kept :].reshape(-1, 6)
-    there, here = back.platform_pose, state.platform_pose
-    left = np.concatenate([_turn(there.frames, here.frames), there.t - here.t], axis=1) - done
-    scale = np.repeat([1.0, state.mean_length], 3)
-    # What was taken back is normal to what the constraints leave, a leg's length being as far as
-    # one radian.
-    N = allowed(problem, state)[problem.n_kept :]
-    of_poses = N[:, np.abs(N).max(axis=0) > 0.0]
-    C = by_differences(problem, state, lambda s: violations(problem, s), np.eye(len(x)))
-    by_poses = C[:, problem.n_kept :] * np.tile(scale, problem.n_elements)
-    free = np.linalg.svd(by_poses)[2][C.shape[0] :]
-    assert np.abs(left).max() > 1e-7
-    assert np.abs(free @ (left / scale).ravel()).max() < 1e-10
-    assert of_poses.shape[0] == free.shape[1]
-
-
 def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:
     session = _session("3-rps")
     problem = build_fit(session.legs, session.measurements, session.outlines)
@@ -468,11 +425,3 @@ def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> No
     far[problem.n_kinematic : problem.n_kept] = 0.0
     with pytest.raises(DidNotConverge, match=r"a pose did not converge \(last step \d"):
         problem.projected(problem.moved(problem.begin(session.start), far))
-
-
-def _turn(there: Frames, here: Frames) -> Array:
-    """Return the small rotation vectors between poses."""
-    R = there.R @ np.swapaxes(here.R, 1, 2)
-    return 0.5 * np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
-    )

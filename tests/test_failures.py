@@ -1,14 +1,10 @@
 """Failures from outside: signals, lost processes, full disks, values and names beyond reason."""
 
 import errno
-import io
-import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,21 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run as run_command
 from dataset_folder import Folder, folder
 from pool_work import row_zero_after_row_five
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import load_dataset, load_mechanism
-from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
-from legcal.files.folder import check_destination, result_folder, write_atomically
-from legcal.files.schema import closest, parse_yaml
+from legcal import load_dataset
+from legcal.errors import DatasetError, OutOfResources
+from legcal.files.folder import result_folder, write_atomically
+from legcal.files.schema import parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import Run, worker_pool
 
 __all__ = ["folder"]
 
-LONG = "a" * 400
 
 POOL = """
 import multiprocessing, os, time
@@ -66,18 +60,6 @@ def test_the_first_signal_interrupts_and_the_second_ends_the_process(name: str) 
     assert ended
     assert signal.getsignal(number) is before
     raise_if_stopped()
-
-
-@pytest.mark.usefixtures("answered_signals")
-def test_an_error_that_a_library_made_of_a_signal_is_an_interrupt() -> None:
-    @stopped_by_signals()
-    def work() -> None:
-        with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        raise ImportError("numpy")
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
 
 
 @pytest.mark.usefixtures("answered_signals")
@@ -137,21 +119,6 @@ def _runs(pid: int) -> bool:
 def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
     with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
         list(run(os._exit, [1, 1]))
-
-
-@pytest.mark.system
-def test_a_pool_that_is_left_in_the_middle_of_its_work_ends_at_once() -> None:
-    with suppress(KeyboardInterrupt), worker_pool(2) as run:
-        results = iter(run(time.sleep, 40 * [0.0] + 200 * [1.0]))
-        next(results)
-        del results  # as when the stack of who reads them is gone
-        begin = time.perf_counter()
-        for process in multiprocessing.active_children():
-            process.kill()  # by the signal that has stopped this one as well
-        time.sleep(0.5)
-        raise KeyboardInterrupt
-    assert time.perf_counter() - begin < 5.0
-    assert not [t for t in threading.enumerate() if "Executor" in type(t).__name__]
 
 
 @pytest.fixture(scope="module")
@@ -246,13 +213,6 @@ def test_output_that_cannot_be_printed_is_said_on_stderr(words: str, stdout: str
     assert done.stderr.count("\n") == 1
 
 
-def test_a_failure_is_json_where_stdout_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    out = io.StringIO()
-    monkeypatch.setattr(sys, "stdout", out)
-    assert run_command(monkeypatch, "inspect", LONG, "--json") == 2
-    assert json.loads(out.getvalue())["error"]["kind"] == "ModelError"
-
-
 # Values that no other test is about; more refusals are in refusal_table.py.
 
 
@@ -263,34 +223,7 @@ def test_a_view_whose_name_a_table_cannot_hold_is_refused(folder: Folder, name: 
         load_dataset(folder.write())
 
 
-def test_names_that_are_too_long_are_those_of_no_file(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load_mechanism)
-    for key in ("measurements", "mechanism"):
-        folder.entry[key] = LONG
-        with pytest.raises((DatasetError, ModelError), match="found no such file"):
-            load_dataset(folder.write())
-    with pytest.raises(DatasetError, match="found no"):
-        load_dataset(LONG)
-    with pytest.raises(UsageError, match="File name too long"):
-        check_destination(Path(LONG))
-
-
 @pytest.mark.parametrize("value", ["!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"])
 def test_a_value_that_is_not_of_its_tag_is_found_by_its_line(value: str) -> None:
     with pytest.raises(DatasetError, match=r"line 2, column 4: .* which is no \w+, needed YAML"):
         parse_yaml(f"a: 1\nb: {value}\n".encode(), Path("x.yaml"), "file")
-
-
-def test_numbers_to_the_base_sixty_are_texts() -> None:
-    found = parse_yaml(b"a: 6:25\nb: [1:30.5, 7]\nc: '1:2'\n", Path("x.yaml"), "file")
-    assert found == {"a": "6:25", "b": ["1:30.5", 7], "c": "1:2"}
-
-
-def test_a_hint_at_known_names_is_short() -> None:
-    names = [f"name{k}" for k in range(30)]
-    assert closest("name7", names) == "did you mean 'name7'?"
-    assert closest("zzz", names) == f"known are: {', '.join(names[:10])} and 20 more"
-    assert closest("zzz", names[:10]) == f"known are: {', '.join(names[:10])}"
-    assert closest("zzz", []) == "known are: none"

@@ -16,7 +16,7 @@ import pytest
 from command_line import run
 
 from legcal.errors import UsageError
-from legcal.files.folder import check_destination, output_path, result_folder, write_atomically
+from legcal.files.folder import result_folder, write_atomically
 from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 
 RESULT = '{"legcal_result": 1}'
@@ -112,17 +112,6 @@ def test_a_folder_on_another_file_system_is_filled(
     assert contents(out) == REPLACED
 
 
-@pytest.mark.parametrize("name", [".", "out"])
-def test_empty_and_current_folders_are_filled(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    here = tmp_path / "here"
-    (here / "out").mkdir(parents=True)
-    monkeypatch.chdir(here / "out" if name == "." else here)
-    write_result(Path(name))
-    assert contents(here / "out")["calibrated.urdf"] == "new"
-
-
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, ValueError])
 def test_an_interrupted_block_leaves_everything_as_it_was(
     out: Path, stop: type[BaseException]
@@ -188,11 +177,6 @@ def test_a_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(
     assert contents(out) == REPLACED
 
 
-def test_what_a_killed_run_left_behind_does_not_make_a_folder_foreign(tmp_path: Path) -> None:
-    (tmp_path / ".out.x.legcal-part").mkdir()
-    check_destination(tmp_path)
-
-
 REFUSED: dict[str, tuple[dict[str, str | None], str, str]] = {  # files, destination, named
     "a file": ({"out": "mine"}, "out", "out: .*found a file"),
     "below a file": ({"file": "mine"}, "file/out", "file is a file"),
@@ -237,12 +221,6 @@ def test_a_pipe_in_the_way_of_a_result_is_refused_and_stays(tmp_path: Path) -> N
     with pytest.raises(UsageError, match=r"calibrated\.urdf, which is a pipe or a device"):
         write_result(tmp_path / "out")
     assert pipe.is_fifo()
-
-
-def test_a_folder_without_a_name_is_refused() -> None:
-    with pytest.raises(UsageError, match="an empty text, needed the path of a folder"):
-        output_path("")
-    assert output_path(".") == Path()
 
 
 @pytest.mark.parametrize(

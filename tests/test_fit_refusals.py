@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_sessions import (
-    FRAME_LEGS,
     PINHOLE,
     TRUTH,
     HexapodSession,
@@ -22,8 +21,6 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import (
     Start,
     cameras_from_hints,
-    fitted_legs,
-    platform_poses,
     start_from,
 )
 from legcal.data.axes import LegAxes
@@ -32,7 +29,6 @@ from legcal.data.outlines import Outlines, no_outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.leg import point_like_legs
-from legcal.machine.loader import load_mechanism
 from legcal.simulation.observe import moved_outlines
 
 
@@ -225,24 +221,3 @@ def test_platform_poses_have_the_lengths_of_the_readings(session: HexapodSession
     )
     for found, true in zip(start.T_Rb_Re, session.T_Rb_Re, strict=True):
         assert np.linalg.norm((found.inv() * true).translation) < 1e-11
-
-
-def test_lengths_that_no_pose_has_give_the_nearest_pose(session: HexapodSession) -> None:
-    lengthening = session.measurements.q.copy()
-    lengthening[0, 2] += 0.4
-    poses = platform_poses(point_like_legs(TRUTH), lengthening, session.T_Rb_Re, FRAME_LEGS)
-    assert np.all(np.isfinite(poses[0].as_matrix()))
-    np.testing.assert_allclose(poses[1].as_matrix(), session.T_Rb_Re[1].as_matrix(), atol=1e-9)
-
-
-def test_legs_of_a_mechanism_bring_names_signs_axes_and_radii() -> None:
-    machine = load_mechanism("tricept")
-    legs = fitted_legs(machine)
-    assert legs.names == machine.leg_names
-    assert legs.sign.tolist() == machine.sign.tolist()
-    assert legs.frame_legs == tuple(machine.frame_legs)
-    assert legs.spatial
-    assert legs.radii[3, "centre_rod"] == machine.legs[3].radius_of_part["centre_rod"]
-    assert "centre.base_axis.1" in legs.parametrization.names
-    assert "centre.twist" in legs.parametrization.names
-    assert not fitted_legs(load_mechanism("3-rpr")).spatial

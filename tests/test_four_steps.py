@@ -10,7 +10,6 @@ import pytest
 from actuated_sessions import MACHINES as ACTUATED
 from actuated_sessions import session as actuated
 from hexapod_sessions import extreme_poses, nominal_of
-from scipy.spatial.transform import RigidTransform, Rotation
 from staged_sessions import Observed, errors, exact_session, noisy_session, planned, shipped, staged
 from thinned import thinned
 
@@ -19,7 +18,6 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs
 from legcal.machine.parameters import from_vector, to_vector
-from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_base_steps, run_platform_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
@@ -74,18 +72,6 @@ def test_exact_axes_give_joints_on_carriages_and_arms(name: str, criteria: Crite
         assert np.abs(leg.A - true.A).max() < 2e-5
         assert np.abs(leg.actuator.numbers(true.actuator)[:4]).max() < 5e-4  # even in some of them
         assert np.allclose(leg.actuator.axis, shared[leg.actuator.joint].axis, atol=1e-12)
-
-
-@pytest.mark.parametrize("criteria", CRITERIA)
-def test_twists_are_found_on_request(criteria: Criteria) -> None:
-    observed = exact("3-upu-tilted")
-    start = tuple(
-        replace(leg, twist=float(leg.twist or 0.0) + 0.01) for leg in observed.nominal.legs
-    )
-    observed = replace(observed, nominal=replace(observed.nominal, legs=start))
-    assert [leg.twist for leg in observed.run(criteria).legs] == [leg.twist for leg in start]
-    freed = observed.run(criteria, free_twists=True)
-    assert np.abs(observed.errors(freed.legs, twists=True)).max() < 1e-6
 
 
 # Criteria as printed
@@ -195,16 +181,6 @@ def test_covariances_of_joints_in_cameras_are_true(name: str) -> None:
     assert 0.5 < np.mean(squares) < 1.7
 
 
-def test_directions_adjusted_to_their_joints_are_better_than_those_of_single_images() -> None:
-    observed = shipped("3-rps", n_poses=10, noise=0.3)
-    joints = run_base_steps(observed.nominal, observed.axes, observed.measurements).in_cameras
-    true = shipped("3-rps", n_poses=10).axes
-    before, after = (
-        np.linalg.norm(np.cross(axes.u, true.u), axis=1) for axes in (observed.axes, joints.axes)
-    )
-    assert np.sqrt(np.mean(after**2)) < 0.6 * np.sqrt(np.mean(before**2))
-
-
 def test_wrong_outlines_hardly_matter() -> None:
     session, nominal = noisy_session(0, OutlineNoise())
     offsets = np.zeros((len(session.outlines), 2))
@@ -283,23 +259,6 @@ def test_scaling_all_lengths_scales_the_result() -> None:
 # Where cameras stand
 
 
-def test_axes_across_the_line_of_two_joints_place_a_camera_unless_two_places_fit_alike() -> None:
-    A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    across = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1]])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    T = RigidTransform.from_components([0.2, -0.3, 1.0], Rotation.from_rotvec([0.4, 0.2, -0.3]))
-    seen = T.apply(A), T.rotation.apply(across) * [[1.0], [-1.0]]
-    (found,), fixed = candidate_camera_poses(A, across, *seen)
-    assert fixed
-    assert np.abs((found * T).as_matrix() - np.eye(4)).max() < 0.01  # of the turns that are tried
-    assert signs_seen(across, seen[1], found).tolist() == [1.0, -1.0]
-    square = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
-    assert len(candidate_camera_poses(A, square, A, square)[0]) == 2  # half a turn about the line
-    along = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    assert candidate_camera_poses(A, along, A, along)[1] is False
-    assert candidate_camera_poses(A[:1], along[:1], A[:1], along[:1]) == ([], False)
-
-
 # Which legs and images take part, and refusals
 
 
@@ -362,16 +321,6 @@ def test_what_images_do_not_show_is_refused_by_leg(
     with pytest.raises(NotIdentifiable) as refusal:
         replace(observed, axes=shown(observed)).run(criteria)
     assert words in str(refusal.value)
-
-
-def test_a_view_without_a_leg_is_named_and_the_others_locate_it() -> None:
-    observed = exact("hexapod")
-    view = observed.measurements.view[observed.axes.row]
-    here = np.flatnonzero((view == 0) & (observed.axes.leg == 2))
-    axes = observed.axes.choose(np.setdiff1d(np.arange(len(view)), here[1:]))
-    found = replace(observed, axes=axes).run()
-    assert "leg3 in view c1 was left out: it was found in one image" in found.diagnostics[0]
-    assert np.abs(observed.errors(found.legs)).max() < 1e-5
 
 
 @pytest.mark.parametrize("criteria", CRITERIA)

@@ -1,6 +1,5 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal.calibration.joint_fit import free_poses
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.scale import naming_missing_lengths
@@ -53,7 +51,8 @@ LAYOUTS = {
     "hung from the platform": Layout((LegLayout(hung="platform", sphere=False),)),
     "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True),)),
 }
-Poses = tuple[RigidTransform, ...]
+
+
 CAMERA = Camera(np.array([[1000.0, 0.0, 639.5], [0.0, 1000.0, 479.5], [0.0, 0.0, 1.0]]), 1280, 960)
 
 
@@ -264,37 +263,6 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_
     assert min(off_at_home) > 40.0
 
 
-def away_from(poses: Poses, shift: float, turn: float) -> Poses:
-    """Poses moved at random, by at most so much along and about each axis [m], [rad]."""
-    rng = np.random.default_rng(1)
-    return tuple(
-        RigidTransform.from_components(
-            T.translation + rng.uniform(-shift, shift, 3),
-            Rotation.from_rotvec(rng.uniform(-turn, turn, 3)) * T.rotation,
-        )
-        for T in poses
-    )
-
-
-def distances(poses: Poses, others: Poses) -> list[float]:
-    """How far apart poses are [m]."""
-    both = zip(poses, others, strict=True)
-    return [float(np.linalg.norm(a.translation - b.translation)) for a, b in both]
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("seed", [0, 1])
-def test_poses_between_which_few_lines_leave_a_choice_are_found_by_the_fit(
-    seed: int, tmp_path: Path
-) -> None:
-    """Four legs and three readings an image allow several poses."""
-    path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
-    session = machine_session(str(path), n_views=2, seed=seed)
-    start = replace(session.start, T_Rb_Re=away_from(session.start.T_Rb_Re, 0.25, 0.6))
-    found = refine(session.legs, session.measurements, session.outlines, start)
-    assert max(distances(found.T_Rb_Re, session.truth.T_Rb_Re)) < 1e-6
-
-
 def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     """One leg and three readings let a platform slide, which no fit comes to the end of."""
     path = write_machine(tmp_path, drawn("3-SPS + passive UPS"), Layout())
@@ -317,20 +285,6 @@ def five_carriages(folder: Path) -> Machine:
     del table["actuators"]["rail6"], table["base_joints"][5], table["platform_joints"][5]
     (folder / "five.yaml").write_text(yaml.safe_dump(table))
     return create_model(read_table(folder / "five.yaml"), folder).machine
-
-
-def test_poses_that_carriages_leave_open_are_looked_for_with_their_readings(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(free_poses, "_N_DRAWS", 1)
-    path = five_carriages(tmp_path).yaml_path
-    session = machine_session(path, length=0.0, angle=0.0, n_views=1, n_poses=3)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    poses = away_from(session.truth.T_Rb_Re, 0.02, 0.3)
-    begin = problem.projected(problem.begin(replace(session.truth, T_Rb_Re=poses)))
-    found = free_poses.with_better_poses(problem, begin).platform_pose
-    assert max(distances(found.motions, session.truth.T_Rb_Re)) < 1e-4
-    np.testing.assert_allclose(found.q, session.measurements.q, atol=1e-4)
 
 
 @pytest.mark.system

@@ -1,37 +1,29 @@
 """Home: projected onto what rods and axes allow, found where none is given, refused if wrong."""
 
 import re
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from layouts import Layout, LegLayout, MachineSpec, write_machine
+from layouts import Layout, LegLayout, write_machine
 from machines import (
-    HOME,
     MACHINES,
     SHIPPED,
     displaced,
-    exechon,
-    exechon_and_ups,
     of_types,
     write_home,
 )
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal import identifiability
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
 from legcal.machine.equations import pose_equations
-from legcal.machine.home import legs_outside
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import free_motions, leg_scale
-from legcal.machine.model import Machine, platform_pose, readings_at, slider_columns
+from legcal.machine.model import Machine, platform_pose, readings_at
 
 machine_of = cache(load_mechanism)
 CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))
@@ -63,18 +55,6 @@ def test_a_slightly_wrong_home_is_projected_onto_all_constraints(name: str, tmp_
     assert moved < 1e-15 if free else 0.0 < moved < 5e-3
 
 
-def test_the_projection_moves_the_platform_only_across_the_constraint(tmp_path: Path) -> None:
-    nominal = machine_of("hexapod-rod")
-    start = displaced(nominal.home, [0.0, 0.0, 0.0, 0.0, 0.0, 1e-4])
-    found = load_mechanism(write_home(tmp_path, "hexapod-rod", start)).home
-    scale = leg_scale(nominal, start)  # rotations count as displacements of a leg's end
-    turn = (found.rotation * start.rotation.inv()).as_rotvec()
-    way = np.concatenate([turn * scale, found.translation - start.translation])
-    normal = constraints(nominal, found)[1][0] / [scale, scale, scale, 1.0, 1.0, 1.0]
-    cosine = abs(way @ normal) / np.linalg.norm(way) / np.linalg.norm(normal)
-    assert cosine == pytest.approx(1.0, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("description", "carried"),
     thinned(
@@ -101,14 +81,6 @@ def test_a_rounded_home_closes_in_every_class(
     check_closed(machine)
     T = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
     np.testing.assert_allclose(T.as_matrix(), machine.home.as_matrix(), atol=1e-11)
-
-
-@pytest.mark.parametrize("types", [["SU"] * 6, ["US"] * 3 + ["UR"]])
-def test_small_machines_close_from_joint_angles_of_zero(types: list[str], tmp_path: Path) -> None:
-    large = of_types(types)
-    legs = tuple(replace(leg, A=0.05 * leg.A, B_home=0.05 * leg.B_home) for leg in large.legs)
-    home = RigidTransform.from_components(0.05 * HOME.translation, HOME.rotation)
-    check_closed(load_mechanism(write_machine(tmp_path, MachineSpec(legs, home), CARRIED)))
 
 
 # --- without a home -----------------------------------------------------------------------------
@@ -140,56 +112,6 @@ def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) 
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     q = readings_at(machine, machine.home)
     np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "drawn", [of_types(["US"] * 6 + ["SS"]), of_types(["RS"] * 3 + ["SS"]), exechon_and_ups()]
-)
-def test_more_motors_than_freedoms_are_nearest_to_mid_travel(
-    drawn: MachineSpec, tmp_path: Path
-) -> None:
-    machine = load_mechanism(write_machine(tmp_path, drawn, Layout(home=False)))
-    check_closed(machine)
-    assert any("as near mid-travel as they are together" in note for note in machine.diagnostics)
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    off = readings_at(machine, machine.home) - 0.5 * (lower + upper)
-    assert np.abs(off).max() > 1e-3
-    assert np.all(np.abs(off) < 0.5 * (upper - lower))
-    # no motion that the closures allow makes the sum of squares less
-    _, sliders = slider_columns(machine, machine.motors)
-    slope = off @ free_motions(machine, machine.home_configuration)[sliders]
-    np.testing.assert_allclose(slope, 0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize("layout", [Layout(), CARRIED])
-def test_where_a_file_without_a_block_draws_open_loops_travel_decides(
-    layout: Layout, tmp_path: Path
-) -> None:
-    path = write_machine(tmp_path, exechon(), layout)
-    document = yaml.safe_load(path.read_text())
-    document.pop("legcal")
-    path.write_text(yaml.safe_dump(document))
-    machine = load_mechanism(path)
-    check_closed(machine)
-    assert any("the file draws no closed pose" in note for note in machine.diagnostics)
-    middle = [np.mean(leg.travel) for leg in machine.legs]
-    np.testing.assert_allclose(readings_at(machine, machine.home), middle, atol=1e-9)
-
-
-def test_loops_that_few_digits_open_are_drawn_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("layouts.PASSED", 0.0)  # drawn at home, and not at mid-travel
-    path = write_machine(tmp_path, of_types(["US"] * 6), CARRIED)
-    urdf = path.with_suffix(".urdf")
-    urdf.write_text(re.sub(r"-?\d\.\d{6,}", lambda x: f"{float(x[0]):.5f}", urdf.read_text()))
-    document = yaml.safe_load(path.read_text())
-    document.pop("legcal")
-    path.write_text(yaml.safe_dump(document))
-    machine = load_mechanism(path)
-    check_closed(machine)
-    assert np.abs(readings_at(machine, machine.home)).max() < 1e-3
-    assert not any("draws no closed pose" in note for note in machine.diagnostics)
 
 
 def test_that_there_is_no_home_at_all_is_said(
@@ -241,15 +163,3 @@ def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
     ) as caught:
         load_mechanism(path)
     assert len(caught.value.problems) == 1
-
-
-@pytest.mark.parametrize(("z", "n_legs"), [(0.55, 6), (0.3, 3)])
-def test_a_home_a_little_out_of_the_travel_is_noted(z: float, n_legs: int, tmp_path: Path) -> None:
-    path = write_home(tmp_path, "hexapod", RigidTransform.from_translation([0.0, 0.0, z]))
-    machine = load_mechanism(path)
-    assert len(legs_outside(machine)) == n_legs
-    assert sum("outside its travel" in note for note in machine.diagnostics) == n_legs
-    if z > 0.5:  # planned poses go there
-        notes = identifiability(machine, [machine.leg_names], 3).notes
-        assert any("outside their travel by more than 5 %" in note for note in notes)
-    assert legs_outside(machine_of("hexapod")) == {}

@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -17,7 +16,7 @@ from command_line import run
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import SHIPPED_URDF, SHIPPED_YAML, regular
+from machines import SHIPPED_YAML
 from rich.console import Console
 from thinned import thinned
 
@@ -27,21 +26,17 @@ from legcal.calibration.identify.identifiability import (
     identifiability_of_dataset,
 )
 from legcal.calibration.identify.predicted_observations import (
-    legs_in_words,
     recorded_observations,
-    views_in_words,
 )
-from legcal.calibration.identify.report import Identifiability, WeakDirection
+from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.machine.directions import describe_direction, leg_labels, list_in_words
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import parametrization_of
-from legcal.report.identify import _hidden, _two_digits, identify_table
+from legcal.report.identify import identify_table
 from legcal.vision.board import Board, FixedBoard
 
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
@@ -123,28 +118,6 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
 
 
-def test_smallest_views_with_a_board_suffice_with_it() -> None:
-    found = legcal.identifiability(loaded("tricept"), board=True)
-    assert found.recommendation
-    for choice in found.recommendation:
-        again = legcal.identifiability(loaded("tricept"), choice.views, board=True)
-        assert again.conditions_hold
-        assert again.identifiable
-
-
-def test_the_report_in_words_says_what_a_board_is_needed_for() -> None:
-    for choices, *texts in (
-        (("paper", False), "A calibration board is not needed"),
-        (("halves", False), "is needed for base joints and axes (12)",
-         "raises the rank from 30 to 30 of 30"),
-        (("halves", True), "fails, not needed with the board"),
-        (("weak joint", True), "a calibration board on the base in every view",
-         "Identifiable: the joint fit determines 30 of 30 parameters."),
-    ):  # fmt: skip
-        shown = said(report(choices[0], board=choices[1]))
-        assert [text for text in texts if text not in shown] == []
-
-
 # The document and the command
 
 
@@ -193,26 +166,6 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
     assert ("smallest sets of views" in out) == (not views)
-
-
-@pytest.mark.parametrize(
-    ("words", "kind", "named"),
-    [
-        ((HEXAPOD, "--board"), "UsageError", ("--board",)),
-        ((HEXAPOD, "--hand-held"), "UsageError", ("--hand-held",)),
-    ],
-)
-def test_refusals_are_one_sentence_in_one_document(
-    words: tuple[str | Path, ...],
-    kind: str,
-    named: tuple[str, ...],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(monkeypatch, "identify", *words, "--json") == 2
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert error["kind"] == kind
-    assert [word for word in named if word not in error["message"]] == []
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:
@@ -302,30 +255,6 @@ def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) ->
     assert any("a tenth of a leg" in note for note in report.notes) == noted
 
 
-def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
-    entry = yaml.safe_load(SHIPPED_YAML.read_text())
-    entry["name_mot"] = entry["name_mot"][:-1]
-    entry["legcal"]["urdf"] = "hexapod.urdf"
-    (tmp_path / "hexapod.urdf").write_bytes(SHIPPED_URDF.read_bytes())
-    (tmp_path / "hexapod.yaml").write_text(yaml.safe_dump(entry))
-    machine = legcal.load_mechanism(tmp_path / "hexapod.yaml")  # of five motors
-    found = legcal.identifiability(machine, [machine.leg_names] * 2)
-    assert (found.full.rank, found.full.of, found.n_ac) == (29, 29, 5)
-    assert found.platform_sigma is None
-    assert "5 motors do not determine the pose" in found.notes[0]
-    few = legcal.identifiability(machine, [["leg1", "leg2"]])
-    assert few.full.weak[0].dX_m is None
-    assert not few.identifiable
-    machine = create_model(regular("6-SPS"), tmp_path / "regular").machine
-    text = machine.urdf_path.read_text()
-    text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
-    machine.urdf_path.write_text(text)
-    machine = legcal.load_mechanism(machine.yaml_path)
-    *_, hidden, singular = legcal.identifiability(machine, [machine.leg_names]).notes
-    assert hidden.startswith("The model has no <visual> cylinder along leg 1:")
-    assert singular.startswith("The mechanism is singular at home: the platform moves")
-
-
 @settings(deadline=None, max_examples=6)
 @given(data=st.data())
 def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
@@ -340,49 +269,3 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
 
 
 # Words
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ("leg4.platform.z leg2.platform.z", "z of platform joints 2 and 4 together"),
-        ("leg3.offset", "offset of leg 3"),
-        ("leg1.base.y leg1.base.x", "x and y of base joint 1"),
-        ("leg2.length leg1.base.x", "length of leg 2 and x of base joint 1 together"),
-        ("leg1.base_axis.2 leg1.platform_axis.2",
-         "angle 2 of base axis of leg 1 and angle 2 of platform axis of leg 1 together"),
-        ("leg1.base_axis.1 leg1.base_axis.2", "angles 1 and 2 of base axis of leg 1"),
-        ("leg2.twist leg3.twist", "twists of legs 2 and 3 together"),
-        ("leg2.radius.rod leg2.radius.tube", "radius of leg 2"),
-        ("leg3.radius.rod c1.fx", "radius of leg 3 and fx of camera c1 together"),
-        ("c1.fy c2.fx c1.fx", "fx and fy of camera c1 and fx of camera c2 together"),
-        ("leg1.left.k1", "k1 of camera leg1.left"),
-        ("platform_board.scale leg1.offset",
-         "size of the board on the platform and offset of leg 1 together"),
-        ("leg1.offset leg1.base.x leg2.base.y leg3.base.z leg4.platform.x",
-         "offset of leg 1, x of base joint 1, y of base joint 2 and 2 more such changes together"),
-    ],
-)  # fmt: skip
-def test_directions_are_named_as_people_say_them(parameters: str, words: str) -> None:
-    assert describe_direction(tuple(parameters.split()), LEGS[:4]) == words
-
-
-def test_legs_views_and_numbers_in_words() -> None:
-    assert leg_labels(("leg1", "Leg_2")) == {"leg1": "1", "Leg_2": "2"}
-    assert leg_labels(("leg1", "centre")) == {"leg1": "1", "centre": "centre"}
-    assert leg_labels(("leg1", "1")) == {"leg1": "leg1", "1": "1"}
-    assert legs_in_words((0, 1), ("leg3", "centre")) == "legs 3 and centre"
-    assert legs_in_words((0, 2, 3), LEGS) == "legs 1, 3 and 4"
-    assert legs_in_words((1,), LEGS) == "leg 2"
-    assert list_in_words([]) == ""
-    names = ("a", "a.b", "centre")  # dots, and each other
-    assert describe_direction(("a.b.base.x",), names) == "x of base joint a.b"
-    assert describe_direction(("a.base.x",), names) == "x of base joint a"
-    assert views_in_words(["1,2", "1,2"]) == "1,2 from two places"
-    assert views_in_words(["1,2", "2,3", "1,2", "1,2"]) == "1,2 from three places; 2,3"
-    for dX_m, dE_rad, shown in (
-        (0.0123, 0.01, ("12.30", "0.573")),
-        (14.9, 50.0, ("> 1000", "> 180")),
-    ):
-        assert _hidden(WeakDirection("x", ("a",), (1.0,), dX_m, dE_rad, False)) == shown
-    assert [_two_digits(x) for x in (0.0123, 12.3, 114.0)] == ["0.012", "12", "110"]

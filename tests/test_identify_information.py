@@ -1,17 +1,15 @@
 """The predicted observations of ``legcal identify``, against second routes."""
 
 from dataclasses import replace
-from functools import cache
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types, with_round_arms
+from machines import MACHINES, with_round_arms
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 from thinned import thinned
@@ -22,7 +20,6 @@ from legcal.calibration.identify.information import (
     expected_intrinsics,
     image_rows,
     intrinsics_changes,
-    session_problem,
     whitened_leg_equations,
 )
 from legcal.calibration.identify.predicted_observations import (
@@ -32,17 +29,12 @@ from legcal.calibration.identify.predicted_observations import (
     at_platform_joints,
     looking_at,
     planned_observations,
-    recorded_observations,
 )
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.data.dataset import load_dataset
 from legcal.errors import DidNotConverge
-from legcal.estimation.problem import linearize
-from legcal.estimation.solver import information
-from legcal.estimation.square_root import compress, eliminate, information_rows, marginal_rows
-from legcal.estimation.uncertainty import marginal
+from legcal.estimation.square_root import compress, eliminate
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.equations import leg_equations as linearize_leg
@@ -276,21 +268,6 @@ def test_views_with_a_board_have_one_camera_in_common(seed: int, shown: list[boo
     assert np.linalg.eigvalsh(gain)[0] > -1e-6 * size
 
 
-def test_the_square_root_is_that_of_the_information_of_the_problem() -> None:
-    """Where nothing is exact, so that squares do not lose it in rounding."""
-    session = planned_observations(legcal.load_mechanism("hexapod"), [range(6)] * 2, 8)
-    analysis = Analysis(replace(session, sigma_q=1e-4))
-    problem, state = session_problem(
-        analysis.predicted, analysis.images, analysis.equations, analysis.prior
-    )
-    parameters = problem.where("parameters")
-    root = marginal_rows(information_rows(problem, state), parameters)
-    normal = information(problem, state, linearize(problem, state))
-    expected = marginal(normal.reduced(), parameters)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(root.T @ root / scale, expected / scale, atol=1e-6)
-
-
 def edges(K: Array, X: Array, u: Array) -> Array:
     """Return places (2,) of both outlines across a thin leg at the pixel where X is seen [px]."""
     h = outlines_of_axis(u[None], X[None], np.array([1e-3]))[0]
@@ -344,41 +321,12 @@ def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None
     np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
 
 
-@cache
-def example() -> Analysis:
-    return Analysis(recorded_observations(load_dataset(HEXAPOD, check_images=False)))
-
-
 def intrinsics_sigma(owners: list[str], analysis: Analysis) -> Array:
     a, R = analysis, looking_at(analysis.predicted)
     found = expected_intrinsics(a.predicted, a.images, a.equations, a.prior, R, owners)
     assert [camera.camera for camera in found] == list(dict.fromkeys(owners))
     sigma = [[camera.sigma[name] for name in INTRINSICS] for camera in found]
     return np.array(sigma, dtype=np.float64)
-
-
-def test_intrinsics_are_known_less_by_fewer_images_and_where_radii_are_larger() -> None:
-    """A radius is known relatively; cameras of their own share none of what they show."""
-    one, three = (intrinsics_sigma(o, example()) for o in (["c"] * 3, ["a", "b", "c"]))
-    assert np.all((one > 0.1) & (one < 3.0))
-    assert not np.any(three <= one)
-    scaled = replace(example().predicted, radius=2.0 * example().predicted.radius)
-    wide, narrow = Analysis(scaled), example().images[:, :, 1::2]
-    depth = wide.images[:, :, 1::2][narrow != 0.0] / narrow[narrow != 0.0]
-    np.testing.assert_allclose(depth, 2.0)
-    np.testing.assert_array_less(intrinsics_sigma(["c"] * 3, wide), one)
-
-
-def test_a_dataset_gives_its_own_readings_cameras_and_legs() -> None:
-    dataset = load_dataset(HEXAPOD, check_images=False)
-    session, m = example().predicted, dataset.measurements
-    assert (session.n_views, len(session.view), len(session.t)) == (3, m.n_rows, m.n_poses)
-    q = (session.length - dataset.machine.q0) * dataset.machine.sign
-    np.testing.assert_allclose(q, m.q_of_poses, atol=1e-5)
-    to_Rb = dataset.machine.T_base_Rb.inv()
-    for camera, view in zip(session.camera, m.views, strict=True):
-        if view.T_base_camera is not None:
-            np.testing.assert_allclose(camera, (to_Rb * view.T_base_camera).translation)
 
 
 @pytest.mark.parametrize(
@@ -415,23 +363,6 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
 
 
-def test_planned_cameras_stand_outside_and_no_two_in_one_place() -> None:
-    machine = legcal.load_mechanism("hexapod")
-    views = [(0, 1, 2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5), (3,)]
-    session = planned_observations(machine, views, 3)
-    apart = np.linalg.norm(session.camera[:, None] - session.camera, axis=2)
-    assert apart[~np.eye(5, dtype=bool)].min() > 0.01
-    points = np.concatenate([session.A, (session.arm + session.t[:, None]).reshape(-1, 3)])
-    reach = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
-    away = session.camera - points.mean(axis=0)
-    assert np.linalg.norm(away, axis=1).min() > 2.0 * reach
-    assert away[4] @ (session.A[3] - session.A.mean(axis=0)) > 0.0  # that of leg 4 on its side
-    planar = planned_observations(legcal.load_mechanism("3-rpr"), [range(3)] * 3, 3)
-    away = planar.camera - planar.A.mean(axis=0)  # from along the normal, tilted
-    slant = away[:, 2] / np.linalg.norm(away, axis=1)
-    assert np.all((slant > 0.7) & (slant < 0.99))
-
-
 def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -446,11 +377,3 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
     )
     assert len(planned_observations(machine, [range(6)], 60).t) == 60
-
-
-def test_more_motors_than_freedoms_are_followed(tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = tmp_path_factory.mktemp("seven")
-    machine = legcal.load_mechanism(write_machine(folder, of_types(["US"] * 7), Layout()))
-    assert (machine.mobility, len(machine.motors)) == (6, 7)
-    found = legcal.identifiability(machine, [machine.leg_names] * 2)
-    assert (found.full.rank, found.full.of) == (37, 37)

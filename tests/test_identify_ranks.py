@@ -7,11 +7,9 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import outline_sessions
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import made
 from random_legs import closed_leg
 from staged_sessions import exact_session
 from thinned import thinned
@@ -172,17 +170,6 @@ def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> No
         assert full.rank + len(full.weak) == full.of
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_what_is_determined_and_what_is_not_lie_far_apart(name: str) -> None:
-    """The limit of one leg length is no fine line: nothing lies within a factor of five of it."""
-    every = tuple(range(model(name).n_legs))
-    for views in ([every] * 3, [every[:3], every[-3:], every]):
-        session = planned_observations(model(name), views)
-        singular = np.linalg.svd(Analysis(session).information, compute_uv=False)
-        sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
-        assert not np.any((sigma > 0.2) & (sigma < 5.0)), sigma
-
-
 # What counts get wrong
 
 
@@ -229,22 +216,6 @@ def test_what_does_not_move_the_platform_is_harmless(
     assert not any(direction.harmless for direction in one.full.weak)
 
 
-def test_legs_on_one_platform_joint_are_identifiable(tmp_path: Path) -> None:
-    """An octahedral hexapod: three joints on either side, each of two legs."""
-    base = [[300, 0, 0], [-150, 260, 0], [-150, -260, 0]]
-    platform = [[100, 173, 0], [-200, 0, 0], [100, -173, 0]]
-    machine = made(
-        tmp_path,
-        type="6-SPS",
-        base_joints=[base[k // 2] for k in range(6)],
-        platform_joints=[platform[(k + 5) // 2 % 3] for k in range(6)],
-        offsets=350,
-        home={"xyz": [0, 0, 350], "rpy_deg": [0, 0, 0]},
-    )
-    found = identifiability(machine, [machine.leg_names] * 2)
-    assert (found.full.rank, found.full.of) == (30, 30)
-
-
 @pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-rpr", "3-upu", "tricept"]))
 def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str) -> None:
     found = identifiability(model(name))
@@ -275,12 +246,6 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
         assert gain < 0.5
 
 
-def test_the_report_does_not_depend_on_the_order_of_views() -> None:
-    one, other = (report("hexapod", views, 2) for views in (HALVES, HALVES[::-1]))
-    assert one.full.rank == other.full.rank < 30
-    assert len(one.full.weak) == len(other.full.weak)
-
-
 def test_remedies_were_tried_and_are_true() -> None:
     found = report("hexapod", HALVES, 2)
     assert found.images == (2, 2)
@@ -293,14 +258,6 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert report("hexapod", ((0, 1, 2), HALVES[1]), 2).full.rank == 30
     assert "add a third camera position (legs 2, 3 and 4)" in text
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
-
-
-def test_remedies_of_a_machine_with_ties_count_what_can_move(tmp_path: Path) -> None:
-    machine = outline_sessions.made("rp-2-sps", tmp_path)
-    found = identifiability(machine, [machine.leg_names], 1)
-    assert found.remedies
-    for remedy in found.remedies:
-        assert remedy.full_rank <= found.full.of
 
 
 def test_a_direction_hides_what_moving_its_parameters_does_to_the_platform() -> None:

@@ -55,6 +55,7 @@ PUBLIC: dict[str, set[str]] = {
         "model",
         "model_builder",
         "model_writer",
+        "occluders",
         "parameter_id",
         "parameters",
         "picture",

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from command_line import run
 from csv_rows import read_rows
 from hexapod_example import HEXAPOD
@@ -211,21 +210,6 @@ def test_tables_are_read_as_spreadsheets_write_them(
     assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
 
 
-def test_columns_of_photographs_and_views_are_known_by_their_cells(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    columns = {"Ort": ("b", "b", "a", "a"), "Bild": ("2.jpg", "x1.jpg", "x1.jpg", "2.jpg"),
-               "Lage": ("b", "a", "c", "a")}  # fmt: skip
-    own_folder(tmp_path, ("a/x1.png", "a/2.png", "b/x1.png", "b/2.png"))
-    table(tmp_path, columns, n=4)
-    assert init(monkeypatch, tmp_path) == 0
-    assert "Column 'Lage'" in " ".join(capsys.readouterr().out.split())
-    places = {image.removeprefix("images/"): (view, k) for view, image, k in pairs(tmp_path)}
-    assert places == {
-        "b/2.png": ("b", 0), "b/x1.png": ("b", 1), "a/x1.png": ("a", 2), "a/2.png": ("a", 3),
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("names", "factor", "add", "words"),
     [
@@ -349,20 +333,3 @@ def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_ph
     }
     assert init(monkeypatch, tmp_path, *words, "--force", output=".") == 0
     assert load_dataset(tmp_path).measurements.q[0, 0] == pytest.approx(0.011)
-
-
-def test_hostile_names_do_no_harm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table(own_folder(tmp_path, ("a\x1b[31m.jpg",)), n=1, names=[*LEGS[:5], "leg6"])
-    assert init(monkeypatch, tmp_path) == 2
-    assert "\x1b" not in capsys.readouterr().err
-    (tmp_path / "photos/a\x1b[31m.jpg").rename(tmp_path / "photos/[red]b.jpg")
-    table(tmp_path, {"../x\x1b[2J": ["=1+1"], "image": ["../[red]b.jpg"]}, n=1)
-    assert init(monkeypatch, tmp_path) == 0
-    said = capsys.readouterr().out
-    assert "\x1b" not in said
-    assert "[red]b.jpg" in said
-    entry = yaml.safe_load((tmp_path / "dataset/dataset.yaml").read_text())
-    assert entry["views"] == {"c1": {"camera": "camera_info.yaml"}}
-    assert pairs(tmp_path) == [("c1", "images/[red]b.jpg", 0)]

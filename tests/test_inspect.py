@@ -9,17 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from csv_rows import read_rows, write_rows
-from layouts import Layout, write_machine
-from machines import ROOT, of_types, regular
+from machines import regular
 from rich.console import Console
 from simulated import simulated
 
 from legcal import evaluate, load_mechanism
 from legcal.calibration.evaluation import Evaluation
 from legcal.errors import DidNotConverge, ModelError
-from legcal.machine.actuator import Pulses
 from legcal.machine.inspection import machine_document
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
@@ -42,19 +39,6 @@ def _described(name: str | Path) -> dict[str, Any]:
     document = json.loads(json.dumps(machine_document(load_mechanism(name)), allow_nan=False))
     assert isinstance(document, dict)
     return document
-
-
-def test_pulses_and_gains_of_motors_are_shown() -> None:
-    machine = load_mechanism("servo-hexapod")
-    legs = tuple(
-        replace(leg, actuator=replace(leg.actuator, gain=1.002, pulses=Pulses(1500.0, -11.1)))
-        for leg in machine.legs
-        if leg.actuator is not None
-    )
-    document = machine_document(replace(machine, legs=legs))
-    text = _printed(inspect_table(document))
-    assert text.count("1500 us at 0, -11.1 us/deg") == text.count("gain 1.002") == 6
-    assert {"gain", "us_per_deg"}.isdisjoint(_described("delta")["actuators"]["arm1"])
 
 
 def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
@@ -102,20 +86,6 @@ def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:
         assert [line.split()[0] for line in below] == [leg["name"] for leg in tilted["legs"]]
 
 
-def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
-    text = (ROOT / "urdf" / "6-sps.urdf").read_text()
-    reversed_axis = '<axis xyz="0.0 0.0 -1.0"/><limit lower="-0.13" upper="0.0"'
-    text = text.replace('<axis xyz="0.0 0.0 1.0"/><limit lower="0.0" upper="0.13"', reversed_axis)
-    (tmp_path / "6-sps.urdf").write_text(text)
-    text = (ROOT / "models" / "6-sps.yaml").read_text()
-    path = tmp_path / "6-sps.yaml"
-    path.write_text(text.replace("../urdf/", "").replace("- leg2_prismatic\n", "", 1))
-    text = _printed(inspect_table(_described(path)))
-    assert "passive" in text
-    assert "520.00 - q" in text
-    assert "note: the motors do not determine the pose" in text
-
-
 @pytest.mark.parametrize(
     ("legs", "found", "notes"),
     [
@@ -131,12 +101,6 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
     _check_notes(description, found, notes)
 
 
-def test_a_platform_that_cannot_move_is_noted(tmp_path: Path) -> None:
-    rods = of_types(["SS"] * 6, ["constant"] * 6)
-    description = machine_document(load_mechanism(write_machine(tmp_path, rods, Layout())))
-    _check_notes(description, "it cannot move", ["the platform cannot move: mobility 0"])
-
-
 def _check_notes(description: dict[str, Any], found: str, notes: list[str]) -> None:
     assert found in _printed(inspect_table(description))
     said = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
@@ -149,46 +113,6 @@ def test_the_mobility_is_that_of_other_poses_where_home_is_singular(tmp_path: Pa
     machine = create_model(regular("3-UPU", platform_radius=300.0), tmp_path).machine
     assert machine.mobility == 3
     assert any("is singular at home" in note for note in machine.diagnostics)
-
-
-@pytest.mark.parametrize(
-    ("hidden", "note"),
-    [
-        ("1", "leg 'leg1' has no <visual> cylinder along its axis: it cannot be seen"),
-        ("[1-3]", "legs leg1, leg2, leg3 have no <visual> cylinder along their axes: they cannot"),
-    ],
-)
-def test_legs_that_cannot_be_seen_are_in_one_note(hidden: str, note: str, tmp_path: Path) -> None:
-    text = (ROOT / "urdf" / "3-rps.urdf").read_text()
-    visual = re.compile(rf'(<link name="leg{hidden}_\w+">)<visual>.*</visual>')
-    (tmp_path / "3-rps.urdf").write_text(visual.sub(r"\1", text))
-    path = tmp_path / "3-rps.yaml"
-    path.write_text((ROOT / "models" / "3-rps.yaml").read_text().replace("../urdf/", ""))
-    (found,) = _described(path)["diagnostics"]
-    assert found.startswith(note)
-
-
-def test_an_evaluation_leaves_out_what_a_machine_does_not_have(tmp_path: Path) -> None:
-    name = "hexapod-strut"
-    evaluation = evaluate(name, name)  # the strut is passive: it has no offset
-    passive = load_mechanism(name).legs[6].name
-    assert f"{passive}.platform.z" in evaluation.names
-    assert f"{passive}.offset" not in evaluation.names
-    assert np.all(evaluation.values == evaluation.references)
-    assert all(np.isfinite(row["difference"]) for row in evaluation.document()["parameters"])
-
-    entry = yaml.safe_load((ROOT / "models" / f"{name}.yaml").read_text())
-    entry["name_mot"].pop()  # without enough motors parameters alone are compared
-    entry["legcal"]["urdf"] = str(ROOT / "urdf" / f"{name}.urdf")
-    path = tmp_path / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(entry))
-    evaluation = evaluate(path, path)
-    document = evaluation.document()
-    assert document["dX_m"] is document["dE_rad"] is document["dX_max_m"] is None
-    assert document["poses"] == 0
-    assert len(document["parameters"]) > 30
-    text = _printed(accuracy_table(evaluation))
-    assert "Parameters only: the motors of a model do not determine its pose" in text
 
 
 def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path: Path) -> None:

@@ -32,33 +32,29 @@ from fit_sessions import (
     shifted,
     with_board,
 )
-from outline_sessions import Noise, StartErrors, design_of, draw_session, one_fit
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.joint_fit.determinacy import open_directions
-from legcal.calibration.joint_fit.factors import average_images
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.rounds import first_minimum
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import (
     FittedLegs,
     RefinementSettings,
     Start,
     State,
-    with_values,
 )
-from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.geometry.types import Array
-from legcal.machine.leg import Leg, LegKind, parameters_of_legs, radius_name
+from legcal.machine.leg import Leg, parameters_of_legs, radius_name
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
@@ -174,22 +170,6 @@ def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px:
         assert error < {"m": 1e-8, "rad": 1e-7}[found.estimates.units[parameter]], parameter
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.015])
-def test_a_stated_length_that_is_another_one_is_doubted(factor: float) -> None:
-    """Images of a machine whose motors turn suit any size."""
-    session = far_session("delta")
-    rod = session.truth.legs[0]
-    known = {f"{rod.name}.length": Prior(factor * rod.q0, 5e-5)}
-    radii = frozenset(radius_name(session.legs.names[j], part) for j, part in session.legs.radii)
-    choices = Choices(priors=known, free=radii)
-    found = refine(
-        session.legs, session.measurements, session.outlines, session.start, choices=choices
-    )
-    doubts = [note for note in found.notes if f"the scale comes from {rod.name}.length" in note]
-    assert len(doubts) == (factor > 1.0)
-    assert all("1.5 % longer than the model's" in note for note in doubts)
-
-
 @pytest.mark.parametrize("known_radii", [False, True])
 def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_show(
     known_radii: bool,
@@ -214,22 +194,6 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
         between = np.linalg.norm(np.cross(a, b), axis=1)
         assert between.max() < 1e-6  # as far as the written model has them from parallel
     assert max(turned) > np.deg2rad(0.5)  # held where the nominal ones are, and harmless
-
-
-def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known() -> None:
-    session = machine_session("3-upu")
-    problem = build_fit(session.legs, *session.noisy(1))
-    begin = problem.begin(session.start)
-    first = first_minimum(problem, begin)
-    turned = [
-        np.arccos(abs(np.asarray(leg.base_axis) @ np.asarray(nominal.base_axis)))
-        for leg, nominal in zip(first.state.legs, session.legs.nominal, strict=True)
-    ]
-    assert max(turned) < np.deg2rad(3.0)
-    held = open_directions(problem, first.state, information(problem, first.state, first.linear))
-    assert len(held.directions) == 7
-    # The knowledge that keeps it there is no measurement, and is not counted.
-    assert len(first.linear.prior_r) == len(problem.priors.mean) < len(problem.named)
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> PredictedObservations:
@@ -318,22 +282,6 @@ def test_the_covariance_is_the_inverse_of_the_fisher_matrix_by_differences(
     assert np.abs((found - expected) / np.outer(sigma, sigma)).max() < 1e-4
 
 
-def test_values_are_set_whatever_basis_an_axis_has() -> None:
-    session = machine_session("3-upu")
-    legs, truth = session.legs, session.legs.vector(session.truth.legs)
-    at = dict(enumerate(truth.tolist()))
-    # Nominal axes near the place where the basis of their angles changes.
-    moved = with_values(legs.nominal, legs, at)
-    np.testing.assert_allclose(legs.vector(moved), truth, rtol=0, atol=1e-15)
-    for leg, true in zip(moved, session.truth.legs, strict=True):
-        np.testing.assert_allclose(
-            np.asarray(leg.base_axis), np.asarray(true.base_axis), rtol=0, atol=1e-12
-        )
-        np.testing.assert_allclose(
-            np.asarray(leg.platform_axis), np.asarray(true.platform_axis), rtol=0, atol=1e-12
-        )
-
-
 @pytest.fixture(scope="module")
 def small() -> HexapodSession:
     return irregular_hexapod(6, legs_seen=5)
@@ -369,46 +317,6 @@ def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign()
     found = refine(legs, measurements, shown, disturbed_start(session))
     assert np.abs(joint_errors(found.parameters)).max() < 1e-9
     assert (2, "rod") not in found.radii
-
-
-@pytest.mark.parametrize("n_left", [0, 1])
-def test_a_view_with_hardly_an_outline_neither_helps_nor_harms(n_left: int) -> None:
-    session = irregular_hexapod(10, legs_seen=5)
-    used = session.outlines.used.copy()
-    used[np.flatnonzero(session.measurements.view[session.outlines.row] == 2)[n_left:]] = False
-    outlines = replace(session.outlines, used=used)
-    found = refine(session.legs, session.measurements, outlines, disturbed_start(session))
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
-
-
-def test_a_passive_leg_needs_no_reading() -> None:
-    session = irregular_hexapod(10, legs_seen=6)
-    q = session.measurements.q.copy()
-    q[:, 3] = np.nan
-    start = disturbed_start(session)
-    legs = list(start.legs)
-    legs[3] = replace(legs[3], kind=LegKind.PASSIVE)
-    start = replace(start, legs=tuple(legs))
-    fitted = replace(session.legs, nominal=start.legs)
-    found = refine(fitted, replace(session.measurements, q=q), session.outlines, start)
-    of_others = np.delete(joint_errors(found.parameters), -3)  # leg 4 has no offset to find
-    assert np.abs(of_others).max() < 1e-9
-    assert "leg4.offset" not in found.estimates.names
-    assert found.kinematic.covariance.shape == (29, 29)
-
-
-def test_encoders_carry_the_scale_so_that_a_wrong_radius_is_found() -> None:
-    session = irregular_hexapod(15, radius=1.01 * 0.010, sigma_px=0.01)
-    start = disturbed_start(session)
-    solution = refine(session.legs, session.measurements, session.outlines, start)
-    # The prior, 2 % of the radius, pulls a little; what it costs is within sigma.
-    found, n = solution.estimates, len(solution.radii)
-    sigma_radii = found.sigma[-n:]
-    assert all(name.split(".")[1] == "radius" for name in found.names[-n:])
-    for radius, sigma in zip(solution.radii.values(), sigma_radii, strict=True):
-        assert radius == pytest.approx(0.0101, abs=3e-6)
-        assert sigma < 1e-5
-    assert np.abs(joint_errors(solution.parameters)).max() < 20e-6
 
 
 @pytest.mark.parametrize("n", thinned([12, 30], [12]))
@@ -492,20 +400,6 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: Hexa
     found = refine(small.legs, small.measurements, once, disturbed_start(small))
     assert not found.outlines.used.all()
     assert not found.left_out
-
-
-@pytest.mark.slow
-def test_a_fit_that_leaves_out_legs_of_a_view_is_tried_from_other_models() -> None:
-    """A platform that is turned by 16 degrees explains all outlines but those of two rods."""
-    noise = Noise()
-    design = design_of("delta", 3, 15, noise.sigma_px)
-    rng = np.random.default_rng(np.random.SeedSequence(0).spawn(29)[28])
-    errors = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
-    session = draw_session(design, noise, errors, rng)
-    found = one_fit(session, noise.radius_sigma)
-    assert found.outlines.used.all()
-    for pose, true in zip(found.T_Rb_Re, design.poses, strict=True):
-        assert (pose.inv() * true).rotation.magnitude() < np.deg2rad(1.0)
 
 
 def test_images_near_a_turning_point_of_a_reading_fit_as_well_as_others() -> None:
@@ -652,17 +546,6 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     assert found.radii == {}
 
 
-def test_axes_beside_outlines_add_to_what_is_known() -> None:
-    session = irregular_hexapod(6, legs_seen=5)
-    radii = {part: r for (_, part), r in session.legs.radii.items()}
-    axes = axes_from_outlines(session.outlines, session.measurements, radii)
-    arguments = (session.legs, session.measurements, session.outlines, disturbed_start(session))
-    alone, both = refine(*arguments), refine(*arguments, axes=axes)
-    assert np.abs(joint_errors(both.parameters)).max() < 1e-9
-    assert np.all(both.estimates.sigma[:30] < alone.estimates.sigma[:30])
-    assert both.quality.dof == alone.quality.dof + 4 * len(axes)
-
-
 @pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
 def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> None:
     session, n = axes_session(coplanar=coplanar), 40
@@ -687,19 +570,6 @@ def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> N
     # What the robust loss does not keep, and no more.
     assert np.all(sigmas.mean(axis=0) > np.sqrt(np.diag(least)))
     assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()
-
-
-def test_the_mean_of_images_of_one_pose_holds_what_they_hold() -> None:
-    session = axes_session(5, 3)
-    m, axes = session.measurements, session.axes
-    mean = average_images(axes, m)
-    assert len(mean) == len(axes) / 3
-    assert np.array_equal(np.unique(m.pose[mean.row]), np.arange(m.n_poses))
-    all_images, together = (
-        bound(build_fit(session.legs, m, no_outlines(), axes=some), session.truth)
-        for some in (axes, mean)
-    )
-    assert np.allclose(together, all_images, rtol=1e-6)
 
 
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:

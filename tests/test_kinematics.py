@@ -2,22 +2,18 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
-from machines import HOME, MACHINES, SHIPPED, displaced, of_types, ring
+from layouts import Layout, LegLayout, write_machine
+from machines import MACHINES, SHIPPED, displaced, of_types
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.machine import kinematics
-from legcal.machine.configurations import Configurations, random_configurations, random_poses
+from legcal.machine.configurations import Configurations, random_configurations
 from legcal.machine.equations import pose_equations
 from legcal.machine.kinematics import (
     Follower,
@@ -92,13 +88,6 @@ def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: 
     assert np.ptp(drawn.readings[:, list(machine.motors)], axis=0).min() > 1e-3
 
 
-def test_poses_drawn_together_are_those_of_the_drawn_configurations(name: str) -> None:
-    readings, poses = random_poses(machine_of(name), DRAWN, 5)
-    np.testing.assert_allclose(readings, drawn_of(name).readings, atol=1e-11)
-    for T, reference in zip(poses, drawn_of(name).poses, strict=True):
-        np.testing.assert_allclose(T.as_matrix(), reference.as_matrix(), atol=1e-10)
-
-
 def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str) -> None:
     machine, drawn = machine_of(name), drawn_of(name)
     backwards = forward_kinematics_many(machine, drawn.readings[::-1])[::-1]
@@ -161,61 +150,6 @@ def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: 
 # --- closed forms and other routes --------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
-@given(xyz=st.tuples(*[st.floats(-0.05, 0.05)] * 3), turn=st.tuples(*[st.floats(-0.25, 0.25)] * 3))
-def test_a_hexapod_goes_where_its_leg_lengths_put_it(
-    xyz: tuple[float, ...], turn: tuple[float, ...]
-) -> None:
-    hexapod = machine_of("hexapod")
-    T = displaced(hexapod.home, [*turn, *xyz])
-    q = inverse_kinematics(hexapod, T)
-    lengths = np.linalg.norm(T.apply(hexapod.B_platform) - hexapod.A_base, axis=1)
-    np.testing.assert_allclose(q, lengths - hexapod.q0, atol=1e-12)
-    np.testing.assert_allclose(
-        forward_kinematics(hexapod, q).as_matrix(), T.as_matrix(), atol=1e-11
-    )
-
-
-def test_a_path_of_readings_gives_a_continuous_path_of_poses() -> None:
-    start, end = np.zeros(6), np.array([0.14, 0.0, 0.14, 0.02, 0.1, 0.03])
-    q = start + np.linspace(0.0, 1.0, 60)[:, None] * (end - start)
-    for one, two in pairwise(forward_kinematics_many(machine_of("hexapod"), q)):
-        step = one.inv() * two
-        assert np.linalg.norm(step.translation) < 0.02
-        assert step.rotation.magnitude() < 0.05
-
-
-@pytest.mark.parametrize("model", ["hexapod", "delta"])
-def test_calls_that_start_where_the_last_one_ended_close_no_loop_anew(
-    model: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    machine = load_mechanism(model)
-    T, q = machine.home, inverse_kinematics(machine, machine.home)
-    forward_kinematics(machine, q, start=T)
-    span = np.array([leg.travel[1] - leg.travel[0] for leg in machine.legs])
-    steps = machine.at_readings(span[list(machine.motors)] * 0.02)
-    T, follower = forward_kinematics(machine, q), Follower(machine)
-    monkeypatch.setattr(kinematics, "close_at", None)
-    for k in range(5):
-        T = forward_kinematics(machine, q + k * steps, start=T)
-        expected = follower.move_to(q + k * steps).as_matrix()
-        np.testing.assert_allclose(T.as_matrix(), expected, atol=1e-12)
-    monkeypatch.undo()
-    elsewhere = forward_kinematics(machine, q + steps, start=machine.home)
-    there = forward_kinematics(machine, q + steps).as_matrix()
-    np.testing.assert_allclose(elsewhere.as_matrix(), there, atol=1e-11)
-
-
-def test_a_start_in_another_assembly_mode_stays_there() -> None:
-    # Base and platform joints are coplanar: the mirror image in their planes has equal legs.
-    hexapod, mirror = machine_of("hexapod"), np.array([1.0, 1.0, -1.0])
-    home = hexapod.home
-    below = RigidTransform.from_components(home.translation * mirror, home.rotation)
-    q = inverse_kinematics(hexapod, home) + 0.01
-    above_T, below_T = forward_kinematics(hexapod, q), forward_kinematics(hexapod, q, start=below)
-    np.testing.assert_allclose(below_T.translation, above_T.translation * mirror, atol=1e-9)
-
-
 def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
     machine, drawn = machine_of("3-rpr"), drawn_of("3-rpr")
     A, B = machine.A_base, machine.B_platform
@@ -241,18 +175,6 @@ def test_a_planar_platform_stays_in_its_plane(virtual: str, tmp_path: Path) -> N
         assert abs((T.translation - machine.home.translation) @ n) < 1e-12
         lengths = np.linalg.norm(vectors_A_to_B(machine, T), axis=1)
         np.testing.assert_allclose(lengths, machine.sign * q + machine.q0, atol=1e-12)
-
-
-def test_axes_that_are_a_little_off_still_close_and_are_not_refused(tmp_path: Path) -> None:
-    machine = of_types(["RS"] * 3)
-    leg = machine.legs[0]
-    slides = leg.u + 2e-4 * np.asarray(leg.base_axis)
-    legs = (replace(leg, slides=slides / np.linalg.norm(slides)), *machine.legs[1:])
-    crooked = load_mechanism(write_machine(tmp_path, replace(machine, legs=legs), Layout()))
-    assert np.abs(crooked.chain.residual(crooked.home_configuration)).max() < 1e-12
-    q = inverse_kinematics(crooked, crooked.home) + 0.003
-    T = forward_kinematics(crooked, q)
-    np.testing.assert_allclose(inverse_kinematics(crooked, T), q, atol=1e-4)
 
 
 # --- the same machine in other trees, far from home ---------------------------------------------
@@ -321,74 +243,6 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
 
 
 # --- random configurations ----------------------------------------------------------------------
-
-
-def _lines(machine: Machine, T: RigidTransform) -> float:
-    """Return the determinant of the leg lines of a hexapod, written down once more."""
-    u = vectors_A_to_B(machine, T)
-    arms = T.apply(machine.B_platform) - T.translation
-    return float(np.linalg.det(np.hstack([np.cross(arms, u), u])))
-
-
-def _check(machine: Machine, drawn: Configurations) -> None:
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    home = np.sign(_lines(machine, machine.home))
-    for configuration, q, T in zip(*drawn, strict=True):
-        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
-        assert np.all((q >= lower) & (q <= upper))
-        assert np.sign(_lines(machine, T)) == home
-
-
-@pytest.mark.parametrize("n", thinned([300, 1000], [300]))
-def test_hundreds_of_random_poses_of_the_hexapod_fill_its_travel_in_one_mode(n: int) -> None:
-    machine = machine_of("hexapod")
-    drawn = random_configurations(machine, n, 2026)
-    assert len(drawn.poses) == len(drawn.readings) == len(drawn.configurations) == n
-    _check(machine, drawn)
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    share = (drawn.readings - lower) / (upper - lower)
-    assert np.abs(share.mean(axis=0) - 0.5).max() < 0.06  # none was drawn again
-    assert share.min() < 0.01
-    assert share.max() > 0.99
-
-
-def test_the_same_seed_gives_the_same_poses_and_another_one_others() -> None:
-    machine = machine_of("hexapod")
-    chances = (3, 3, np.random.default_rng(3), 4)
-    one, same, rng, other = (random_configurations(machine, 5, c).readings for c in chances)
-    np.testing.assert_array_equal(one, same)
-    np.testing.assert_array_equal(one, rng)
-    assert np.abs(one - other).max() > 1e-3
-
-
-def test_long_travels_that_exclude_each_other_still_give_poses_in_one_mode() -> None:
-    machine = machine_of("nategh-agheli")
-    drawn = random_configurations(machine, 15, 1)
-    _check(machine, drawn)
-    assert np.ptp(drawn.readings, axis=0).min() > 0.02
-
-
-@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept"])
-def test_without_enough_motors_home_wanders_inside_the_travel(name: str) -> None:
-    machine = without_a_motor(name)
-    drawn = random_configurations(machine, 10, 1)
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    for configuration, q in zip(drawn.configurations, drawn.readings, strict=True):
-        assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
-        assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
-    assert np.ptp(drawn.readings, axis=0).min() > 1e-3
-    middles: Array = np.array([T.translation for T in drawn.poses])
-    assert np.ptp(middles, axis=0).max() > 5e-3
-
-
-@pytest.mark.slow
-def test_poses_are_drawn_where_home_is_nearly_singular(tmp_path: Path) -> None:
-    chance = np.random.default_rng(3)
-    A, B = ring(list(np.arange(6) * 60.0), 0.3), ring(list(np.arange(6) * 60.0 + 6.0), 0.15)
-    A, B = A + chance.normal(0.0, 0.02, A.shape), B + chance.normal(0.0, 0.015, B.shape)
-    legs = tuple(LegSpec("SU", a, HOME.apply(b)) for a, b in zip(A, B, strict=True))
-    machine = load_mechanism(write_machine(tmp_path, MachineSpec(legs, HOME), Layout()))
-    _check(machine, random_configurations(machine, 20, 1))
 
 
 # --- refusals -----------------------------------------------------------------------------------

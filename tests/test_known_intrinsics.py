@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from fit_sessions import LENS, MachineSession, axes_session, machine_session, with_camera
-from hexapod_example import spoiled
+from fit_sessions import LENS, MachineSession, machine_session, with_camera
 from simulated import simulated
 
 from legcal import calibrate, check
@@ -18,7 +17,6 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.dataset import load_dataset
-from legcal.data.outlines import no_outlines
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
@@ -136,12 +134,6 @@ def test_a_covariance_says_what_lies_between_exact_and_free() -> None:
     assert weak.isdisjoint(unknown)
 
 
-def test_one_file_that_states_a_covariance_speaks_for_the_camera() -> None:
-    camera = replace(LENS, covariance=COVARIANCE)
-    both, one = fitted(session(), camera), fitted(session(), camera, views=(0, 2))
-    assert one.estimates.values == both.estimates.values
-
-
 def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
     camera = replace(LENS, covariance=COVARIANCE)
     choices = Choices(
@@ -182,15 +174,6 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     assert found.camera_doubts.views == ("c1",)
 
 
-def test_axes_do_not_depend_on_cameras() -> None:
-    exact = axes_session()
-    measurements, axes = exact.noisy(0)
-    views = [replace(view, camera=moved(0.0 * SIGMA)) for view in measurements.views]
-    stated = replace(measurements, views=tuple(views))
-    found = refine(exact.legs, stated, no_outlines(), exact.start(), axes=axes)
-    assert not any(name.endswith(".fx") for name in found.estimates.values)
-
-
 def state_covariance(folder: Path) -> Path:
     """Write a covariance of fx, fy and k3 into the camera file of a dataset; return the folder."""
     (path,) = set(load_dataset(folder).camera_paths)
@@ -220,37 +203,6 @@ def test_a_camera_file_with_a_covariance_is_used_from_calibration_to_check(tmp_p
     assert prior.mean.tolist() == [document.parameters[i].value for i in _rows(document)]
     whitened = prior.whitened(np.eye(2))
     np.testing.assert_allclose(np.linalg.inv(whitened.T @ whitened), earlier, rtol=1e-6)
-
-
-@pytest.mark.system
-def test_photographs_correct_a_camera_of_which_little_is_known(tmp_path: Path) -> None:
-    # They are searched again where the fit with the corrected camera has the legs.
-    session = spoiled(tmp_path / "set", 5)
-    path = session.write() / "camera_info.yaml"
-    camera = yaml.safe_load(path.read_text("utf-8"))
-    truth = np.array(camera["camera_matrix"]["data"]).reshape(3, 3)
-    K = truth * np.diag([1.01, 1.01, 1.0])
-    K[:2, 2] = truth[:2, 2] + [8.0, -6.0]
-    camera["camera_matrix"]["data"] = K.ravel().tolist()
-    names, known = ["fx", "fy", "cx", "cy"], np.diag([49.0, 49.0, 64.0, 64.0])
-    known[0, 1] = known[1, 0] = 48.99
-    camera["legcal_camera"] = {
-        "version": 1,
-        "sigma": dict(zip(names, np.sqrt(np.diag(known)).tolist(), strict=True)),
-        "names": names,
-        "covariance": known.tolist(),
-    }
-    path.write_text(yaml.safe_dump(camera), "utf-8")
-    found = calibrate(session.path).result
-    wanted = dict(zip(names, [truth[0, 0], truth[1, 1], truth[0, 2], truth[1, 2]], strict=True))
-    for one in found.parameters:
-        key = one.name.rpartition(".")[2]
-        if key in wanted:
-            assert one.sigma is not None
-            assert one.sigma < 3.0
-            assert abs(one.value - wanted[key]) < 4.0 * one.sigma
-    assert found.observations is not None
-    assert found.observations.used > 0.7 * found.observations.total
 
 
 def _rows(document: Result) -> list[int]:

@@ -7,10 +7,7 @@ import pytest
 from layouts import Layout, LegLayout, MachineSpec, write_machine
 from leg_screws import freedoms_of
 from machines import exechon, exechon_and_ups, four_upu, of_types, planar, two_upr_two_sps
-from seen_numbers import n_seen
-from thinned import thinned
 
-from legcal import identifiability
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import geometries
 
@@ -34,7 +31,8 @@ KINDS: dict[str, MachineSpec] = {
     "5-UPS + rod": of_types(["US"] * 6, [A] * 5 + [C]),
     "3-SPS + passive UPS": of_types(["SS"] * 3 + ["US"], [A, A, A, P]),
 }
-REDUNDANT = ["7-UPS", "4-RPR", "3-RPS + SPS", "5-UPS + RPS", "2-RPS + 2-SPS + rod"]
+
+
 LAYOUTS = {
     "hung from the base": Layout(),
     "cut behind the slider": Layout((LegLayout(cut="mid"),)),
@@ -66,19 +64,3 @@ def test_freedoms_are_those_of_the_screws_of_the_joints(
     of = f"{expected.n_redundant} of the {expected.n_constraints}"
     assert len(said) == (expected.n_redundant > 0)
     assert all(of in note for note in said)
-
-
-@pytest.mark.parametrize(
-    ("kind", "layout"),
-    thinned(
-        product(REDUNDANT, LAYOUTS),
-        [("7-UPS", "hung from the base"), ("3-RPS + SPS", "hung from the platform")],
-    ),
-)
-def test_identify_counts_the_numbers_of_redundant_machines_that_show(
-    kind: str, layout: str, tmp_path: Path
-) -> None:
-    machine = load_mechanism(write_machine(tmp_path, KINDS[kind], LAYOUTS[layout]))
-    report = identifiability(machine, (machine.leg_names,) * 3)
-    assert report.identifiable
-    assert report.full.of == report.full.rank == n_seen(machine)

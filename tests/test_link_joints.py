@@ -1,22 +1,16 @@
 """Joints in the links that an owner knows: as the written URDF has them, covariance and all."""
 
-import json
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from command_line import run
 from hexapod_example import Run
-from simulated import settings
 
 import legcal
 from legcal.calibration.change_detection import possible_changes
 from legcal.calibration.documents import Kinematic, ParameterRow
-from legcal.calibration.link_joints import joints_in_links, weak_in_links
+from legcal.calibration.link_joints import joints_in_links
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -28,8 +22,6 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, ParameterErrors
 from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
@@ -57,20 +49,6 @@ def test_joints_are_where_the_written_model_has_them(example_run: Run) -> None:
     assert [row["status"] for row in rows[6:9]] == ["x axis of R_b", "defines R_b", "defines R_b"]
     sigma = {row.name: row.sigma for row in result.result.parameters}
     assert rows[5]["sigma"] == pytest.approx(1e3 * float(sigma["leg2.base.z"] or 0.0))  # z is z
-
-
-def test_earlier_results_get_their_joints_on_loading(example_run: Run, tmp_path: Path) -> None:
-    folder = shutil.copytree(example_run.output, tmp_path / "earlier")
-    document = json.loads((folder / "result.json").read_text())
-    recorded = document.pop("links")
-    (folder / "result.json").write_text(json.dumps(document))
-    found = legcal.load_result(folder).result.document()["links"]
-    for side, block in recorded.items():
-        assert found[side]["link"] == block["link"]
-        for one, other in zip(found[side]["joints"], block["joints"], strict=True):
-            for key in ("xyz", "nominal", "covariance"):
-                np.testing.assert_allclose(one[key], other[key], atol=1e-12)
-            assert one["status"] == other["status"]
 
 
 @pytest.mark.parametrize("model", [OBLIQUE, "3-rpr", "3-upu-tilted"])
@@ -140,17 +118,6 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
     np.testing.assert_allclose(written.A_base, joints_with(1e-3 * np.eye(n)[1])[0], atol=1e-12)
 
 
-def test_a_combination_of_parameters_is_told_along_the_axes_of_the_links() -> None:
-    machine = load_mechanism(OBLIQUE)
-    leg, by = machine.leg_names[5], np.array([0.0, 1.0, 0.0])  # along y of the base link
-    in_frame = machine.T_base_Rb.inv().rotation.apply(by)
-    parts = [(f"{leg}.base.{axis}", float(x)) for axis, x in zip("xyz", in_frame, strict=True)]
-    found = weak_in_links(machine, [*parts, (f"{leg}.offset", 0.5)])
-    assert found.parameters == [f"{leg}.base.y", f"{leg}.offset"]
-    np.testing.assert_allclose(found.components, [1.0, 0.5], atol=1e-12)
-    assert found.direction == "y of base joint 6 and offset of leg 6 together"
-
-
 @pytest.mark.parametrize("model", [OBLIQUE, "3-upu-tilted", "3-rpr"])
 def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
     """A joint is moved in the link; R_b and R_e, built anew, give the parameters."""
@@ -168,41 +135,3 @@ def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
                 after = vector_of(found, geometries(moved), legs)
                 np.testing.assert_allclose(change.columns[:, k], (after - before) / step, atol=2e-3)
             assert set(change.links) == {getattr(machine, side)}
-
-
-@pytest.mark.system
-def test_a_joint_that_was_moved_is_reported_in_its_link(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    machine = load_mechanism("3-rpr")
-    exact = settings(level=Level.AXES, poses=6, errors=ParameterErrors())
-    first = simulate("3-rpr", tmp_path / "set", exact).folder
-    legcal.calibrate(first, output=tmp_path / "result")
-    moved = _moved(machine, "base", 1, [1e-3, 0.0, 0.0])
-    write_urdf(machine, geometries(moved), tmp_path / "moved.urdf")
-    write_calibrated_yaml(machine, tmp_path / "moved.yaml", "moved.urdf")
-    new = simulate(tmp_path / "moved.yaml", tmp_path / "new", exact).folder
-    text = yaml.safe_load((new / "dataset.yaml").read_text()) | {"mechanism": "3-rpr"}
-    (new / "dataset.yaml").write_text(yaml.safe_dump(text))
-    assert run(monkeypatch, "calibrate", new, "--check", tmp_path / "result") == 1
-    said = " ".join(capsys.readouterr().out.split())
-    found = re.search(r"base joint of leg2: (\S+) mm in x of base .*, (\S+) mm in y of base", said)
-    assert found is not None
-    assert [float(x) for x in found.groups()] == pytest.approx([1.0, 0.0], abs=0.05)
-
-
-def test_two_models_are_compared_along_the_links_of_the_first() -> None:
-    # With no motor parameters alone are compared, which is quick.
-    machine = replace(load_mechanism(OBLIQUE), motor_rank=0)
-    leg = next(j for j in range(6) if j not in machine.frame_legs)
-    found = legcal.evaluate(_moved(machine, "base", leg, [1e-3, 0.0, 0.0]), machine).links["base"]
-    expected = np.zeros((6, 3))
-    expected[leg, 0] = 1e-3
-    np.testing.assert_allclose([joint.difference for joint in found.joints], expected, atol=1e-12)
-    assert found.frames_apart.dX_m == found.frames_apart.dE_rad == 0.0
-
-    third = machine.frame_legs[2]  # moved out of the plane of R_b, which turns with it
-    turned = legcal.evaluate(_moved(machine, "base", third, [0.0, 0.0, 1e-3]), machine)
-    assert turned.links["base"].frames_apart.dE_rad > 1e-3
-    for joint in turned.links["base"].joints:
-        assert not any(d for d, own in zip(joint.difference, joint.defined, strict=True) if own)

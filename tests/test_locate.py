@@ -134,19 +134,6 @@ def test_exact_poses_give_exact_frames_where_the_open_part_is_fixed_at_its_truth
     assert error[kept] @ np.linalg.solve(found.covariance[np.ix_(kept, kept)], error[kept]) < 33.0
 
 
-def test_where_the_tool_is_in_the_world_does_not_depend_on_what_is_fixed() -> None:
-    translating = made("3-upu", 10)
-    one, other = (
-        locate(translating.machine, translating.poses, tool_position=at)
-        for at in (None, (0.01, 0.02, 0.3))
-    )
-    np.testing.assert_allclose(one.T_platform_tool.translation, 0.0, atol=1e-9)
-    for T in translating.platform:
-        there = [x.T_world_base * T * x.T_platform_tool for x in (one, other)]
-        assert np.abs(motion_error(*there)).max() < 1e-8
-        assert np.linalg.norm(motion_error(there[0], BASE * T * TOOL)[:3]) < 0.05e-3
-
-
 @pytest.mark.parametrize("stated", [{}, KNOWN])
 def test_outliers_are_named_and_left_out(stated: dict[str, Any]) -> None:
     hexapod = made("hexapod", 20)
@@ -176,30 +163,6 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     beside = locate(hexapod.machine, hexapod.poses, **KNOWN, encoder_sigma="50um")
     assert np.all(beside.sigma > right.sigma)
     assert beside.noise.reading == pytest.approx(50e-6)
-
-
-def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
-    hexapod = made("hexapod", 8)
-    position, sigma = hexapod.poses.position.copy(), np.full(8, SIGMA_POSITION)
-    position[0] += 2e-3
-    sigma[0] = 2e-3
-    poses = replace(hexapod.poses, position=position, position_sigma=sigma)
-    found = locate(hexapod.machine, poses, angle_sigma=SIGMA_ANGLE)
-    assert all(row.used for row in found.rows)
-    assert np.linalg.norm(frames_error(found)[:3]) < 0.2e-3
-
-
-def test_few_poses_and_weak_directions_are_noted() -> None:
-    weak = near_home("hexapod", 12, 0.02, (0.01, 0.01, 1.0))
-    notes = locate(weak.machine, weak.poses).notes
-    assert any("the position of the tool in the platform along" in note for note in notes)
-    hexapod = made("hexapod", 20)
-    notes = locate(hexapod.machine, hexapod.rows(range(3))).notes
-    assert any("A wrong row among the 3 poses" in note for note in notes)
-    one = replace(hexapod.poses, oriented=np.arange(20) == 4)
-    found = locate(hexapod.machine, one, angle_sigma=SIGMA_ANGLE)
-    assert found.has_tool_orientation
-    assert found.sigma[9:].max() > 0.9 * SIGMA_ANGLE
 
 
 def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Located:
@@ -349,23 +312,6 @@ def test_a_table_says_the_same_as_arrays(tmp_path: Path) -> None:
     ]
     write_rows(path, short)
     assert "quaternions were made unit" in locate(hexapod.machine, path, angle_sigma=1e-3).notes[0]
-
-
-@pytest.mark.parametrize(
-    ("cells", "named"),
-    [
-        ({"position_sigma": "0"}, ("position_sigma", "'0'")),
-        ({"position_sigma": ""}, ("position_sigma", "empty cell")),
-    ],
-)
-def test_sigmas_of_a_table_are_read_strictly(
-    tmp_path: Path, cells: dict[str, str], named: tuple[str, ...]
-) -> None:
-    rows = write_poses(tmp_path / "poses.csv", made("hexapod", 4))
-    write_rows(tmp_path / "poses.csv", [row | cells for row in rows])
-    with pytest.raises(DatasetError) as refused:
-        locate(shipped("hexapod"), tmp_path / "poses.csv")
-    assert [word for word in named if word not in str(refused.value)] == []
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, files
@@ -11,10 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from layouts import borne, numbers, origin, write_machine
-from machines import of_types
-from model_formats import FORMATS, mjcf, with_loops_at_joints, write_format
+from model_formats import FORMATS, with_loops_at_joints, write_format
 from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
@@ -24,7 +20,7 @@ from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.chain import ClosedChain
 from legcal.machine.mjcf import MjcfReader
-from legcal.machine.model import Machine, readings_at
+from legcal.machine.model import Machine
 from legcal.machine.model_writer import (
     reload_and_check,
     write_calibrated_yaml,
@@ -34,7 +30,6 @@ from legcal.machine.model_writer import (
 from legcal.machine.parameters import geometries
 from legcal.machine.spanning_tree import close_loop
 from legcal.machine.urdf import Problems, parse_xml
-from legcal.simulation.poses import draw_poses
 
 machine_of = cache(load_mechanism)
 
@@ -76,18 +71,6 @@ def test_every_format_gives_the_same_analysis(name: str, machine: str, tmp_path:
     if not name.startswith("mjcf"):  # these have no pose where they are closed
         found = replace(found, home=expected.home)
     assert_same_analysis(found, expected)
-
-
-def test_slides_and_a_ball_that_nothing_drives_carry_a_platform_freely(tmp_path: Path) -> None:
-    expected = machine_of("hexapod")
-    joints = "".join(
-        f'<joint name="p{i}" type="slide" axis="{numbers(axis)}"/>'
-        for i, axis in enumerate(np.eye(3))
-    )
-    joints += '<joint type="ball"/>'
-    text = mjcf(expected, "sites").replace('<freejoint name="platform_free"/>', joints)
-    (tmp_path / "machine.xml").write_text(text)
-    assert_same_analysis(load_mechanism(tmp_path / "machine.xml"), expected)
 
 
 @pytest.mark.parametrize(
@@ -144,35 +127,6 @@ def test_a_urdf_that_needs_no_change_is_copied_and_nothing_written_over(tmp_path
     assert urdf_path.read_bytes() == machine.urdf_path.read_bytes()
     with pytest.raises(UsageError, match="already there, needed new files"):
         write_model(machine, tmp_path)
-
-
-def test_a_home_is_level_where_a_file_draws_open_loops_and_no_travel(tmp_path: Path) -> None:
-    drawn, layout = borne(of_types(["SS"] * 6), 5, cut="mid", sphere=False)
-    path = write_machine(tmp_path, drawn, layout)
-    document = yaml.safe_load(path.read_text())
-    document.pop("legcal")
-    path.write_text(yaml.safe_dump(document))
-    urdf = path.with_suffix(".urdf")
-    text = re.sub(r'<limit lower="\S+" upper="\S+"', "<limit", urdf.read_text())
-    urdf.write_text(text)
-    for leg, length in {"leg1": 0.03, "leg4": -0.02}.items():  # by which legs are drawn too long
-        joint = load_mechanism(path).urdf.joints[f"{leg}_slider"]
-        moved = joint.T_parent_origin * RigidTransform.from_translation(length * joint.axis)
-        before, after = text.split(f'<joint name="{leg}_slider"')
-        after = re.sub("<origin[^>]*>", origin(moved), after, count=1)
-        text = f'{before}<joint name="{leg}_slider"{after}'
-    urdf.write_text(text)
-    machine = load_mechanism(path)
-    level = Rotation.align_vectors(
-        machine.A_base - machine.A_base.mean(axis=0),
-        machine.B_platform - machine.B_platform.mean(axis=0),
-    )[0]
-    np.testing.assert_allclose((level.inv() * machine.home.rotation).magnitude(), 0.0, atol=1e-9)
-    q = readings_at(machine, machine.home)
-    travel = np.array([leg.travel for leg in machine.legs])
-    np.testing.assert_allclose(q, travel.mean(axis=1), atol=1e-9)
-    assert np.abs(q).max() < 0.1  # near where the sliders are drawn
-    assert len(draw_poses(machine, 2, np.random.default_rng(0)).readings) == 2
 
 
 def test_what_closes_no_loop_is_left_out_of_an_mjcf_scene(tmp_path: Path) -> None:

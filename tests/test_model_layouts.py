@@ -1,7 +1,6 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
 import pickle
-import re
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -22,9 +21,9 @@ from legcal.errors import UsageError
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, readings_at
+from legcal.machine.model import Machine
 
 LAYOUTS = {
     "hung from the base": Layout(),
@@ -211,38 +210,6 @@ def test_a_platform_that_is_the_child_of_a_last_joint_changes_nothing(
     np.testing.assert_allclose(level[0].as_matrix(), level[1].as_matrix(), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("description", "hung"), [("3-RPR", "base"), ("3-RPR, tilted plane", "platform")]
-)
-def test_a_planar_virtual_joint_changes_nothing(
-    description: str, hung: str, tmp_path: Path
-) -> None:
-    drawn, layout = MACHINES[description](), Layout((LegLayout(hung=hung),), virtual="planar")
-    machine = load_mechanism(write_machine(tmp_path, drawn, layout))
-    _check(machine, drawn, layout)
-    assert machine.mobility == 3
-    assert drawn.normal is not None
-    _close(machine.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
-    z_e = (machine.home * machine.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
-    _close(z_e, drawn.normal)
-
-
-@pytest.mark.parametrize("name", ["cut before the slider", "carried by leg 1", "planar joint"])
-def test_a_planar_machine_may_be_written_with_few_digits(name: str, tmp_path: Path) -> None:
-    drawn = MACHINES["3-RPR, tilted plane"]()
-    layout = LAYOUTS.get(name, Layout((LegLayout(slid=0.01),), virtual="planar"))
-    path = write_machine(tmp_path, drawn, layout)
-    urdf = path.with_suffix(".urdf")
-    text = re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda x: f"{float(x[0]):.6f}", urdf.read_text())
-    urdf.write_text(text)
-    machine = load_mechanism(path)
-    assert (machine.spatial, machine.mobility) == (False, 3)
-    for leg, spec in zip(machine.legs, drawn.legs, strict=True):
-        np.testing.assert_allclose(leg.A, spec.A, atol=1e-5)
-    q = inverse_kinematics(machine, machine.home) + machine.sign * np.array([0.01, -0.02, 0.03])
-    np.testing.assert_allclose(readings_at(machine, forward_kinematics(machine, q)), q, atol=1e-5)
-
-
 LEG_LAYOUTS = st.builds(
     LegLayout,
     hung=st.sampled_from(["base", "platform"]),
@@ -306,35 +273,6 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
         _close(leg.B, expected_B(description, j))
 
 
-def test_a_universal_joint_that_is_blocked_on_one_axis_is_a_revolute(tmp_path: Path) -> None:
-    old = 'name="leg4_b1" type="revolute"'
-    text = SHIPPED_URDF.read_text().replace(old, old.replace("revolute", "fixed"))
-    (tmp_path / "hexapod.urdf").write_text(text)
-    (tmp_path / "hexapod.yaml").write_text(SHIPPED_YAML.read_text().replace("../urdf/", ""))
-    machine = load_mechanism(tmp_path / "hexapod.yaml")
-    assert [leg.type for leg in machine.legs] == ["SPU", "SPU", "SPU", "SPR", "SPU", "SPU"]
-    assert machine.legs[3].platform_axis is not None
-    assert machine.mobility == 5
-
-
-@pytest.mark.parametrize(
-    "part",
-    [
-        "<visual/>",
-        "<visual><geometry/></visual>",
-        '<visual><geometry><mesh filename="package://lost/lost.stl"/></geometry></visual>',
-        '<visual><material name="m"><color rgba="a b"/></material></visual>',
-    ],
-)
-def test_visuals_that_are_no_cylinder_do_no_harm(tmp_path: Path, part: str) -> None:
-    link, text = '<link name="leg1_tube">', SHIPPED_URDF.read_text()
-    assert link in text
-    (tmp_path / "hexapod.urdf").write_text(text.replace(link, link + part))
-    (tmp_path / "hexapod.yaml").write_text(SHIPPED_YAML.read_text().replace("../urdf/", ""))
-    machine = load_mechanism(tmp_path / "hexapod.yaml")
-    assert [len(leg.cylinders) for leg in machine.legs] == [2] * 6
-
-
 @pytest.mark.parametrize(("types", "scale"), [("US", 1.0), ("RS", 0.1), ("UU", 25.0)])
 def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(
     types: str, scale: float, tmp_path: Path
@@ -387,28 +325,6 @@ def test_base_platform_and_legs_are_taken_from_the_bodies(
     assert found.mobility == named.mobility
 
 
-def test_base_frame_may_be_left_out(tmp_path: Path) -> None:
-    path = write_machine(tmp_path, MACHINES["6-UPS"](), Layout())
-    machine = load_mechanism(_without(path, "base_frame"))
-    assert len(machine.frame_legs) == 3
-    assert any("legcal.base_frame is not given" in note for note in machine.diagnostics)
-
-
-@pytest.mark.parametrize(
-    ("prefix", "names"), [("b.", ["b.1", "b.2", "b.3"]), ("rig/", ["leg1", "leg2", "leg3"])]
-)
-def test_unnamed_legs_have_the_names_of_their_joints_where_these_are_plain(
-    prefix: str, names: list[str], tmp_path: Path
-) -> None:
-    for source, name in ((SHIPPED_URDF, "hexapod.urdf"), (SHIPPED_YAML, "hexapod.yaml")):
-        (tmp_path / name).write_text(re.sub(r"leg(\d)_", rf"{prefix}\1_", source.read_text()))
-    machine = load_mechanism(_without(tmp_path / "hexapod.yaml"))
-    assert list(machine.leg_names[:3]) == names
-    assert (machine.base, machine.platform) == ("base", "platform")
-    assert machine.platform_joint == "platform_free"
-    assert machine.frame_legs == (0, 2, 4)
-
-
 # --- the loaded machine -------------------------------------------------------------------------
 
 
@@ -427,16 +343,6 @@ def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
     assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}
 
 
-def test_parameters_are_zero_where_the_frames_make_them_zero(tmp_path: Path) -> None:
-    drawn = of_types(["US"] * 6)
-    xi = load_mechanism(write_machine(tmp_path, drawn, Layout())).parameters
-    for joints in (xi.base_joints, xi.platform_joints):
-        assert np.all(joints[0] == 0.0)
-        assert np.all(joints[1, 1:] == 0.0)
-        assert joints[2, 2] == 0.0
-        assert np.abs(joints[3:]).min() > 1e-6
-
-
 def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
     machine = load_mechanism("hexapod")
     names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")
@@ -453,23 +359,6 @@ def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
     np.testing.assert_allclose(forward_kinematics(copy, q).as_matrix(), expected, atol=1e-13)
     with pytest.raises(UsageError, match="each of leg1"):
         machine.with_leg_order(["leg1"])
-
-
-def test_a_slider_that_nothing_drives_is_passive_and_frees_the_platform(tmp_path: Path) -> None:
-    path = write_machine(tmp_path, of_types(["US"] * 6), Layout())
-    path.write_text(path.read_text().replace("- leg2_slider\n", "", 1))
-    machine = load_mechanism(path)
-    assert [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE] == [1]
-    assert machine.parameters.passive == (1,)
-    assert any("mobility 6, motors 5" in note for note in machine.diagnostics)
-
-
-def test_an_almost_unit_quaternion_and_keys_of_other_programs_do_no_harm(tmp_path: Path) -> None:
-    text = SHIPPED_YAML.read_text().replace("../urdf/", f"{SHIPPED_URDF.parent}/")
-    text = text.replace("0.951057", "0.9515").replace("0.309017", "0.30903")
-    (tmp_path / "hexapod.yaml").write_text(f"robot_color: red\n{text}")
-    machine = load_mechanism(tmp_path / "hexapod.yaml")
-    assert np.linalg.norm(machine.home.rotation.as_quat()) == pytest.approx(1.0, abs=1e-15)
 
 
 def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from actuated_sessions import MACHINES, frame_legs, machine, session
-from scipy.spatial.transform import RigidTransform, Rotation
+from actuated_sessions import MACHINES, session
 from staged_sessions import Observed, planned
 
 from legcal.calibration.identify import identifiability
@@ -18,10 +17,8 @@ from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.scale import is_scale_open, scale_sources
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable
-from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
-from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.paper.conditions import count_conditions, enough_readings
 from legcal.paper.four_steps import run_base_steps
 from legcal.report.identify import _verdict
@@ -151,17 +148,6 @@ def test_a_free_gain_of_every_carriage_loses_the_scale_too() -> None:
     assert not is_scale_open(Analysis(found, Choices(free=gains - {"motor1.gain"})))
 
 
-def test_a_rod_that_no_view_shows_leaves_a_direction_open_and_is_named() -> None:
-    unseen = np.arange(6) != 1
-    found = {
-        name: Analysis(replace(session(name), seen=session(name).seen & unseen)).full
-        for name in ("delta", "hexaglide")
-    }
-    assert found["hexaglide"].rank == 42  # its readings tell of it
-    (weak,) = found["delta"].weak
-    assert all("2" in name.partition(".")[0] for name in weak.parameters)
-
-
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -178,21 +164,3 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     )
     with pytest.raises(NotIdentifiable, match=wanted):
         check_identifiable(dataset)
-
-
-@pytest.mark.parametrize("name", ["delta", "hexaglide"])
-def test_random_poses_are_closed_and_inside_the_travel_of_actuators(name: str) -> None:
-    legs, R0, t0 = machine(name)
-    home = RigidTransform.from_components(t0, Rotation.from_matrix(R0))
-    travel = np.array([leg.actuator.travel for leg in legs if leg.actuator])
-    rng = np.random.default_rng(0)
-    R, t = random_postures_of_legs(legs, frame_legs(6), home, travel, 12, rng)
-    q = readings_of_rods(legs, R, t)
-    assert np.ptp(q, axis=0).min() > 0.3 * np.ptp(travel, axis=1).min()
-    for leg, a, (low, high) in zip(legs, actuator_index(legs), travel, strict=True):
-        assert leg.actuator is not None
-        reach = R @ leg.B + t - leg.actuator.at(leg.A, q[:, a])
-        assert np.linalg.norm(reach, axis=1) == pytest.approx(leg.q0, abs=1e-9)
-        margin = 0.06 * (high - low)
-        assert q[:, a].min() > low - margin
-        assert q[:, a].max() < high + margin

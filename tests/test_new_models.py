@@ -7,17 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
+from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.files import shipped_names
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import singularity
@@ -75,14 +74,6 @@ def test_shipped_models_are_what_their_tables_give(table: Path, tmp_path: Path) 
         assert machine.mobility == mobility == len(machine.motors)
         assert machine.spatial is (table.stem != "3-rpr")
         assert singularity(machine, machine.home) > 0.05
-
-
-def test_a_table_is_as_good_as_csv(tmp_path: Path) -> None:
-    (table,) = (ROOT / "models" / "tables").glob("*.csv")
-    described = description_of(table, Dimensions(height=820.0))
-    made = create_model(described, tmp_path)
-    for path, folder in ((made.yaml_path, "models"), (made.urdf_path, "urdf")):
-        assert path.read_bytes() == (ROOT / folder / path.name).read_bytes()
 
 
 def test_every_shipped_model_has_a_table_and_the_example_is_the_shipped_hexapod() -> None:
@@ -209,46 +200,6 @@ def test_millimetres_metres_and_csv_give_the_same_files(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
-def test_a_home_that_is_not_given_has_the_legs_at_mid_travel(tmp_path: Path) -> None:
-    machine = made(tmp_path, home=None)
-    np.testing.assert_allclose(inverse_kinematics(machine, machine.home), 0.075, atol=1e-9)
-    assert machine.home.translation[2] > 0.4
-    assert machine.home.rotation.magnitude() < 1e-6
-
-
-def test_a_rod_has_the_length_that_is_given_or_the_one_at_home(tmp_path: Path) -> None:
-    rod = {"type": None, "types": ["SPU", "SPU", "SS"]}
-    free = made(tmp_path, **rod)
-    assert free.q0[2] == pytest.approx(np.hypot(0.44, np.hypot(0.06, 0.104)), abs=1e-12)
-    assert [c.radius for c in free.legs[2].cylinders] == [0.014]
-    lengths = {"offsets": [380, 380, None], "lengths": [None, None, 457], "name": "given"}
-    given = made(tmp_path, **rod, **lengths)  # its home moves onto the rod
-    vector = given.home.apply(given.B_platform[2]) - given.A_base[2]
-    np.testing.assert_allclose([given.q0[2], np.linalg.norm(vector)], 0.457, atol=1e-12)
-
-
-@pytest.mark.parametrize("travel", [[None, [0, 150], [0, 150]], [0, 150]])
-def test_a_passive_slider_reads_its_length_and_moves_freely(
-    tmp_path: Path, travel: list[Any]
-) -> None:
-    passive = {"kinds": ["passive", None, None], "offsets": [None, 380, 380], "travel": travel}
-    machine = made(tmp_path, type="SPS", **passive)
-    leg = machine.legs[0]
-    length = float(np.linalg.norm(machine.home.apply(leg.B) - leg.A))
-    assert (leg.kind, leg.q0) == (LegKind.PASSIVE, 0.0)
-    np.testing.assert_allclose(leg.travel, [0.5 * length, 1.5 * length])
-
-
-def test_names_frames_and_missing_radii_of_the_table_are_kept(tmp_path: Path) -> None:
-    named = {"legs": ["a", "b", "c"], "base_frame": ["c", "a", "b"], "name": "my.tripod"}
-    machine = made(tmp_path, **named, radius=None)
-    assert machine.leg_names == ("a", "b", "c")
-    assert machine.frame_legs == (2, 0, 1)
-    assert all(leg.cylinders == () for leg in machine.legs)
-    document = yaml.safe_load((tmp_path / "models" / "my.tripod.yaml").read_text())
-    assert document["name_mot"] == ["a_prismatic", "b_prismatic", "c_prismatic"]
-
-
 def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
     base = [[400, 0, 0], [-200, 0, 346], [-200, 0, -346]]
     platform = [[140, 0, 0], [-70, 0, 121], [-70, 0, -121]]
@@ -324,16 +275,6 @@ def test_the_delta_is_the_shipped_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
 
 
-def test_a_3upu_turns_only_where_its_axes_are_tilted() -> None:
-    for name, turns in (("3-upu", False), ("3-upu-tilted", True)):
-        machine = load_mechanism(name)
-        T = forward_kinematics(machine, np.array([0.03, 0.07, 0.12]))
-        turned = float((machine.home.inv() * T).rotation.magnitude())
-        assert (turned > 0.05) if turns else (turned < 1e-9)
-
-
-# --- files ------------------------------------------------------------------------------------
-
 HEAD = "type,base_x,base_y,platform_x,platform_y"
 
 
@@ -353,6 +294,9 @@ def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> Non
     (tmp_path / "list.yaml").write_text("- 1\n")
     with pytest.raises(ModelError, match="needed 'key: value' lines"):
         read_table(tmp_path / "list.yaml")
+
+
+# --- files ------------------------------------------------------------------------------------
 
 
 def test_files_that_are_there_stay_without_force(tmp_path: Path) -> None:
@@ -381,7 +325,7 @@ def test_what_stands_in_the_way_leaves_nothing_behind(
         create_model(machine, file / "folder")
 
     def refuse(path: Path) -> None:
-        raise OutOfClass(f"{path}: this machine is outside the method.")
+        raise OutOfClass(Problem("this machine is outside the method.", file=str(path)))
 
     monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
     with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):

@@ -3,15 +3,11 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from csv_rows import read_rows
 from dense_fit import jacobian, residuals
 from fit_sessions import (
-    BOARD,
-    BOARD_SCALE,
     PINHOLE,
     HexapodSession,
     MachineSession,
@@ -26,12 +22,9 @@ from fit_sessions import (
     shifted,
     with_board,
 )
-from simulated import settings
 from thinned import thinned
 
-import legcal
-from legcal.calibration.doctor import detect
-from legcal.calibration.joint_fit.factors import known_gammas, observed_outlines
+from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.gammas import (
     GAMMA_RANGE,
@@ -39,22 +32,16 @@ from legcal.calibration.joint_fit.gammas import (
     GAMMA_TOLERANCE,
     MAX_GAMMA_TRIALS,
     GammaTrials,
-    loses_outlines,
     most_likely,
     next_trial,
 )
 from legcal.calibration.joint_fit.outline_errors import (
-    KINDS,
     LIMB_SIGMA,
-    N_KINDS,
     PLACES,
     RECOVERED_SHARE,
     EdgeBiases,
-    EstimatedGamma,
     NoiseModel,
-    estimated_biases,
     possible_biases,
-    sigmas_at_places,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import (
@@ -67,14 +54,12 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, no_outlines
-from legcal.data.reasons import USED, Reason, Rejection
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception.outline import used_as_before
-from legcal.simulation.dataset import simulate as simulate_folder
 from legcal.simulation.observe import moved_outlines
 from legcal.vision.cylinder import EPSILON
 
@@ -227,37 +212,6 @@ def test_errors_of_corners_are_found_in_their_residuals() -> None:
     np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
 
 
-def test_a_few_wrong_corners_do_little() -> None:
-    session = machine_session("hexapod")
-    measurements, outlines = session.noisy(5)
-    corners = corners_of(session, seed=6)
-    wrong = corners.corner % 9 == 0
-    px = corners.px + np.where(wrong[:, None], [3.0, -4.0], 0.0)
-    seen, start = with_board(session, corners)
-    right = refine(session.legs, measurements, outlines, start, board=seen)
-    bent = refine(
-        session.legs,
-        measurements,
-        outlines,
-        start,
-        board=replace(seen, corners=replace(corners, px=px)),
-    )
-    away = _errors(session, bent) - _errors(session, right)
-    assert np.abs(away / right.estimates.sigma[:30]).max() < 1.0
-    assert {corner for _, _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
-    assert any("disagree with the fit and were rejected" in note for note in bent.notes)
-
-
-def test_rejected_corners_and_a_board_in_no_image_are_left_out() -> None:
-    session = machine_session("hexapod")
-    corners = corners_of(session)
-    none = replace(corners, used=np.zeros(len(corners), dtype=np.bool_))
-    seen, start = with_board(session, none)
-    solution = refine(session.legs, session.measurements, session.outlines, start, board=seen)
-    assert (solution.T_frame_board, solution.quality.rms_corners_px) == ({}, {})
-    assert BOARD_SCALE not in solution.estimates.values
-
-
 def biases_of(session: HexapodSession) -> EdgeBiases:
     """Return all biases that the outlines of a session may share."""
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
@@ -338,14 +292,6 @@ def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: HexapodSess
         np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
 
 
-def test_biases_have_different_names(session: HexapodSession) -> None:
-    possible = biases_of(session)
-    assert len(set(possible.names)) == len(possible.names) == len(possible.kind)
-    assert {"all.bias", "c1.tilt", "leg1.rod.bias"} <= set(possible.names)
-    assert {"c1.leg5.rod.inward.bias", "c1.leg5.rod.sideways.tilt_x"} <= set(possible.names)
-    assert len(possible.of_sizes(np.zeros(N_KINDS))) == 0
-
-
 def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
     start = disturbed_start(session)
     normalised, sizes = [], []
@@ -382,26 +328,6 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
 
 
-def test_errors_at_places_count_where_residuals_hardly_show_them() -> None:
-    """Each is a third of what a place could tell; residuals often say nothing of them."""
-    sigma, rng, n_places, found = 0.02, np.random.default_rng(0), 40, []
-    K = np.diag(np.full(2 * n_places, (0.58 / sigma) ** 2))
-    for _ in range(100):
-        b = sigma * rng.standard_normal(len(K))
-        found.append(sigmas_at_places(K @ b + np.sqrt(K) @ rng.standard_normal(len(K)), K) ** 2)
-    assert np.min(found) > 0.0
-    assert np.sqrt(np.mean(found)) == pytest.approx(sigma, rel=0.2)
-
-
-def test_edges_that_lie_inwards_together_are_noted(session: HexapodSession) -> None:
-    rng = np.random.default_rng(7)
-    outlines = shared_errors(session, rng, 0.0, 0.0, many=0.4)
-    found = refine(session.legs, noisy_readings(session, rng), outlines, disturbed_start(session))
-    (note,) = found.notes
-    assert "common inward or outward bias of 0." in note
-    assert found.quality.shared_px["bias of many edges"] == pytest.approx(0.4, rel=0.6)
-
-
 def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSession) -> None:
     start, shared = disturbed_start(session), []
     for seed in range(3):
@@ -412,22 +338,6 @@ def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSes
         assert found.quality.noise.bias_px == found.quality.noise.tilt_px == 0.0
     assert shared.count(0.0) >= 2  # one set in twenty seems to have some
     assert max(shared) < 0.02  # [px], where points of edges scatter by 0.05 px
-
-
-def test_residuals_of_known_biases_give_their_sizes(session: HexapodSession) -> None:
-    possible = biases_of(session)
-    sigma, found = np.array([0.0, 0.0, 0.06, 0.04, 0.03, 0.0]), []
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
-    K = scores_of(problem, state, possible)[1]
-    rng, value, vector = np.random.default_rng(0), *np.linalg.eigh(K)
-    root = vector * np.sqrt(np.maximum(value, 0.0))
-    for _ in range(25):
-        b = sigma[possible.kind] * rng.standard_normal(len(possible))
-        z = K @ b + root @ rng.standard_normal(len(possible))
-        found.append(estimated_biases(possible, z, K).sigma ** 2)
-    found_sigma = np.sqrt(np.mean(found, axis=0))[: len(KINDS)]
-    assert found_sigma == pytest.approx(sigma, rel=0.15, abs=0.03)
 
 
 def _fit_in_rounds(session: HexapodSession, level: float, n_rounds: int) -> Solution:
@@ -507,78 +417,6 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert found.quality.rms_px < 0.7 * as_linear.quality.rms_px
 
 
-def test_view_whose_gamma_is_given_keeps_it(session: HexapodSession) -> None:
-    views = without_gamma(session.measurements).views
-    given = replace(views[0], camera=PINHOLE)
-    measurements = replace(session.measurements, views=(given, *views[1:]))
-    found = refine(session.legs, measurements, encoded(session), disturbed_start(session))
-    (gamma,) = found.gammas
-    assert gamma.views == ("c2", "c3")
-
-
-def test_used_outlines_say_with_which_gamma_they_were_measured(session: HexapodSession) -> None:
-    outlines = encoded(session)
-    outlines = replace(outlines, gamma=np.full(len(outlines), 1.8))
-    found = known_gammas(outlines, without_gamma(session.measurements))
-    assert found == dict.fromkeys(("c1", "c2", "c3"), 1.8)
-    assert known_gammas(outlines, session.measurements) == {}
-    rejected = replace(outlines, used=np.zeros(len(outlines), dtype=np.bool_))
-    assert known_gammas(rejected, without_gamma(session.measurements)) == {}
-
-
-def test_pull_of_a_gamma_is_that_of_its_sigma(session: HexapodSession) -> None:
-    measurements = without_gamma(session.measurements)
-    start, pulls = disturbed_start(session, joints=0.0, camera=0.0, angle=0.0), []
-    for seed in range(3):
-        found = refine(session.legs, measurements, encoded(session, seed=seed), start).gammas[0]
-        pulls.append((np.log(found.gamma) - LOG_GAMMA) / found.fitted_sigma)
-    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.8
-
-
-def test_gammas_that_are_given_or_of_which_nothing_is_known_are_not_estimated(
-    session: HexapodSession,
-) -> None:
-    outlines, start = encoded(session, log_gamma=0.0), disturbed_start(session)
-    unknown = np.full(len(outlines), np.nan)
-    bare = replace(outlines, gamma=unknown, by_gamma=unknown)
-    given = refine(session.legs, session.measurements, outlines, start)
-    for measurements in (session.measurements, without_gamma(session.measurements)):
-        found = refine(session.legs, measurements, bare, start)
-        assert found.gammas == given.gammas == ()
-        assert found.estimates.values == given.estimates.values
-        np.testing.assert_array_equal(found.estimates.covariance, given.estimates.covariance)
-
-
-def test_each_camera_has_its_own_gamma(session: HexapodSession) -> None:
-    cameras = [
-        replace(PINHOLE, K=PINHOLE.K + 1e-9 * np.diag([k, k, 0.0]), gamma_is_given=k < 2)
-        for k in range(3)
-    ]
-    views = tuple(
-        replace(view, camera=camera)
-        for view, camera in zip(session.measurements.views, cameras, strict=True)
-    )
-    measurements = replace(session.measurements, views=views)
-    of_last = measurements.view[session.outlines.row] == 2
-    outlines = encoded(session)
-    linear = encoded(session, log_gamma=0.0)
-    h = np.where(of_last[:, None], outlines.h, linear.h)
-    ends = np.where(of_last[:, None, None], outlines.ends, linear.ends)
-    mixed = replace(outlines, h=h, ends=ends)
-    (gamma,) = refine(session.legs, measurements, mixed, disturbed_start(session)).gammas
-    assert gamma.views == ("c3",)
-    assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.1)
-
-
-def test_note_on_a_gamma_says_how_well_it_is_known_and_names_few_views() -> None:
-    clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
-    assert clear.startswith(
-        "The gamma of the camera of view c1 is not given: estimated 2.10 +- 0.43 from"
-    )
-    vague = str(EstimatedGamma(tuple(f"c{k}" for k in range(8)), 1.2, 0.4, 1.0))
-    assert "of views c0, c1, c2, c3, c4 and 3 more is not given, and its outlines hardly" in vague
-
-
 def trial(session: HexapodSession, gamma: float, lost: float = np.inf, seed: int = 4) -> Outlines:
     """Return outlines of a camera of LOG_GAMMA, measured with a gamma.
 
@@ -626,16 +464,6 @@ def test_the_most_likely_gamma_is_that_of_the_same_outlines(
     assert np.sqrt(np.mean(np.square(off))) < 0.75 * GAMMA_TOLERANCE
 
 
-def test_fewer_outlines_speak_for_no_gamma(session: HexapodSession) -> None:
-    """Those that are left where most are lost fit better, and many of them are needed."""
-    every, few = trial(session, np.exp(LOG_GAMMA)), trial(session, 3.0, lost=0.02)
-    assert few.used.sum() < 0.5 * every.used.sum()
-    assert loses_outlines(every, few)
-    assert not loses_outlines(few, every)
-    one_less = replace(every, used=every.used & (np.arange(len(every)) != 7))
-    assert not loses_outlines(every, one_less)
-
-
 @pytest.mark.parametrize("truth", [-0.3, 0.0, 0.15, 0.4, 0.65, 0.79, 1.05, 1.4])
 def test_trials_end_at_the_gamma_that_is_likely(truth: float) -> None:
     def merit(log_gamma: Array) -> Array:
@@ -669,39 +497,3 @@ def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession
     assert "of views c1, c2, c3 is undecided: its outlines are about as likely with 1.49" in note
     (note,) = trials.tried(gammas, None).notes({"c1": 2.0})
     assert "fewer of its outlines are usable with 2.00" in note
-
-
-def test_outlines_of_another_gamma_are_used_as_before_whatever_their_width(
-    session: HexapodSession,
-) -> None:
-    before = session.outlines.choose(np.arange(len(session.outlines)) < 4)
-    before = replace(
-        before,
-        used=np.array([True, True, True, False]),
-        reason=(USED, USED, USED, Rejection(Reason.OTHER, "far")),
-    )
-    after = replace(
-        before,
-        used=np.array([False, False, True, True]),
-        reason=(Rejection(Reason.WIDTH, "9.0 px for 8.0 px"), Rejection(Reason.ROUGH), USED, USED),
-    )
-    found = used_as_before(after, before)
-    assert found.used.tolist() == [True, False, True, False]
-    assert [bool(reason) for reason in found.reason] == [False, True, False, True]
-
-
-@pytest.mark.slow
-def test_photographs_without_a_gamma_are_read_with_the_one_they_show(tmp_path: Path) -> None:
-    session = settings(level="photographs", poses=5, views=3, seed=1, tell_gamma=False)
-    data = simulate_folder("hexapod", tmp_path / "data", session).folder
-    assert "gamma" not in (data / "dataset.yaml").read_text()
-    assert any("c1, c2, c3 is not given and was taken as 1" in n for n in detect(data).notes)
-    found = legcal.calibrate(data)
-    (gamma,) = found.solution.gammas
-    assert abs(np.log(gamma.gamma / 2.2)) < 3.0 * gamma.sigma
-    assert gamma.gamma > 1.4
-    assert gamma.measured_with > 1.3
-    read = {row["gamma"] for row in read_rows(data / "observations.csv")} - {""}
-    assert {float(cell) for cell in read} == {gamma.measured_with}
-    again = legcal.calibrate(data)  # by the table, which knows with what it was measured
-    assert again.solution.gammas[0].gamma == pytest.approx(gamma.gamma, rel=1e-6)

@@ -1,11 +1,9 @@
 """Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array
@@ -20,13 +18,9 @@ from legcal.perception.blocks import (
 )
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
-    HALF,
     N_AMPLITUDES,
     N_POWERS,
-    RAMP,
-    SQUARE,
     SURFACES,
-    THREE_HALVES,
     powers,
     profile_functions,
     simple_functions,
@@ -214,16 +208,6 @@ def test_covariance_agrees_with_monte_carlo() -> None:
     assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
 
 
-def test_blocks_that_share_their_errors_count_for_fewer() -> None:
-    rng = np.random.default_rng(3)
-    position = np.linspace(0.0, 1.0, 64)
-    white = 0.1 * rng.standard_normal(64)
-    smooth = np.repeat(white[:16], 4)
-    independent = fitted(fit_straight(position, white, np.full(64, 0.01))).covariance
-    shared = fitted(fit_straight(position, smooth, np.full(64, 0.01))).covariance
-    assert np.trace(shared) > 1.5 * np.trace(independent)
-
-
 # All blocks of outlines together.
 
 HALF_WIDTH, DEPTH = 15.0, 3.5
@@ -238,7 +222,6 @@ def amplitudes(background: float, slope: float, *of_r: float) -> Array:
 BRIGHT = amplitudes(20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0)
 DARK = amplitudes(180.0, 5.0, 30.0, -20.0, 60.0, 10.0, 0.0)
 GLINT = amplitudes(20.0, 0.0, 60.0, 60.0, -120.0, 40.0, 0.0)
-LIMB = amplitudes(20.0, 0.0, 20.0, 0.0, 150.0, 0.0, 0.0)
 
 
 def single(value: float, n: int) -> Array:
@@ -271,21 +254,6 @@ def outline(
     )  # fmt: skip
     read.noise[:] = max(noise, 0.3) ** 2  # as the blocks by themselves show it
     return read
-
-
-@pytest.mark.parametrize(
-    ("column", "power"), [(HALF, 0.5), (RAMP, 1.0), (THREE_HALVES, 1.5), (SQUARE, 2.0)]
-)
-@pytest.mark.parametrize("z", [-1.5, 0.0, 3.0])
-def test_powers_are_means_over_a_gaussian(z: float, column: int, power: float) -> None:
-    def integrand(x: float) -> float:
-        return float(x**power * np.exp(-0.5 * (x - z) ** 2) / np.sqrt(2.0 * np.pi))
-
-    expected, _ = quad(integrand, 0.0, 15.0, points=[max(z, 0.0)], limit=200)
-    values, slopes = powers(np.array([z, z - 1e-4, z + 1e-4]))
-    assert values[0, column] == pytest.approx(expected, rel=2e-3, abs=1e-5)
-    slope = (values[2, column] - values[1, column]) / 2e-4
-    assert slope == pytest.approx(slopes[0, column], rel=1e-2, abs=1e-4)
 
 
 @pytest.mark.parametrize("blur", [0.35])
@@ -337,39 +305,6 @@ def test_covariance_covers_the_errors_and_knows_low_contrast() -> None:
     assert sigma[1] > 2.0 * sigma[0]
 
 
-def test_blocks_of_something_else_do_not_move_the_line() -> None:
-    clean = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
-    other = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
-    other.light[10:16] = 40.0 - 30.0 * other.d[10:16]
-    everything = np.ones(40)
-    one, two = (fit_pooled(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
-    np.testing.assert_allclose(one, two, atol=0.02)
-
-
-def together(parts: Sequence[Blocks]) -> Blocks:
-    """Return the outlines of one image, 40 blocks each."""
-    d, light, weight, position = (
-        np.concatenate([getattr(one, name) for one in parts])
-        for name in ("d", "light", "weight", "position")
-    )
-    bounds, half_width = 40 * np.arange(len(parts) + 1), np.full(len(parts), HALF_WIDTH)
-    both = Blocks.of_pixels(d, light, weight, bounds, position, half_width)
-    both.noise[:] = 0.09
-    return both
-
-
-def test_an_outline_without_blocks_stays_while_others_move_the_blur_of_the_image() -> None:
-    sharp, soft = (
-        outline(contrast * BRIGHT, (0.0, 0.0), blur, noise=0.3)
-        for contrast, blur in ((1.0, 0.3), (0.3, 0.95))
-    )
-    kept = np.repeat([1.0, 0.0, 1.0, 0.0], [6, 34, 40, 40])
-    found = fit_pooled(together([sharp, soft, sharp]), kept, 0.6, DEPTH)
-    np.testing.assert_array_equal(found.ends[2], [0.0, 0.0])
-    assert np.all(np.abs(found.ends[:2]) < 0.3)
-    assert np.isnan(found.by_gamma).tolist() == [False, False, True]
-
-
 def read_with(blocks: Blocks, gamma: float) -> Blocks:
     """Return the same blocks as a camera of gamma 2.2 encodes them, read with a gamma."""
     seen = np.maximum(blocks.light + blocks.level[0], 0.0)
@@ -395,26 +330,3 @@ def test_outlines_know_how_far_they_move_with_gamma(
     assert abs(moved) > 0.05
     assert (moved > 0.0) == (amplitude is BRIGHT)
     assert here.by_gamma[0] == pytest.approx(moved, rel=tolerance)
-
-
-def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
-    """Blocks by themselves hardly know where it is, and together no better than they say."""
-    blocks = outline(LIMB, (0.0, 0.0), 0.55, noise=1.0)
-    blocks.fit(0.55, 2)
-    assert blocks.lines[0] is not None
-    assert np.abs(blocks.lines[0].ends).max() > 0.05
-    blocks.unmove()
-    np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
-    found = fit_pooled(blocks, blocks.shares(), 0.55, DEPTH)
-    assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))
-
-
-def test_an_outline_whose_blur_is_not_that_of_the_others_is_known_less_well() -> None:
-    def sigma(blur: float, among: float) -> float:
-        others = [outline(BRIGHT, (0.0, 0.0), among, noise=1.0, seed=k) for k in range(1, 6)]
-        blocks = together([outline(BRIGHT, (0.0, 0.0), blur, noise=1.0), *others])
-        found = fit_pooled(blocks, np.ones(len(blocks.d)), among, DEPTH)
-        return float(np.sqrt(found.covariance[0, 0, 0]))
-
-    alone = sigma(0.6, 0.6)
-    assert sigma(0.6, 0.5) > 1.5 * alone

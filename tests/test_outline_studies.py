@@ -3,33 +3,25 @@
 import dataclasses
 import io
 import json
-import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TypeVar, cast
+from typing import TypeVar
 
 import bound as bound_study
 import classes_study
 import convergence as convergence_study
 import numpy as np
-import outline_study
 import pytest
 from bound import BoundStudy, errors_of
-from classes_study import FIT, ClassesStudy, as_stated, errors_of_fit, standing_where_held
+from classes_study import FIT, ClassesStudy, as_stated, errors_of_fit
 from convergence import ConvergenceStudy
-from fit_sessions import machine_session, shown_outlines
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from machine_kinds import normalised_error
-from outline_bound import Bound, Determined, at_best, band_of_ratio, bound_of
+from fit_sessions import machine_session
+from outline_bound import Bound, bound_of
 from outline_sessions import (
     MACHINES,
-    SHIPPED,
     Design,
     Noise,
     OutlineSession,
     StartErrors,
-    closed_poses,
     design_of,
     draw_session,
     one_fit,
@@ -38,28 +30,20 @@ from outline_study import (
     Found,
     OutlineStudy,
 )
-from parameter_steps import written_with
 from rich.console import Console
-from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import Start
-from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.motions import components
-from legcal.geometry.types import Array
-from legcal.machine.equations import pose_equations
-from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import platform_in_base
-from legcal.machine.leg import Leg, LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.parameters import parametrization_of, vector_of
-from legcal.simulation.paper import nominal_start
-from legcal.simulation.study import Record, child_seed, run_study
+from legcal.machine.parameters import vector_of
+from legcal.simulation.study import Record, run_study
 
 NOISE = Noise()
 N_POSES = 5
-FAR = ConvergenceStudy.errors
+
+
 FREE_3_UPU = 7  # turns of both axes of a leg at once (six), and its size
 S = TypeVar("S", bound=OutlineStudy)
 FAILED: Record = {"failure": {"kind": "DidNotConverge", "message": "It still fell."}}
@@ -192,59 +176,6 @@ def test_a_bias_of_half_a_sigma_is_told_by_its_parameter_and_a_failed_run_is_cou
     assert not failed["met"]
 
 
-def test_one_ratio_in_a_thousand_is_outside_the_band() -> None:
-    rng = np.random.default_rng(0)
-    low, high = band_of_ratio(20)
-    ratios = np.sqrt(np.mean(rng.normal(size=(200_000, 20)) ** 2, axis=1))
-    outside = np.mean((ratios < low) | (ratios > high))
-    assert 0.0007 < outside < 0.0013  # four standard deviations of this count
-    assert low < 1.0 < high
-
-
-def test_few_runs_are_judged_by_chance_and_say_so() -> None:
-    studies = [_of_bound(40, seed=seed)["pooled"] for seed in range(50)]
-    assert all(studies[0][name]["limits_of_chance"] for name in ("nse", "coverage"))
-    assert np.mean([not _missed(figures) for figures in studies]) >= 0.98
-    assert not _of_bound(40, worse=1.3, stated=1.3)["met"]
-    assert not _of_bound(40, stated=0.7)["met"]
-    assert not _of_bound(0, failures=3)["met"]
-
-
-def test_means_leave_out_sessions_that_failed_and_tell_how_many_and_why() -> None:
-    records = [*map(_record, range(3)), {**_record(3), "default": FAILED}]
-    found = classes_study.judged("synthetic", 12, records)
-    steps = found["estimators"]["default"]
-    assert (steps["runs"], steps["failures"]) == (3, {"DidNotConverge": 1})
-    assert (steps["dX_mm"], steps["dE_deg"]) == pytest.approx((1.0, np.rad2deg(0.02)))
-    assert found["estimators"]["literal"]["dX_mm"] is None
-    assert found["met"]  # the steps may fail; the fit may not
-    told = _printed(ClassesStudy().table([found]))
-    for words in ("failed (4)", "1.00 1.15 (1)", "No leg turns.", "It still fell.", "Machines:"):
-        assert words in told
-    records.append({**_record(), FIT: FAILED})
-    assert not classes_study.judged("synthetic", 12, records)["met"]
-    found = classes_study.judged("synthetic", 12, [{**_record(), FIT: FAILED}])
-    assert found["estimators"][FIT]["dX_mm"] is None
-    assert not found["met"]
-    assert "all failed" in _printed(ClassesStudy().table([found]))
-
-
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 12))
-@settings(max_examples=25, deadline=None)
-def test_the_normalised_squared_error_is_one_by_mean_and_the_same_in_any_units(
-    seed: int, n: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(n, n)) * np.geomspace(1e-3, 1e-6, n)
-    covariance, scale = root @ root.T, np.geomspace(1e-3, 1e3, n)
-    scaled = covariance * np.outer(scale, scale)
-    z = rng.normal(size=n)
-    nse = Determined(np.eye(n), covariance).nse(root @ z)
-    assert nse == pytest.approx(z @ z / n, rel=1e-4)
-    assert Determined(np.eye(n), scaled).nse(scale * (root @ z)) == pytest.approx(nse, rel=1e-4)
-    assert Determined(np.diag(scale), scaled).nse(root @ z) == pytest.approx(nse, rel=1e-4)
-
-
 # Designs, their bound and sessions
 
 
@@ -269,15 +200,6 @@ def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(start - truth)
 
 
-def test_the_bound_is_as_large_as_the_noise() -> None:
-    design = _design("3-rpr")
-    worse = dataclasses.replace(design.outlines, covariance=4.0 * design.outlines.covariance)
-    once = bound_of(design, 2e-6, 0.02)
-    doubled = bound_of(dataclasses.replace(design, outlines=worse), 4e-6, 0.04)
-    assert np.allclose(doubled.covariance, 4.0 * once.covariance, rtol=1e-6)
-    assert np.all(bound_of(design, 2e-5, 0.02).sigma > once.sigma * (1.0 - 1e-9))
-
-
 def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> None:
     design, relative = design_of("delta", 3, 6, Noise().sigma_px), 0.02
     bound = bound_of(design, Noise().sigma_q, relative)
@@ -285,39 +207,6 @@ def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> 
     wanted = relative / np.sqrt(len(design.parts))
     for leg, name in zip(design.legs.nominal, design.legs.names, strict=True):
         assert sigma[f"{name}.length"] / leg.q0 == pytest.approx(wanted, rel=1e-3)
-
-
-def test_a_bound_of_too_little_data_and_legs_that_meet_nowhere_are_refused() -> None:
-    with pytest.raises(NotIdentifiable, match="do not determine"):
-        bound_of(design_of("3-rpr", 1, 1, NOISE.sigma_px), 2e-6, 0.02)
-    design = _design("3-rpr")
-    rods = [dataclasses.replace(leg, kind=LegKind.CONSTANT, q0=5.0) for leg in design.legs.nominal]
-    with pytest.raises(DidNotConverge, match="could not be closed"):
-        closed_poses(rods, design.legs.frame_legs, design.R, design.t)
-
-
-@pytest.mark.parametrize("machine", MACHINES[1:])
-def test_a_true_machine_stands_where_its_legs_allow(machine: str) -> None:
-    design = _design(machine)
-    found = pose_equations(design.legs.nominal, design.R, design.t, by_local=False)
-    assert np.abs(found.of(~found.measured).values).max(initial=0.0) < 1e-12
-    assert np.allclose(_lengths(design), _read(design), rtol=0.0, atol=1e-12)
-    most = 4 if machine.startswith("6-spu") else 3
-    images = np.unique(np.column_stack([design.outlines.row, design.outlines.leg]), axis=0)
-    assert max(np.bincount(images[:, 0])) == most
-
-
-def _lengths(design: Design) -> np.ndarray:
-    """Return the lengths of all legs at all poses."""
-    legs = design.legs.nominal
-    ends = np.array([leg.B for leg in legs]) @ np.swapaxes(design.R, 1, 2) + design.t[:, None]
-    return np.asarray(np.linalg.norm(ends - np.array([leg.A for leg in legs]), axis=-1))
-
-
-def _read(design: Design) -> np.ndarray:
-    """Return the lengths that readings tell."""
-    q0 = np.array([leg.q0 for leg in design.legs.nominal])
-    return np.asarray(design.legs.sign * design.q + q0)
 
 
 def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:
@@ -333,50 +222,6 @@ def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:
     assert np.allclose(white.T @ white / len(white), np.eye(2), atol=0.05)
     assert np.std(readings) == pytest.approx(NOISE.sigma_q, rel=0.05)
     assert np.array_equal(design.outlines.covariance, session.outlines.covariance)
-
-
-def _turn(a: Array, b: Array) -> float:
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-
-
-@pytest.mark.parametrize(("errors", "least"), [(FAR, 1.0), (BoundStudy.errors, 0.0)])
-def test_what_a_fit_starts_from_is_as_wrong_as_is_said(errors: StartErrors, least: float) -> None:
-    design = _design("3-upu-tilted")
-    session = _session("3-upu-tilted", errors)
-    lengths, turns = [], []
-    for nominal, true in zip(session.legs.nominal, design.legs.nominal, strict=True):
-        lengths.append(np.abs([*(nominal.A - true.A), *(nominal.B - true.B), nominal.q0 - true.q0]))
-        for name in ("base_axis", "platform_axis"):
-            turns.append(_turn(getattr(nominal, name), getattr(true, name)))
-    shifts, cameras = [], []
-    for view, T in zip(session.measurements.views, design.T_Rb_camera, strict=True):
-        assert view.T_base_camera is not None
-        shifts.append(np.linalg.norm(view.T_base_camera.translation - T.translation))
-        cameras.append((view.T_base_camera * T.inv()).rotation.magnitude())
-    for found, size, most in (
-        (np.array(lengths)[np.array(lengths) > 0.0], errors.length, 1.0),
-        (turns, errors.angle, 1.5),
-        (shifts, errors.camera_shift, 1.0),
-        (cameras, errors.camera_turn, 1.0),
-    ):
-        assert least * size * (1.0 - 1e-9) <= np.min(found)
-        assert np.max(found) <= most * size * (1.0 + 1e-9)
-
-
-@pytest.mark.parametrize("machine", ["6-spu-coplanar", "3-upu-tilted"])
-def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
-    design, session = _design(machine), _session(machine)
-    nominal = session.legs.nominal
-    start = nominal_start(session.legs, session.measurements, RigidTransform.identity())
-    assert start.legs == nominal
-    q = session.measurements.q_of_poses
-    lengths = session.legs.sign * q + np.array([leg.q0 for leg in nominal])
-    A, B = (np.array([getattr(leg, name) for leg in nominal]) for name in "AB")
-    found = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in start.T_Rb_Re])
-    missed = np.abs(found - lengths).max(axis=1)
-    assert np.mean(missed < 1e-9) > 0.6  # of the poses; others are beyond the nominal model
-    away = [np.linalg.norm(T.translation - t) for T, t in zip(start.T_Rb_Re, design.t, strict=True)]
-    assert 1e-4 < np.median(away) < 0.02  # neither the truth nor another assembly mode
 
 
 # A machine of which some directions stay open
@@ -404,22 +249,6 @@ def open_machine() -> tuple[Design, OutlineSession, Solution]:
     return design, session, one_fit(session, NOISE.radius_sigma)
 
 
-def test_the_machine_that_stands_where_the_fit_holds_shows_the_same_as_the_true_one(
-    open_machine: tuple[Design, OutlineSession, Solution],
-) -> None:
-    design, session, _ = open_machine
-    there = standing_where_held(*open_machine)
-    true = design.legs.nominal
-    xi, truth = (vector_of(design.parametrization, d.legs.nominal, true) for d in (there, design))
-    assert np.abs(xi - truth).max() > 1e-3  # far off, in what nothing shows
-    cameras = tuple(T.inv() for T in there.T_Rb_camera)
-    stands = Start(there.legs.nominal, cameras, there.poses, "there")
-    shown = shown_outlines(there.legs.radii, session.measurements, stands)
-    ends = design.camera.undistort(design.outlines.ends)
-    assert np.abs(design.camera.line_offset(shown.h[:, None], ends)).max() < 1e-7  # [px]
-    assert np.abs(_lengths(there) - _read(there)).max() < 1e-10
-
-
 def test_errors_along_what_is_held_do_not_count(
     open_machine: tuple[Design, OutlineSession, Solution],
 ) -> None:
@@ -437,24 +266,6 @@ def test_errors_along_what_is_held_do_not_count(
     assert 0.2 < errors["nse"] < 2.5
     assert 0.2 < errors["of_bound"] < 2.5
     assert len(errors["of_sigma"]) == 3  # offsets
-
-
-def test_the_bound_of_what_is_determined_is_the_bound_where_nothing_is_open() -> None:
-    design, whole = _design("3-rpr"), _bound("3-rpr")
-    best, n = at_best(design, NOISE.sigma_q, NOISE.radius_sigma), len(design.parametrization)
-    np.testing.assert_allclose(
-        np.linalg.inv(best.parts) @ best.covariance @ np.linalg.inv(best.parts.T),
-        whole.covariance[:n, :n],
-        rtol=1e-6,
-        atol=1e-18,
-    )
-    fewer = at_best(design, NOISE.sigma_q, NOISE.radius_sigma, n_held=2)
-    assert fewer.rank == n - 2
-    # What is known best is known no worse where something else is held.
-    inside = np.linalg.inv(fewer.parts @ whole.covariance[:n, :n] @ fewer.parts.T)
-    assert np.all(
-        np.linalg.eigvalsh(np.linalg.inv(fewer.covariance) - inside) > -1e-3 * inside[0, 0]
-    )
 
 
 # Runs
@@ -500,53 +311,6 @@ def test_the_study_of_classes_compares_nominal_model_steps_and_fit(output: Path)
     assert all("2 runs are too few" in text for text in (page, told))
 
 
-def test_the_session_of_a_machine_does_not_depend_on_the_others(output: Path) -> None:
-    line = json.loads((output / "bound" / "runs.jsonl").read_text().splitlines()[2])
-    both = BoundStudy(("3-upu-tilted", "3-rpr"), n_poses=N_POSES)
-    record = both.one_run(child_seed(0, 1))
-    assert record["3-rpr"] == line["record"]["3-rpr"]
-
-
-def test_a_step_or_a_fit_that_fails_is_counted_with_its_reason(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def steps_fail(session: OutlineSession, criteria: str) -> tuple[Leg, ...]:
-        raise NotIdentifiable(f"Nothing is determined by the {criteria} steps.")
-
-    def fit_fails(session: OutlineSession, radius_sigma: float) -> Solution:
-        raise DidNotConverge("It did not.")
-
-    for module, study in (
-        (bound_study, _quick(BoundStudy)),
-        (convergence_study, _quick(ConvergenceStudy)),
-    ):
-        monkeypatch.setattr(module, "one_fit", fit_fails)
-        result = run_study(study, 2)
-        (found,) = result.document()["machines"]
-        assert not found["met"]
-        assert 2 in (found.get("refused"), found.get("failed"))
-        assert "DidNotConverge" in _printed(study.table(result.document()["machines"]))
-    monkeypatch.setattr(classes_study, "staged_legs", steps_fail)
-    monkeypatch.setattr(classes_study, "one_fit", fit_fails)
-    classes = _quick(ClassesStudy)
-    result = run_study(classes, 2)
-    (found,) = result.document()["machines"]
-    assert found["estimators"][FIT]["failures"] == {"DidNotConverge": 2}
-    assert found["estimators"]["nominal"]["runs"] == 2
-    told = " ".join(_printed(classes.table(result.document()["machines"])).split())
-    assert "failed in 2 of 2 sessions with NotIdentifiable, the first time: Nothing" in told
-
-
-def test_a_parameter_that_was_not_estimated_is_a_failure() -> None:
-    design, session = _design("3-rpr"), _session("3-rpr")
-    solution = one_fit(session, NOISE.radius_sigma)
-    status = {**solution.estimates.status, "leg1.offset": "weak"}
-    found = dataclasses.replace(solution.estimates, status=status)
-    held = dataclasses.replace(solution, estimates=found)
-    with pytest.raises(NotIdentifiable, match=r"leg1\.offset"):
-        errors_of(design, session, held)
-
-
 def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -578,45 +342,3 @@ def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
 
 
 # Commands
-
-
-def test_every_shipped_model_is_a_machine_of_the_study_of_classes() -> None:
-    assert sorted(SHIPPED) == shipped_names()
-
-
-@pytest.mark.parametrize(
-    ("study", "words", "message"),
-    [
-        (BoundStudy, ["--machine", "4-rpr"], "found the machines 4-rpr, needed some of 6-spu"),
-        (BoundStudy, ["--machine", "3-rpr"] * 2, "each once"),
-        (ConvergenceStudy, ["--machine", "hexapod"], "found the machines hexapod"),
-    ],
-)
-def test_wrong_use_of_a_benchmark_is_one_sentence(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    study: type[OutlineStudy],
-    words: list[str],
-    message: str,
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["study", *words])
-    assert outline_study.run(study, "A study.") == 2
-    assert message in capsys.readouterr().err
-
-
-def test_normalised_errors_of_axes_count_from_the_nominal_ones(tmp_path: Path) -> None:
-    nominal = load_mechanism("3-rps")
-    found, rng = parametrization_of(nominal), np.random.default_rng(2)
-    step = np.where([unit == "rad" for unit in found.units], 0.01, 2e-3)
-    away = step * rng.uniform(-1.0, 1.0, len(found))
-    sigma = 1e-3 * step
-    sigma[0] = 0.0  # a parameter that is held
-    error = sigma * rng.normal(size=len(found))
-    written = [
-        written_with(nominal, found, by, tmp_path / name).yaml_path
-        for name, by in {"truth": away, "calibrated": away + error}.items()
-    ]
-    of_values = SimpleNamespace(parametrization=found, value_covariance=np.diag(sigma**2))
-    solution = SimpleNamespace(kinematic=of_values)
-    stated = normalised_error(nominal, written[1], written[0], cast(Solution, solution))
-    assert stated == pytest.approx(np.mean((error[1:] / sigma[1:]) ** 2), rel=1e-6)

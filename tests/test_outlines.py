@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
-from six_photographs import six_photographs
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
@@ -18,10 +17,8 @@ from legcal.perception.blocks import BlockLine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
 from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone
-from legcal.perception.photographs import measure_photographs, with_measured_radii
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import MeasuredEdge
-from legcal.progress import no_progress
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 from legcal.vision.visibility import END_COVER, visible_segments
@@ -191,20 +188,6 @@ def test_outlines_are_straight_in_space_and_not_in_the_picture() -> None:
     assert sigma.min() > 0.03  # what the model leaves out, however little noise there is
 
 
-def test_edges_near_the_leg_are_not_taken_for_it() -> None:
-    cam = camera()
-    bars = [bar(0.0, 0.03, 150.0)]
-    image = render(cam, bars, 40.0, blur=0.5, supersample=3)
-    for offset, level in ((-45, 230.0), (-25, 10.0), (18, 90.0), (33, 220.0)):
-        slope = round(2 * 0.03 * F / 0.82)
-        start, end = (181 + offset - slope // 2, 269), (181 + offset + slope // 2, 0)
-        cv2.line(image, start, end, level, 2, cv2.LINE_AA)
-    found = detect(cam, bars, image.astype(np.uint8))
-    assert np.any(found.used), found.reason
-    error = errors(cam, bars, found)
-    assert np.all(np.abs(error) < 1.0)
-
-
 def test_legs_behind_others_end_where_they_are_hidden() -> None:
     cam = camera()
     front, behind = bar(0.0, 0.08, 60.0, depth=0.7), bar(0.0, -0.08, 170.0, depth=0.9)
@@ -232,15 +215,6 @@ def test_outlines_say_how_well_they_were_seen() -> None:
         assert np.all(np.isnan(values[4:]))
 
 
-def test_a_leg_that_another_covers_is_left_out_by_its_name() -> None:
-    cam = camera()
-    front, behind = bar(0.0, 0.03, 60.0, 0.03, 0.6), bar(0.0, 0.04, 170.0, depth=0.9)
-    image = render(cam, [front, behind], 30.0, blur=0.5, supersample=3)
-    found = detect(cam, [front, behind], image.astype(np.uint8))
-    assert found.reason[2:] == (Rejection(Reason.HIDDEN, "leg1"),) * 2
-    assert np.all(np.isnan(found.h[2:]))
-
-
 def test_what_is_not_there_is_rejected_with_the_reason() -> None:
     cam = camera()
     bars = [bar(0.0, 0.03, 150.0), bar(0.9, 0.0, 150.0)]
@@ -266,29 +240,6 @@ def test_a_mirrored_image_shows_mirrored_outlines_at_its_border_too() -> None:
     again = detect(other, [mirrored], image[:, ::-1].copy(), off=0.0)
     assert found.reason == again.reason[::-1]
     np.testing.assert_array_equal(found.used, [False, True])
-
-
-def test_a_leg_of_another_radius_is_not_trusted() -> None:
-    cam = camera()
-    bars = [bar(0.0, 0.03, 150.0, radius=0.02)]
-    image = render(cam, bars, 40.0, blur=0.5, supersample=3).astype(np.uint8)
-    assert np.all(detect(cam, bars, image).used)
-    found = detect(cam, bars, image, radius=0.016)
-    assert not np.any(found.used)
-
-
-def test_a_faint_leg_gets_a_wide_covariance_or_none() -> None:
-    cam = camera()
-    bars = [bar(0.0, 0.03, 60.0)]
-    flat = Light(ambient=1.0, diffuse=0.0)
-    clear = detect(cam, bars, render(cam, bars, 20.0, flat, supersample=3).astype(np.uint8))
-    faint = detect(
-        cam, bars, np.rint(render(cam, bars, 52.0, flat, supersample=3)).astype(np.uint8)
-    )
-    assert np.all(clear.used)
-    assert np.any(faint.used), faint.reason
-    for i in np.flatnonzero(faint.used):
-        assert np.trace(faint.covariance[i]) > 2.0 * np.trace(clear.covariance[i])
 
 
 def test_tube_and_rod_are_two_parts() -> None:
@@ -376,12 +327,6 @@ def test_of_overlapping_cylinders_the_thicker_one_is_seen(
         assert [segment.link for segment in segments] == [one[0] for one in expected if one]
 
 
-def test_equally_long_cylinders_have_one_name_at_every_length() -> None:
-    halves = [Cylinder("a", 0.01, "platform", -0.3, 0.0), Cylinder("b", 0.01, "base", 0.0, 0.3)]
-    lengths = np.linspace(0.35, 0.608, 100)
-    assert {s.link for x in lengths for s in visible_segments(halves, float(x))} == {"b"}
-
-
 # Which of two measured edges of a part are its outlines.
 
 WIDTH = np.array([20.0, 18.0])  # by the radius [px]
@@ -412,19 +357,6 @@ def _judged(
     return verdict(pair, np.stack([np.zeros(2), WIDTH]), LENGTH, (one, two), window)
 
 
-def test_an_outline_before_a_saturated_background_needs_some_of_its_step() -> None:
-    whole, most = _edge(np.zeros(2)), replace(_edge(WIDTH), clipped=0.2)
-    assert _judged(0.0, whole, most).reasons == (USED, USED)
-    found = _judged(0.0, whole, replace(most, clipped=0.5))
-    assert found.reasons[1] == Rejection(Reason.OVEREXPOSED, "1.0")
-
-
-def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:
-    found = _judged(0.0, _edge(np.zeros(2)), _edge(WIDTH + 0.5))
-    assert found.reasons == (USED, USED)
-    assert found.bias == 0.0
-
-
 @pytest.mark.parametrize(
     ("off", "used"),
     [((1.0, 0.0), (False, True)), ((0.0, -1.0), (True, False)), ((0.6, -0.6), (False, False))],
@@ -453,33 +385,6 @@ def test_of_two_edges_too_near_to_each_other_the_surer_is_the_outline(surer: int
     assert found.bias == pytest.approx(3.0 * NARROW_BIAS)
 
 
-@pytest.mark.parametrize(
-    ("off", "sigma", "is_step"),
-    [(3.0, 0.1, True), (-3.0, 0.28, True), (-3.0, 0.1, False)],
-    ids=["too far from each other", "about as sure", "no step"],
-)
-def test_otherwise_edges_at_another_distance_are_not_used(
-    off: float, sigma: float, is_step: bool
-) -> None:
-    one = _edge(np.zeros(2), sigma=sigma, is_step=is_step)
-    found = _judged(off, one, _edge(WIDTH + off, sigma=0.3))
-    assert all(reason.reason is Reason.WIDTH for reason in found.reasons)
-
-
-@pytest.mark.parametrize(
-    ("off", "alone", "kept", "used"),
-    [(0.5, False, 1.0, True), (4.0, False, 1.0, False), (4.0, True, 1.0, True),
-     (0.5, False, 0.4, False)],
-    ids=["found at its distance", "found elsewhere", "convincing alone", "half of it seen"],
-)  # fmt: skip
-def test_an_edge_whose_partner_was_found_but_not_measured(
-    off: float, alone: bool, kept: float, used: bool
-) -> None:
-    found = _judged(off, _edge(np.zeros(2), kept=kept), None, alone=alone)
-    expected = USED if used else Rejection(Reason.PARTNER, Reason.FAINT)
-    assert found.reasons == (expected, Rejection(Reason.FAINT))
-
-
 @pytest.mark.parametrize(("beside", "used"), [(0.5, True), (3.0, False)])
 def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, used: bool) -> None:
     found = _judged(6.0, _edge(np.full(2, beside)), _edge(WIDTH + 6.0), window=5.0)
@@ -487,25 +392,3 @@ def test_an_edge_where_other_legs_predict_it_needs_no_partner(beside: float, use
     assert found.reasons[1].reason is Reason.WIDTH
     lone = _judged(6.0, _edge(np.full(2, beside)), None, alone=True, window=5.0)
     assert (lone.reasons[0] == USED) is used
-
-
-def test_a_width_that_most_outlines_of_a_cylinder_share_speaks_against_none_of_them() -> None:
-    photographs, _, fitted = six_photographs()
-    true = [leg.cylinders for leg in photographs.machine.legs]
-    wrong = photographs.machine.with_radii(lambda _, c: 0.86 * c.radius)
-    biased = replace(photographs, machine=wrong)
-    before = measure_photographs(biased, fitted, no_progress)
-    other = with_measured_radii(biased, fitted, before)
-    assert other is not None
-    ratios = np.array(
-        [
-            one.radius / of_truth.radius
-            for leg, cylinders in zip(other.machine.legs, true, strict=True)
-            for one, of_truth in zip(leg.cylinders, cylinders, strict=True)
-        ]
-    )
-    changed = ratios > 0.87
-    assert changed.sum() >= len(ratios) // 2
-    np.testing.assert_allclose(ratios[changed], 1.0, atol=0.06)
-    after = measure_photographs(other, fitted, no_progress)
-    assert after.used.sum() > before.used.sum()

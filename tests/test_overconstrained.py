@@ -13,34 +13,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bound import ERRORS
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import exechon, exechon_and_ups, four_upu, two_upr_two_sps
-from outline_sessions import Noise, design_of, draw_session, made, one_fit
+from machines import exechon, four_upu, two_upr_two_sps
 from scipy.spatial.transform import Rotation
 from thinned import thinned
 
-import legcal
 from legcal import identifiability
-from legcal.calibration.joint_fit.diagnostics import refuse_contradicted_values
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import LegConstraints, start_from
 from legcal.errors import OutOfClass
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import follow_poses, inverse_kinematics, platform_in_base
+from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, moved_legs, parametrization_of
 from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import machine_ties, on_ties
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model
 
 KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties
@@ -133,30 +127,6 @@ def test_true_machines_close_and_fits_find_them(kind: str, tmp_path: Path) -> No
         assert np.abs(np.concatenate([leg.A - exact.A, leg.B - exact.B])).max() < 1e-7
 
 
-@pytest.mark.slow
-def test_a_wrong_minimum_that_light_would_have_to_explain_is_left() -> None:
-    """From this start the first view ends up behind the machine, its edges 7 px off together."""
-    noise = Noise()
-    design = design_of("2-upr-2-sps", 3, 15, noise.sigma_px)
-    rng = np.random.default_rng(np.random.SeedSequence(0).spawn(164)[163])
-    session = draw_session(design, noise, ERRORS, rng)
-    found = one_fit(session, noise.radius_sigma)
-    for leg, true in zip(found.legs, design.legs.nominal, strict=True):
-        assert np.abs(np.concatenate([leg.A - true.A, leg.B - true.B])).max() < 1e-3
-
-
-def test_a_prior_of_what_is_tied_is_not_asked_of_the_measurements(tmp_path: Path) -> None:
-    machine = written("exechon", LAYOUTS[0], tmp_path)
-    session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
-    names = [n for n in session.legs.parametrization.names if n.endswith(".twist")]
-    choices = Choices(priors=dict.fromkeys(names, Prior(0.0, 0.1)))
-    measured = session.measurements, session.outlines
-    problem = build_fit(session.legs, *measured, choices=choices)
-    assert set(names) - set(problem.named)
-    state = problem.begin(session.start)
-    refuse_contradicted_values(problem, session.start, state, with_priors=True)
-
-
 def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:
     machine = load_mechanism(write_machine(tmp_path, four_upu(), LAYOUTS[0]))
     legs, found = geometries(machine), parametrization_of(machine, twists=True)
@@ -218,25 +188,3 @@ def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
     assert moved[2] > 1e-3
     assert moved[3:].max() < 1e-9
     assert np.isfinite(moved).all()
-
-
-@pytest.mark.parametrize("drawn", [two_upr_two_sps, exechon_and_ups])
-def test_ways_of_dependent_constraints_need_no_short_steps(
-    drawn: Callable[[], MachineSpec], tmp_path: Path
-) -> None:
-    machine = load_mechanism(write_machine(tmp_path, drawn(), LAYOUTS[0]))
-    home = inverse_kinematics(machine, machine.home)
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    q = home + 0.4 * (np.random.default_rng(1).uniform(lower, upper, (30, len(home))) - home)
-    _, quickly = follow_poses(machine, machine.home, home, q, 1.0 / 16.0)
-    _, slowly = follow_poses(machine, machine.home, home, q, 1.0 / 256.0)
-    assert np.sum(slowly == 1.0) > 5
-    np.testing.assert_array_equal(quickly == 1.0, slowly == 1.0)
-
-
-def test_twists_that_ties_hold_are_called_tied_and_not_fixed(tmp_path: Path) -> None:
-    machine, folder = made("exechon", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=4, seed=1))
-    platform = legcal.calibrate(folder).platform
-    assert platform is not None
-    assert [one.what for one in platform.effects] == ["twists that are tied, each 0.1 deg off,"]

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_legs import closed_leg
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.axes import axis_angles, turned_axis
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.motions import register_groups, register_in_plane, register_points
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import EquationKind, JointType
@@ -90,13 +89,6 @@ def test_an_outlier_loses_its_weight() -> None:
     clean, wrong = (solve_least_squares(_line(y), weighted=True).x for y in (0.0, 0.1))
     plain = solve_least_squares(_line(0.1)).x
     assert np.abs(wrong - clean).max() < 0.02 * np.abs(plain - clean).max()
-
-
-def test_a_curved_problem_converges_from_far_away() -> None:
-    x = ca.SX.sym("x", 2)
-    residuals = ca.vertcat(1.0 - x[0], 10.0 * (x[1] - x[0] ** 2))
-    solution = solve_least_squares(_problem("A valley", x, residuals, [-1.2, 1.0]))
-    assert np.allclose(solution.x, 1.0, atol=1e-9)
 
 
 def test_a_direction_that_no_residual_shows_is_undetermined() -> None:
@@ -230,24 +222,3 @@ def test_turns_of_an_axis_are_its_angles_from_the_nominal_one(
 
 
 # Registration of points
-
-
-def test_groups_of_points_are_registered_as_each_alone() -> None:
-    rng = np.random.default_rng(2)
-    group = np.array([0, 1, 0, 1, 1, 0, 1])
-    P_from, P_to = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
-    R, t = register_groups(P_from, P_to, group)
-    for g in range(2):
-        alone = register_points(P_from[group == g], P_to[group == g])
-        assert np.allclose(R[g], alone.rotation.as_matrix(), atol=1e-12)
-        assert np.allclose(t[g], alone.translation, atol=1e-12)
-
-
-def test_two_points_register_a_plane_whatever_their_heights() -> None:
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.3, 0.3, (2, 2)), [0.0, 0.02]])
-    T = RigidTransform.from_components([0.1, 0.2, 0.0], Rotation.from_rotvec([0.0, 0.0, 0.7]))
-    ends = np.asarray(T.apply(points)) + np.array([0.0, 0.0, 0.005])
-    R, t = register_in_plane(points, ends, np.zeros(2, dtype=np.intp))
-    np.testing.assert_allclose(R[0], T.rotation.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(t[0], T.translation, atol=1e-12)

@@ -17,11 +17,11 @@ from photograph_files import exif, jpeg, png, tiff, undecodable_png
 from legcal import calibrate, calibrate_camera, load_dataset
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.data.photograph_notes import compression_notes
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError, NotVisible, Place
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_facts import ImageFacts, read_facts
-from legcal.vision.image_file import BadImage, image_size, inspect_image, read_image
+from legcal.vision.image_file import BadImage, decode_image, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 
@@ -136,10 +136,10 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(
     path = tmp_path / "a.jpg"
     path.write_bytes(content)
     with pytest.raises(DatasetError) as refused:
-        read_image(path, CAMERA, "table, row 3")
+        decode_image(path, CAMERA, Place("table", 3))
     (sentence,) = refused.value.problems
     assert [w for w in ("table, row 3: image", "a.jpg", *words) if w not in sentence] == []
-    assert inspect_image(path, CAMERA, "table, row 3")[1] == sentence
+    assert str(inspect_image(path, CAMERA, Place("table", 3))[1]) == sentence
     assert cv2.utils.logging.getLogLevel() == level
     assert capfd.readouterr().err == ""
 
@@ -200,15 +200,6 @@ def test_an_image_unlike_the_others_is_named_with_the_difference(
         del folder.entry["views"]["c2"]
     (note,) = notes(folder, {1: content})
     assert [word for word in [*ONE, *words] if word not in note] == []
-
-
-def test_what_is_written_only_where_it_is_so_differs_from_silence(folder: Folder) -> None:
-    silent = {key: value for key, value in PHONE.items() if key not in ("zoom", "software")}
-    files = dict.fromkeys(range(4), jpeg(PICTURE, 95, exif(**silent)))
-    assert notes(folder, files) == []
-    for said, word in (({"zoom": 1.1}, "digital zoom of 1.1"), ({"software": "GIMP"}, "'GIMP'")):
-        (note,) = notes(folder, files | {1: jpeg(PICTURE, 95, exif(**silent | said))})
-        assert f"{word} ({NAMES[1]}) and images that say nothing of it ({NAMES[0]}," in note
 
 
 def test_a_refusal_names_what_may_be_its_cause(
@@ -345,9 +336,3 @@ def test_the_camera_file_records_its_photographs(
     camera = read_camera(tmp_path / "camera.yaml")
     assert camera.photographs["focal_length_mm"] == [4.25]
     assert camera.photographs["taken_size"] == [(448, 336)]
-
-
-def test_photographs_of_a_board_by_two_cameras_are_warned_of(boards: Callable[..., Path]) -> None:
-    found = calibrate_camera(boards(focal=6.0), "chessboard:9x6:30mm")
-    (warning,) = (w for w in found.warnings if "No one camera" in w)
-    assert [w for w in ("b2.jpg", "6 mm", "4.25 mm", "b0.jpg") if w not in warning] == []

@@ -1,6 +1,5 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
-import io
 import json
 import os
 import pickle
@@ -9,9 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,8 +16,6 @@ import pytest
 from command_line import run
 from csv_rows import read_rows
 from fit_sessions import machine_session
-from machines import with_round_arms
-from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
 import legcal
@@ -28,27 +23,18 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
-from legcal.machine.actuator import Pulses
-from legcal.machine.configurations import random_configurations
-from legcal.machine.feasibility import Feasibility
-from legcal.machine.kinematics import follow, inverse_kinematics
+from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import Cylinder
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import slider_columns
-from legcal.machine.model_builder import create_model
-from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
-from legcal.planning.goals import criterion_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
-from legcal.planning.noise import read_noise
 from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.request import difference
 from legcal.planning.session import write_session
-from legcal.report.plan import checklist, plan_table
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
@@ -204,48 +190,6 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
-@pytest.mark.usefixtures("answered_signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("place", ["legcal.cli.plan._previews", "legcal.planning.session._poses"])
-def test_a_second_signal_ends_a_plan_at_once_and_leaves_no_session(
-    place: str,
-    number: signal.Signals,
-    planned: Plan,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def stopped(*_found: Any, **_more: Any) -> Plan:
-        signal.raise_signal(signal.SIGINT)
-        return planned
-
-    def stopped_again(*_found: Any) -> Any:
-        signal.raise_signal(number)
-        pytest.fail("the second signal was not answered")
-
-    monkeypatch.setattr("legcal.planning.request.plan", stopped)
-    monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
-    monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr(place, stopped_again)
-    assert run(monkeypatch, *WORDS, "-o", tmp_path / "session") == 130
-    assert capsys.readouterr().err == "legcal: Stopped before the end.\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_stopped_search_says_that_it_missed_its_target() -> None:
-    found = legcal.plan(
-        "3-rpr",
-        target=1e-6,
-        cameras=2,
-        bounds=parse_bounds(BOUNDS),
-        setting=FEW,
-        stop=lambda: True,
-    )
-    assert found.error is not None
-    missed = f"error is {1e3 * found.error.mean_displacement:.3f} mm, not 0.001 mm"
-    assert any(missed in note for note in found.notes)
-
-
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     planned: Plan, shot: Path
 ) -> None:
@@ -329,97 +273,6 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
     assert missing <= 0.1 * agreeing
 
 
-@pytest.mark.system
-def test_arms_that_are_cylinders_count_as_a_calibration_has_them(tmp_path: Path) -> None:
-    """They are seen where the simulation shows them, and their lines become as well known."""
-    machine = create_model(with_round_arms("delta"), tmp_path).machine
-    setting = replace(FEW, shift=0.0, turn=0.0)
-    plan = legcal.plan(machine, images=15, seed=1, noise=WHITE, setting=setting)
-    write_session(plan, tmp_path / "session")
-    lengths = {"leg1.base:leg1.platform": 5e-5}
-    settings = SimulationSettings(
-        plan=tmp_path / "session", level=Level.OUTLINES, seed=2, lengths=lengths
-    )
-    simulate(machine, tmp_path / "shot", settings)
-    shown = load_dataset(tmp_path / "shot").observations
-    assert shown is not None
-    keys = {key for key in shown.row_keys() if key[2].startswith("arm")}
-    row, planned = 0, set()
-    for view in plan.views:
-        of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
-        planned |= {key for key in of_view.row_keys() if key[2].startswith("arm")}
-        row += len(view.poses.poses)
-    assert keys <= planned
-    assert len(keys) >= 0.65 * len(planned)
-    found = legcal.calibrate(tmp_path / "shot", output=tmp_path / "out")
-    stated = dict(
-        zip(found.solution.estimates.names, found.solution.estimates.sigma.tolist(), strict=True)
-    )
-    names = [name for name in plan.names if ParameterId.parse(name).kind in ARMS]
-    sigma = dict(zip(plan.names, plan.sigma.tolist(), strict=True))
-    ratios = [stated[name] / sigma[name] for name in names]
-    assert len(ratios) == 12
-    assert 0.75 < np.exp(np.mean(np.log(ratios))) < 1.3
-    assert found.platform is not None
-    assert found.platform.workspace is not None
-    assert plan.error is not None
-    stated_error = found.platform.workspace.mean_displacement
-    assert plan.error.mean_displacement == pytest.approx(stated_error, rel=0.15)
-
-
-def test_bias_of_single_outlines_in_a_result_counts_as_errors_at_places(tmp_path: Path) -> None:
-    """It does not fall with their length, and fits to few images cannot tell the two apart."""
-    noise, place = {"scale": 0.7, "bias_px": 0.05, "tilt_px": 0.01}, "tilt of an edge at a place"
-    for shared, places in (({}, (0.05, 0.01)), ({place: 0.02}, (0.05, 0.02))):
-        found = {"legcal_result": 1, "residuals": {"noise": noise, "shared_px": shared}}
-        (tmp_path / "result.json").write_text(json.dumps(found))
-        assert read_noise(tmp_path).places_px == places
-
-
-def test_a_box_between_the_places_around_a_machine_is_used(small_search: None) -> None:
-    """From where a machine is shown as well, wherever that is."""
-    predictor = Predictor(load_mechanism("hexapod"), sample_camera(), WHITE, 1e-6)
-    poses = random_configurations(predictor.machine, 4, np.random.default_rng(0))
-    around = [
-        p.T_base_camera.translation for p in planner._places(Task(predictor, 6, 1, FEW), poses)
-    ]
-    middle = np.mean(around[:2], axis=0)  # one nearer than the other
-    box = middle[:, None] + [-0.01, 0.01]
-    assert not any(np.all((where > box[:, 0]) & (where < box[:, 1])) for where in around)
-    places = planner._places(Task(predictor, 6, 1, FEW, bounds=box), poses)
-    assert places
-    assert all(place.is_inside(box) for place in places)
-
-
-def test_cameras_of_a_machine_that_hangs_stand_upright(small_search: None) -> None:
-    """A tripod stands on the ground, whichever way the platform is."""
-    places = planner._places(
-        Task(Predictor(load_mechanism("delta"), sample_camera(), WHITE, 1e-6), 6, 1, FEW),
-        random_configurations(load_mechanism("delta"), 4, np.random.default_rng(0)),
-    )
-    below = [place.T_base_camera.translation[2] < -0.5 for place in places]
-    assert any(below)
-    assert all(place.T_base_camera.rotation.as_matrix()[2, 1] < 0.0 for place in places)
-
-
-def test_the_way_between_planned_poses_is_free(planned: Plan) -> None:
-    machine = planned.machine
-    feasibility, columns = Feasibility(machine), slider_columns(machine, machine.motors)[0]
-    stations = [machine.home_configuration]
-    for view in planned.views:  # one after the other, without a way home between them
-        stations += [*view.poses.configurations]
-    for k, via in enumerate([via for view in planned.views for via in view.via]):
-        stops = [stations[k]]
-        if via:
-            stops.append(stations[0 if via == "home" else int(via)])
-        stops.append(stations[k + 1])
-        for here, there in pairwise(stops):
-            for part in np.linspace(0.1, 1.0, 10):
-                q = here[columns] + part * (there - here)[columns]
-                at = follow(machine, here, q)
-                assert feasibility.problem(at, of_motors=False) is None
-
-
 def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
     task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
     view = planned.views[0]
@@ -434,16 +287,6 @@ def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -
     session.renewed()
     sigma = np.sqrt(np.diagonal(session.covariance))
     assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
-
-
-def test_without_poses_a_plan_makes_the_volume_of_the_covariance_small() -> None:
-    legs = Predictor(load_mechanism("3-rpr"), sample_camera(), WHITE, 1e-6).legs
-    p = len(legs.parametrization.names)
-    criterion = criterion_of(None, legs, np.eye(p))
-    narrow = np.diag(np.r_[1e-12, np.full(p - 1, 1e-8)])
-    one, twice, smaller = criterion(np.stack([1e-8 * np.eye(p), 4e-8 * np.eye(p), narrow]))
-    assert twice == pytest.approx(2.0 * one)
-    assert smaller == pytest.approx(one * 1e-4 ** (1.0 / (2 * p)))
 
 
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
@@ -507,61 +350,6 @@ def test_a_machine_whose_legs_always_collide_says_so() -> None:
     assert "found 0 that the machine reaches in 300 draws" in message
     assert "excluded 300 times by collisions of legs" in message
     assert "check radii and ends of the cylinders" in message
-
-
-def test_plans_of_motors_that_turn_are_in_degrees_and_name_the_length_to_measure(
-    planned: Plan, tmp_path: Path
-) -> None:
-    machine, sigma = load_mechanism("delta"), np.radians(0.5)
-    drawn = random_configurations(machine, 2, np.random.default_rng(1))
-    seen: Any = SimpleNamespace(legs_in=lambda *shape: np.ones(shape, dtype=np.bool_))
-    view = replace(planned.views[0], poses=drawn, via=("", ""), seen=seen)
-    plan = replace(planned, machine=machine, views=(view,), sigma_by_joint={"arm2": sigma})
-    write_session(plan, tmp_path)
-    rows = read_rows(tmp_path / "poses.csv")
-    told = [[float(row[f"arm{j} [deg]"]) for j in (1, 2, 3)] for row in rows]
-    found = load_dataset(tmp_path, check_images=False).measurements
-    np.testing.assert_allclose(np.radians(told), found.q[:, ::2], atol=1e-6)
-    assert found.sigma_by_joint["arm2"] == pytest.approx(sigma)
-    console = Console(file=io.StringIO(), width=200)
-    console.print(plan_table(plan, tmp_path))
-    printed = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "-o OUT --length leg1.base:leg1.platform=" in printed
-    listed = checklist(plan)
-    assert any("Measure the rod of leg1" in item for item in listed)
-    assert any("where motors read arm1 20.00 deg" in item for item in listed)
-
-
-def test_each_motor_counts_with_its_own_standard_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
-    found: list[Predictor] = []
-
-    def told(task: Task, *_: object) -> Plan:
-        found.append(task.predictor)
-        raise DidNotConverge("It was told.")
-
-    monkeypatch.setattr("legcal.planning.request.plan_session", told)
-    delta = load_mechanism("delta")
-    legs = tuple(
-        replace(leg, actuator=replace(leg.actuator, pulses=Pulses(1500.0, 11.1)))
-        for leg in delta.legs
-        if leg.actuator is not None
-    )
-    for machine, stated in ((delta, None), (delta, "0.2deg"), (replace(delta, legs=legs), None)):
-        with pytest.raises(DidNotConverge, match="told"):
-            legcal.plan(machine, images=6, encoder_sigma=stated)
-    session = machine_session("delta", n_views=1, n_poses=4)
-    T_base_camera = delta.T_base_Rb * session.truth.T_camera_Rb[0].inv()
-    known = [
-        predictor.contributions(
-            {"c1": T_base_camera},
-            session.measurements.view,
-            session.truth.T_Rb_Re,
-            session.outlines,
-        ).rows
-        for predictor in found
-    ]
-    default, rough, servo = (np.linalg.norm(rows) for rows in known)
-    assert default > 1.1 * rough > 1.1 * servo
 
 
 def test_photographs_of_one_site_share_errors_at_its_places() -> None:

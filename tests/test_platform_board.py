@@ -109,15 +109,6 @@ def test_boards_that_cannot_be_used_are_refused(board: Any, words: tuple[str, ..
     assert [word for word in (str(PATH), "needed", *words) if word not in problem] == []
 
 
-def test_boards_of_both_links_are_numbered_one_after_the_other_in_any_order() -> None:
-    other = CHARUCO | ON_PLATFORM | {"dictionary": "DICT_5X5_50"}
-    for blocks in ([CHARUCO, other], [other, CHARUCO]):
-        base, platform = parse_boards(blocks, PATH)
-        assert (base.link, platform.link) == ("base", "platform")
-        assert (base.first, platform.first) == (0, 24)
-        assert platform.has(np.array([23, 24, 47, 48])).tolist() == [False, True, True, False]
-
-
 # Datasets
 
 

@@ -13,7 +13,6 @@ from legcal.calibration.joint_fit import platform
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     expected_error,
-    moved_by,
     platform_accuracy,
     platform_by_parameters,
 )
@@ -61,22 +60,6 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     np.testing.assert_allclose(predicted.displacement, np.sqrt(squares[:, 3:].sum(1)), rtol=3e-3)
     np.testing.assert_allclose(predicted.rotation, np.sqrt(squares[:, :3].sum(1)), rtol=3e-3)
     assert predicted.displacement.min() > 1e-6
-
-
-def test_a_change_of_the_parameters_moves_the_platform_as_its_covariance_says() -> None:
-    nominal = load_mechanism("3-rps")
-    drawn = random_configurations(nominal, 4, 1)
-    parametrization = parametrization_of(nominal)
-    J = platform_by_parameters(
-        geometries(nominal),
-        parametrization,
-        nominal.frame_legs,
-        [platform_in_base(nominal, T) for T in drawn.poses],
-    )
-    change = np.random.default_rng(2).normal(size=len(parametrization))
-    moved, expected = moved_by(J, change[:, None]), expected_error(J, np.outer(change, change))
-    np.testing.assert_allclose(moved.displacement, expected.displacement, rtol=1e-9)
-    np.testing.assert_allclose(moved.rotation, expected.rotation, rtol=1e-9)
 
 
 def test_a_pose_that_readings_do_not_determine_is_refused() -> None:
@@ -162,10 +145,3 @@ def test_wrong_assumptions_count_over_the_workspace_or_at_the_readings(
     assert 0.9e-3 < effect.error.mean_displacement < 2e-3
     assert accuracy.sigma.max_displacement == 0.0
     assert accuracy.change.max_displacement < 1e-9
-
-
-def test_a_machine_whose_motors_do_not_determine_the_pose_has_no_platform_error() -> None:
-    nominal = load_mechanism("hexapod")
-    q = random_configurations(nominal, 2, 0).readings
-    known = geometries(nominal), parametrization_of(nominal), np.eye(30), q, [nominal.home] * 2
-    assert platform_accuracy(replace(nominal, mobility=7), *known) is None

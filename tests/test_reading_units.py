@@ -83,9 +83,6 @@ def test_a_model_keeps_the_pulses_of_its_servos(tmp_path: Path) -> None:
         read_table(servo_table(tmp_path, us_per_deg=0))
 
 
-DEGREES = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
-
-
 def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_path: Path) -> None:
     """Where the travel goes further one way, less than half of reversed readings are outside."""
     angles = np.radians(20.0 + 100.0 * np.sin(np.arange(24.0).reshape(8, 3)) / 2.0)
@@ -99,15 +96,6 @@ def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_
     (said,) = caught.value.problems
     assert "columns arm1, arm2, arm3" in said
     assert "opposite sign" in said
-
-
-@pytest.mark.parametrize("sigma", ["0.5deg", "0.1deg"])
-def test_readings_are_outside_the_travel_by_more_than_noise(sigma: str, tmp_path: Path) -> None:
-    angles = ANGLES.copy()
-    angles[1, 2] = np.radians(46.0)
-    entry = {"encoder_sigma": dict.fromkeys(SERVOS, sigma)}
-    notes = load_dataset(dataset_of_readings(tmp_path, angles, entry), check_images=False).notes
-    assert sum("outside the travel" in note for note in notes) == (sigma == "0.1deg")
 
 
 def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_they_are_given(
@@ -141,35 +129,6 @@ def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_t
     assert sigmas_of("70deg", [endless]) == {"arm1": pytest.approx(np.radians(70.0))}
     with pytest.raises(UsageError, match="found 80 deg, needed at most 20% of a turn, 72 deg"):
         sigmas_of("80deg", [endless])
-
-
-@pytest.mark.parametrize(
-    ("given", "unit", "is_noted"),
-    [
-        (BOTH_WAYS[::2], "deg", True),  # as of a check
-        (0.5 * BOTH_WAYS, "deg", True),
-        (0.2 * BOTH_WAYS, "deg", False),
-        (np.radians(BOTH_WAYS), "rad", False),  # the same motions, in a unit that is not doubted
-    ],
-)
-def test_small_motions_are_not_refused_for_their_unit(
-    given: np.ndarray, unit: str, is_noted: bool, tmp_path: Path
-) -> None:
-    made = dataset_of_readings(tmp_path, given, DEGREES | {"readings": unit})
-    found = load_dataset(made, check_images=False)
-    size = np.radians(1.0) if unit == "deg" else 1.0
-    np.testing.assert_allclose(found.measurements.q, size * given, atol=1e-9)
-    noted = [note for note in found.notes if "of the travel in deg" in note]
-    assert [("in rad; check their unit" in note) for note in noted] == [True] * is_noted
-
-
-def test_what_a_hobby_servo_was_told_is_good_to_half_a_degree_in_any_unit(tmp_path: Path) -> None:
-    create_model(read_table(servo_table(tmp_path)), tmp_path)
-    model = str(tmp_path / "models/servos.yaml")
-    for entry, given in (({}, ANGLES), ({"readings": "deg"}, np.degrees(ANGLES))):
-        made = dataset_of_readings(tmp_path, given, entry, model)
-        found = load_dataset(made, check_images=False).measurements.sigma_by_joint
-        np.testing.assert_allclose(np.degrees([found[name] for name in SERVOS]), 0.5)
 
 
 def photographs(folder: Path, n: int) -> None:

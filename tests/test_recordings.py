@@ -14,7 +14,6 @@ from legcal import load_dataset, load_mechanism
 from legcal.data.measurements import reading_columns
 from legcal.geometry.types import Array
 from legcal.recordings.frames import VIDEOS
-from legcal.recordings.stillness import clock_offset
 
 MODEL = "hexapod"
 SIZE = 96, 64  # [px]
@@ -181,16 +180,6 @@ def test_poses_that_were_held_become_rows(
     assert np.abs(np.array(dark) - (8.0 + 7.0 * np.arange(10))).max() <= 2.0
 
 
-def test_the_topic_of_one_camera_is_named_behind_the_bag(
-    motion: Motion, tmp_path: Path, import_: Callable[..., tuple[int, Path]]
-) -> None:
-    code, folder = import_(f"{_bag(motion, tmp_path, second='/second')}:/camera")
-    assert code == 0
-    measurements = load_dataset(folder).measurements
-    assert [view.name for view in measurements.views] == ["c1_camera"]
-    assert measurements.n_rows == motion.rests
-
-
 def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
     motion: Motion,
     tmp_path: Path,
@@ -332,12 +321,3 @@ def test_what_cannot_be_imported_is_refused(
     assert "Traceback" not in error
     assert "Unexpected element" not in error  # as readers of OpenCV write
     assert not folder.exists()
-
-
-def test_motion_of_recordings_with_many_more_samples_than_are_compared() -> None:
-    rng = np.random.default_rng(5)
-    moves = np.repeat(np.arange(60) % 2 == 1, rng.integers(5, 30, 60))
-    steps = np.where(np.arange(len(moves)) < 0.6 * len(moves), 1e-4, 0.5)  # [s], most are short
-    times = 1.7e9 + np.concatenate([[0.0], np.cumsum(steps)])
-    found = clock_offset(times + 3.0, moves, times, moves)
-    assert abs(found.seconds - 3.0) < 0.05

@@ -6,28 +6,20 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any
 
 import numpy as np
 import pytest
-from command_line import run
 from csv_rows import read_rows, write_rows
 from fit_sessions import machine_session
 from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import displaced, of_types, planar, ring
 from outline_sessions import made
-from parameter_steps import written_with
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from simulated import settings
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.outlier_readings import with_judged_readings
-from legcal.calibration.joint_fit.platform import platform_by_parameters
-from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.exports.formats import export
-from legcal.exports.subject import ExportOptions, Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import (
@@ -41,12 +33,11 @@ from legcal.machine.kinematics import (
 from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import generic_configurations
 from legcal.machine.model import Machine, slider_columns
-from legcal.machine.parameters import geometries, legs_in_links, parametrization_of
+from legcal.machine.parameters import geometries, legs_in_links
 from legcal.machine.redundancy import Contradiction, contradictions, reading_residuals
 from legcal.machine.solved_poses import solve_poses
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
-from legcal.simulation.settings import Level, SimulationSettings
 
 
 def _concurrent() -> MachineSpec:
@@ -163,30 +154,6 @@ def test_poses_are_those_of_least_squares(name: str) -> None:
         assert min(change) > -1e-12
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("7-UPS", marks=pytest.mark.slow),
-        "4-RPR",
-        pytest.param("2-RPS + 2-SPS + rod", marks=pytest.mark.system),
-    ],
-)
-def test_predicted_errors_are_those_of_written_models(name: str, tmp_path: Path) -> None:
-    machine = machine_of(name)
-    parametrization = parametrization_of(machine)
-    rng = np.random.default_rng(3)
-    step = 1e-6 * rng.normal(size=len(parametrization))
-    other = written_with(machine, parametrization, step, tmp_path)
-    drawn = random_configurations(machine, 2, rng)
-    before = platforms_in_base(machine, drawn.poses)
-    after = platforms_in_base(other, forward_kinematics_many(other, drawn.readings))
-    J = platform_by_parameters(geometries(machine), parametrization, machine.frame_legs, before)
-    for T, T_other, by in zip(before, after, J, strict=True):
-        turn = (T_other.rotation * T.rotation.inv()).as_rotvec()
-        moved = np.concatenate([turn, T_other.translation - T.translation])
-        np.testing.assert_allclose(by @ step, moved, atol=2e-3 * np.abs(moved).max())
-
-
 def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path: Path) -> None:
     machine = machine_of("4-RPR")
     q = inverse_kinematics(machine, machine.home)
@@ -238,35 +205,6 @@ def test_a_wrong_reading_is_told_from_errors_of_the_model_or_motors_that_explain
         assert abs(one.off) == pytest.approx(one.distances[0])
 
 
-def test_carriages_may_be_redundant(tmp_path: Path) -> None:
-    """Seven carriages: a fit with too many readings is exact, a contradictory one is named."""
-    machine = made("7-pss", tmp_path)
-    assert machine.is_redundant
-    session = machine_session(str(machine.yaml_path))
-    found = refine(session.legs, session.measurements, session.outlines, session.start)
-    names, truth = found.kinematic.parametrization.names, session.legs.vector(session.truth.legs)
-    values = found.estimates.vector(names)
-    begun = session.legs.vector(session.start.legs)
-    assert np.abs(begun - truth).max() > 0.002
-    np.testing.assert_allclose(values, truth, atol=1e-7)
-    wrong = inverse_kinematics(machine, machine.home)
-    wrong[6] += 0.06
-    with pytest.raises(DidNotConverge, match=r"motor 'rail\d' \(or as likely one of rail.* mm"):
-        forward_kinematics(machine, wrong)
-
-
-@pytest.mark.system
-def test_redundant_carriages_calibrate_with_a_platform_error(tmp_path: Path) -> None:
-    machine, folder = made("7-pss", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, seed=4))
-    found = legcal.calibrate(folder)
-    assert found.verdict.trustworthy
-    assert found.platform is not None
-    assert found.platform.workspace is not None
-    assert found.solution.quality.redundant_readings is not None
-    assert found.solution.quality.redundant_readings.wrong == ()
-
-
 @pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3), ("7-pss", -2e-3)])
 def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     kind: str, off: float, tmp_path: Path
@@ -284,67 +222,6 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     assert found.quality.redundant_readings.doubts == ()
     values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
-
-
-def test_right_readings_that_a_bent_model_contradicts_come_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
-    q = session.measurements.q.copy()
-    q[7, 3] += 1e-3
-    wrong = dataclasses.replace(session.measurements, q=q)
-    n_left_out = list[int]()
-
-    def too_strict(problem: FitProblem, *rest: Any) -> tuple[FitProblem, bool]:
-        """Leave out, once, most readings of a motor."""
-        problem, is_changed = with_judged_readings(problem, *rest)
-        if n_left_out:
-            return problem, is_changed
-        factor = problem.factor("readings")
-        out = (problem.readings.leg == 2) & (problem.readings.pose > 2)
-        n_left_out.append(int(np.count_nonzero(out)))
-        whitening = np.where(out[:, None, None], 0.0, factor.whitening)
-        return problem.with_factors(dataclasses.replace(factor, whitening=whitening)), True
-
-    monkeypatch.setattr("legcal.calibration.joint_fit.rounds.with_judged_readings", too_strict)
-    found = refine(session.legs, wrong, session.outlines, session.start)
-    assert n_left_out[0] > 5
-    assert found.quality.redundant_readings is not None
-    assert [(one.leg, one.pose) for one in found.quality.redundant_readings.wrong] == [(3, 7)]
-    assert found.quality.redundant_readings.doubts == ()
-
-
-def test_a_contradiction_that_no_image_shows_is_left_out_and_accuses_no_motor_alone(
-    tmp_path: Path,
-) -> None:
-    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
-    m, leg, row = session.measurements, 3, 7
-    q = m.q.copy()
-    q[row, leg] -= 0.02
-    wrong = dataclasses.replace(m, q=q)
-    outlines = session.outlines.choose(session.outlines.row != row)
-    found = refine(session.legs, wrong, outlines, session.start)
-    assert found.quality.redundant_readings is not None
-    (one,) = found.quality.redundant_readings.wrong
-    assert one.pose == row
-    assert {one.motor, *one.alike} == set(session.legs.names)
-    assert found.quality.redundant_readings.doubts == ()
-    values = found.estimates.vector(found.kinematic.parametrization.names)
-    np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
-
-
-@pytest.mark.system
-def test_a_motor_of_another_scale_is_named_and_not_trusted(tmp_path: Path) -> None:
-    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
-    q = session.measurements.q.copy()
-    q[:, 2] *= 0.99
-    wrong = dataclasses.replace(session.measurements, q=q)
-    found = refine(session.legs, wrong, session.outlines, session.start)
-    assert found.quality.redundant_readings is not None
-    assert any(
-        f"scale error of {session.legs.names[2]} of -1 % explains most" in why
-        for why in found.quality.redundant_readings.doubts
-    )
 
 
 @pytest.mark.system
@@ -380,60 +257,3 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     write_rows(table, of_pose)
     with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
         legcal.calibrate(folder, output=tmp_path / "refused")
-
-
-@pytest.mark.slow
-def test_two_models_compared_say_how_redundant_readings_agree_with_each(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=6, seed=2))
-    truth = next((folder / "truth/models").glob("*.yaml"))
-    args = ["evaluate", str(machine.yaml_path), str(truth), "--dataset", str(folder)]
-    assert run(monkeypatch, *args, "--json") == 0
-    found = json.loads(capsys.readouterr().out)["redundant_readings"]
-    assert found["model"]["rms_expected"] == found["reference"]["rms_expected"] == 0.5
-    assert found["model"]["rms_m"] > 1e-4  # joints are off by up to 2 mm
-    assert found["reference"]["rms"] == pytest.approx(0.5, rel=0.5)
-    assert run(monkeypatch, *args) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for who, one in found.items():
-        assert f"in the {who}: off by {1e3 * one['rms_m']:.4f} mm, {one['rms']:.2f} of" in text
-
-
-def test_corrected_commands_of_redundant_motors_are_poses_of_least_squares(tmp_path: Path) -> None:
-    machine = machine_of("4-RPR")
-    rng = np.random.default_rng(5)
-    legs = [
-        dataclasses.replace(leg, A=leg.A + np.append(rng.normal(scale=1e-3, size=2), 0.0))
-        for leg in geometries(machine)
-    ]
-    nominal = dataclasses.replace(machine, legs=legs_in_links(machine, legs))
-    subject = Subject(machine, "machine", nominal)
-    found = export(subject, "correction", tmp_path / "a.csv", options=ExportOptions(nodes=3))
-    assert found.figures["coordinates"] == ["x", "y", "yaw"]
-    table = np.loadtxt(tmp_path / "a.csv", delimiter=",", comments=("#", "x"))
-    assert len(table) == 27
-    for x, y, yaw, *corrected in table[::5].tolist():
-        turn = Rotation.from_euler("z", yaw, degrees=True)
-        height = machine.home.translation[2]
-        pose = RigidTransform.from_components([1e-3 * x, 1e-3 * y, height], turn)
-        moved = forward_kinematics(nominal, inverse_kinematics(machine, pose))
-        angle = moved.rotation.as_euler("xyz", degrees=True)[2]
-        np.testing.assert_allclose([*(1e3 * moved.translation[:2]), angle], corrected, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_doctor_names_readings_that_contradict_each_other(tmp_path: Path) -> None:
-    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, SimulationSettings(level=Level.AXES, poses=10, seed=3))
-    contradict = "contradict each other"
-    assert not [one for one in legcal.doctor(folder).findings if contradict in one.what]
-    table = folder / "measurements.csv"
-    rows, column = read_rows(table), str(machine.legs[1].prismatic)
-    there = float(rows[13][column])
-    rows[13][column] = str(there + (0.008 if there < 0.06 else -0.008))
-    write_rows(table, rows)
-    (found,) = [one for one in legcal.doctor(folder).findings if contradict in one.what]
-    assert (found.check, found.severity) == ("readings", "warning")
-    assert machine.legs[1].name in found.what

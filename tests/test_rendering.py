@@ -18,8 +18,6 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.outlines import Outlines, read_observations
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.simulation.dataset import simulate
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.pipeline import CAMERAS
@@ -34,9 +32,6 @@ from legcal.simulation.solids import (
     Solid,
     SolidCylinder,
     Sphere,
-    link_poses,
-    placed,
-    solids_of,
 )
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
@@ -62,23 +57,6 @@ LENSES = {
         "equidistant",
     ),
 }
-
-
-@pytest.fixture(scope="module", params=SHIPPED)
-def shipped(request: pytest.FixtureRequest) -> Machine:
-    return load_mechanism(ROOT / "models" / f"{request.param}.yaml")
-
-
-def looking_at(machine: Machine, solids: tuple[PlacedSolid, ...]) -> RigidTransform:
-    """Return T_base_camera of a camera a little above the machine, which fills its picture."""
-    points = np.array([p.T_base_solid.translation for p in solids])
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    away = np.array([0.75, 0.4, 0.55]) / np.linalg.norm([0.75, 0.4, 0.55])
-    distance = 5.0 * np.linalg.norm(points - centre, axis=1).max()
-    x = np.cross(-away, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    turn = Rotation.from_matrix(np.column_stack([x, np.cross(-away, x), -away]))
-    return RigidTransform.from_components(centre + distance * away, turn)
 
 
 def solid(shape: Shape, T: RigidTransform, **looks: Any) -> PlacedSolid:
@@ -156,16 +134,6 @@ def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> 
     assert abs(np.mean(worst)) < 0.002
 
 
-@pytest.mark.parametrize("width_px", [0.3, 0.9, 2.2])
-def test_thin_rods_cover_their_area(width_px: float) -> None:
-    placed, _, _ = bar(0.7, 0.5 * width_px / F, tilt=0.0)
-    covered = (clean([placed]) - 0.02) / 0.58
-    length = HEIGHT / math.sin(
-        math.atan(1.01 * math.tan(0.7))
-    )  # from the upper to the lower border
-    assert covered.sum() == pytest.approx(width_px * length, rel=0.02)
-
-
 @pytest.mark.parametrize("turn", [0.0, math.pi])
 def test_a_cylinder_seen_along_its_axis_shows_its_near_cap(turn: float) -> None:
     T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_rotvec([turn, 0.0, 0.0]))
@@ -200,17 +168,6 @@ def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
     assert np.mean(np.abs(lit[0] - lit[1]) > 2e-3) < 0.01  # at creases alone
 
 
-def test_surfaces_darken_towards_their_outline_as_the_material_says() -> None:
-    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_euler("x", 90, degrees=True))
-    row = clean([solid(SolidCylinder(0.1, 2.0), T, albedo=0.8, limb=0.5)], limb=1.0)[122]
-    x = (np.arange(WIDTH) - 157.3) / F
-    t = (1.0 - np.sqrt(np.maximum(1.0 - (1.0 + x**2) * (1.0 - 0.01), 0.0))) / (1.0 + x**2)
-    P = np.stack([t * x, t], axis=-1)
-    cosine = -np.sum((P - [0.0, 1.0]) / 0.1 * P, axis=-1) / np.linalg.norm(P, axis=-1)
-    inside = np.abs(x) < 0.097
-    assert np.allclose(row[inside], 0.8 * (0.5 + 0.5 * cosine[inside]), atol=2e-3)
-
-
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: float) -> None:
     wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
@@ -243,15 +200,6 @@ def test_light_on_a_wall_falls_with_the_square_of_the_distance_of_its_lamp() -> 
     expected = (1.5 - lamp[2]) / np.linalg.norm(lamp - P, axis=1) ** 3  # cosine over square
     assert np.ptp(expected) > 0.3 * expected.max()
     assert row / row.max() == pytest.approx(expected / expected.max(), rel=0.01)
-
-
-def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Machine) -> None:
-    solids = placed(solids_of(shipped), link_poses(shipped, shipped.home_configuration))
-    camera, T = LENSES["pinhole"], looking_at(shipped, solids)
-    image = photograph(solids, camera, T, Appearance.clean(), np.random.default_rng(0)) / 65535.0
-    middles = T.inv().apply(np.array([p.T_base_solid.translation for p in solids]))
-    for u, v in np.rint(camera.project(middles)).astype(int):
-        assert image[v, u] > 0.3
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not() -> None:
@@ -298,13 +246,6 @@ def test_a_lens_blurs_edges_by_a_gaussian_before_pixels_count(blur: float) -> No
     assert np.abs(share[near] - ndtr(inside[near] / spread)).max() < 0.02
 
 
-def test_colours_are_the_materials_and_grey_is_their_mean() -> None:
-    T = RigidTransform.from_translation([0.0, 0.0, 1.0])
-    ball = solid(Sphere(0.1), T, albedo=0.5, tint=(1.5, 1.0, 0.5))
-    blue, green, red = clean([ball], colour=True)[122, 157]
-    assert [red, green, blue] == pytest.approx([0.75, 0.5, 0.25], abs=1e-4)
-
-
 # What cameras make of the light.
 
 SIDE, DARK, LIGHT = 160, 0.2, 0.8
@@ -346,34 +287,6 @@ def test_cameras_leave_edges_where_they_are(kind: str, colour: bool) -> None:
     assert np.mean(places - edge_place(rows)) == pytest.approx(0.0, abs=0.05)
 
 
-def test_sharpening_overshoots_and_an_industrial_camera_does_not() -> None:
-    clean, _ = slanted_edge("industrial", electrons=math.inf)
-    sharp, _ = slanted_edge("action", electrons=math.inf)
-    middle = slice(60, 100)  # free of vignetting
-    overshoot = sharp[middle, 40:].max() / np.median(sharp[middle, 60:66]) - 1.0
-    assert clean.max() <= 255.0 * LIGHT + 1.0
-    assert overshoot > 0.05
-
-
-def test_corners_are_darker_and_softer() -> None:
-    wide = CAMERAS["action"]
-    even = wide.through_lens(np.ones((90, 120, 3), dtype=np.float32), 0.0)
-    assert even[0, 0] == pytest.approx(1.0 - wide.vignetting, abs=1e-6)
-    assert even[45, 60] == pytest.approx(1.0, abs=1e-3)
-    points = np.zeros((200, 200, 3), dtype=np.float32)
-    points[[100, 8], [100, 8]] = 1.0
-    blurred = wide.through_lens(points, 0.5)[..., 1]
-    assert blurred[100, 100] > 2.0 * blurred[8, 8] / (1.0 - wide.vignetting)
-
-
-def test_files_are_of_the_stated_quality() -> None:
-    files = {quality: slanted_edge("webcam", jpeg=quality)[1] for quality in (50, 95)}
-    assert all(file[:2] == b"\xff\xd8" for file in files.values())
-    assert len(files[95]) > 1.5 * len(files[50])
-    assert slanted_edge("industrial")[1][:4] == b"\x89PNG"
-    assert Appearance(camera="industrial", jpeg=75).pipeline.suffix == ".jpg"
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -394,15 +307,6 @@ def test_files_are_of_the_stated_quality() -> None:
 def test_looks_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=r"found .*, needed .*;"):
         Appearance(**wrong)
-
-
-def test_a_camera_below_the_machine_does_not_look_at_a_table() -> None:
-    ball = solid(Sphere(0.2), RigidTransform.from_translation([0.0, 0.0, 1.0]))
-    above = RigidTransform.from_components([0.0, 0.0, 2.0], Rotation.from_rotvec([3.0, 0.0, 0.0]))
-    for T, is_seen in ((IDENTITY, False), (above, True)):
-        rng = np.random.default_rng(0)
-        scene = prepare_view([ball], LENSES["pinhole"], T, Appearance(clutter=0), rng)
-        assert np.isfinite(scene.canvas.z).any() == is_seen
 
 
 # --- photographs of datasets against the truth beside them, by edge measurements of their own

@@ -1,9 +1,7 @@
 """Pages in a browser: Chromium without a window, driven by Selenium."""
 
-import base64
 import csv
 import io
-import re
 import shutil
 import threading
 import time
@@ -21,18 +19,14 @@ from hexapod_example import HEXAPOD, Run
 
 import legcal
 from legcal.calibration.detection import Detection
-from legcal.calibration.detection_folder import write_detection
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import examination_page
-from legcal.data.reasons import USED, Reason, Rejection
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.motions import pose_distance
 from legcal.viewer.click_server import ClickServer
-from legcal.vision.camera import Camera
-from legcal.vision.distortion import DistortionModel
 
 pytestmark = pytest.mark.system
 
-INTERACTIVE = 2000  # [ms]
+
 HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
 
 
@@ -152,52 +146,6 @@ def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
     )
     assert page.execute_script(width) < 0.5 * before
     page.execute_script("document.getElementById('enlarged').close()")
-
-
-def test_it_prints_on_a4(page: Any) -> None:
-    _draw_all(page)
-    from selenium.webdriver.common.print_page_options import PrintOptions
-
-    options = PrintOptions()
-    options.set_page_size(PrintOptions.A4)
-    pdf = base64.b64decode(page.print_page(options))
-    sizes = {
-        tuple(round(float(x)) for x in found.split())
-        for found in re.findall(rb"/MediaBox\s*\[0 0 ([\d.]+ [\d.]+)\]", pdf)
-    }
-    assert sizes
-    assert all(abs(w - 595) <= 1 and abs(h - 842) <= 1 for w, h in sizes)
-
-
-def test_scenes_and_folded_tables_are_there_for_the_printer_alone(
-    page: Any,
-) -> None:
-    _draw_all(page)
-    copies = """dispatchEvent(new Event(arguments[0]));
-        return [...document.querySelectorAll("#machine-scene canvas, #platform-space canvas")]
-            .filter((one) => one.className === "copy").map((one) => new Set(
-                one.getContext("2d").getImageData(0, 0, one.width, one.height).data).size);"""
-    folded = "return document.querySelectorAll('details:not([open])').length"
-    n_folded = page.execute_script(folded)
-    colours = page.execute_script(copies, "beforeprint")
-    assert page.execute_script(folded) == 0 < n_folded
-    assert len(colours) == 2
-    assert min(colours) > 50
-    assert page.execute_script(copies, "afterprint") == []
-    assert page.execute_script(folded) == n_folded
-
-
-def test_it_is_interactive_within_two_seconds(example_run: Run, browser: Any) -> None:
-    path = legcal.write_report(example_run.calibration, example_run.output)
-    times = []
-    for _ in range(3):  # the best: others work on this machine too
-        browser.get(path.as_uri())
-        times.append(
-            browser.execute_script(
-                "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
-            )
-        )
-    assert min(times) <= INTERACTIVE
 
 
 def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path) -> None:
@@ -403,111 +351,6 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     assert 1.0 < abs(off[0]) < 2.5  # across the line
     assert np.abs(calibration.residuals.offset[k]) == pytest.approx(np.abs(off), abs=0.3)
     assert _errors(browser) == []
-
-
-def test_lines_are_those_of_every_camera_and_lost_outlines_are_placed(
-    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
-) -> None:
-    folder, examination = examined
-    found = examination.detection
-    assert found is not None
-    measured = found.dataset.measurements
-    lenses: dict[DistortionModel, list[float]] = {
-        "plumb_bob": [-0.21, 0.08, 1e-3, -7e-4, -0.02],
-        "rational_polynomial": [0.3, -0.1, 8e-4, -5e-4, 0.02, 0.55, -0.06, 0.01],
-        "equidistant": [0.04, -0.02, 0.01, -0.003],
-    }
-    views = tuple(
-        replace(view, camera=replace(view.camera, distortion=np.array(lens), model=model))
-        for view, (model, lens) in zip(measured.views, lenses.items(), strict=True)
-    )
-    lost, h = 2, found.outlines.h.copy()
-    of_view = [int(np.flatnonzero(measured.view[found.outlines.row] == v)[lost]) for v in range(3)]
-    h[of_view] = np.nan
-    outlines = replace(
-        found.outlines,
-        h=h,
-        used=~np.isnan(h[:, 0]),
-        reason=tuple(Rejection(Reason.NO_EDGE) if np.isnan(a) else USED for a in h[:, 0]),
-    )
-    dataset = replace(found.dataset, measurements=replace(measured, views=views))
-    changed = replace(found, dataset=dataset, outlines=outlines)
-    page = folder.parent / "found" / "lenses.html"  # beside the same photographs
-    page.write_text(examination_page(examination, changed), "utf-8")
-    editor = Editor(browser, page, tmp_path)
-    for v in range(3):
-        row = int(outlines.row[of_view[v]])
-        editor.open(list(changed.overlay_files).index(row))
-        buttons = browser.find_elements("css selector", ".rows button")
-        name = buttons[lost].text.splitlines()[0]
-        editor.choose(name)
-        assert editor.state(name) == "not found: no convincing edge"
-        editor.press("u", "1", "Left", "Shift Down")
-        assert editor.state(name) == "used (edited)"
-        editor.close()
-    editor.open(0)
-    rows = _rows(editor.download())
-    for v, i in enumerate(of_view):
-        camera: Camera = views[v].camera
-        ends = _ends(rows[i]).reshape(2, 2)
-        (leg,) = (p for p in changed.predicted(int(outlines.row[i])) if p.leg == outlines.leg[i])
-        band, expected = leg.bands[0], leg.outlines[0][int(outlines.edge[i]) - 1]
-        assert band is not None
-        t = np.array([0.0, band.length])
-        placed = camera.distort(band.points(t, band.offsets(expected, t)))
-        assert np.linalg.norm(ends - placed, axis=1) == pytest.approx(
-            [np.hypot(0.1, 1.0), 0.0], abs=0.02
-        )
-        rays = np.column_stack([camera.undistort(ends), np.ones(2)])
-        line = np.cross(rays[1], rays[0])
-        written = np.array([float(rows[i][name]) for name in "abc"])
-        assert written == pytest.approx(line / np.linalg.norm(line), abs=1e-9)
-        assert written @ expected > 0.99
-    assert _errors(browser) == []
-
-
-def test_the_page_of_a_detection_is_ready_in_time_and_hostile_names_do_nothing(
-    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
-) -> None:
-    _, examination = examined
-    found = examination.detection
-    assert found is not None
-    machine, measured = found.dataset.machine, found.dataset.measurements
-    legs = tuple(replace(leg, name=f'{leg.name}, "{HOSTILE}') for leg in machine.legs)
-    views = tuple(replace(view, name=f"{view.name}{HOSTILE}") for view in measured.views)
-    dataset = replace(
-        found.dataset,
-        machine=replace(machine, name=HOSTILE, legs=legs),
-        measurements=replace(measured, views=views),
-    )
-    changed = replace(found, dataset=dataset, rows=found.rows[:2])
-    hostile = replace(
-        examination,
-        mechanism=HOSTILE,
-        views=tuple(
-            view.model_copy(update={"view": f"{view.view}{HOSTILE}"}) for view in examination.views
-        ),
-        detection=changed,
-    )
-    write_detection(hostile, changed, tmp_path / "out", map, lambda *_: None)
-    editor = Editor(browser, tmp_path / "out" / "index.html", tmp_path)
-    assert (
-        browser.execute_script(
-            "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
-        )
-        <= INTERACTIVE
-    )
-    editor.open(1)
-    buttons = browser.find_elements("css selector", ".rows button")
-    buttons[0].click()
-    editor.press("r")
-    before = _rows((tmp_path / "out" / "observations.csv").read_text())
-    after = _rows(editor.download())
-    assert [a["leg"] for a in after] == [b["leg"] for b in before]
-    assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
-    assert _errors(browser) == []
-    assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
-    assert HOSTILE in browser.find_element("css selector", "h1").text
 
 
 # Clicking joints on the page of ``legcal detect``.

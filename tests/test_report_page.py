@@ -1,6 +1,5 @@
 """The page of a calibration: one file, complete, with the numbers of the result, and harmless."""
 
-import base64
 import json
 import re
 import shutil
@@ -14,9 +13,6 @@ import pytest
 from command_line import run
 from hexapod_example import TRUTH, Run, spoiled
 from lxml import html
-from rich.console import Group
-from rich.table import Table as TextTable
-from scipy.ndimage import map_coordinates
 
 import legcal
 from legcal.calibration.fit_overlays import with_overlays
@@ -24,12 +20,9 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.workspace_errors import platform_map
 from legcal.errors import OutOfResources, UsageError
-from legcal.pages.document import Items, Number, Text, Verdict, number
 from legcal.pages.html import page_html
 from legcal.perception.overlays import COLOURS
 from legcal.report.page.calibration_page import calibration_page
-from legcal.report.page.parameter_rows import parameter_tables
-from legcal.report.page.text_page import text_page
 from legcal.vision.cylinder import outlines_of_axis
 
 SECTIONS = (
@@ -91,35 +84,6 @@ def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> No
             assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
-def test_a_prior_of_a_coordinate_is_told_with_its_joint(example_run: Run) -> None:
-    calibration, sigma = example_run.calibration, 1e-5
-    known = {"leg2.base.x": sigma, "leg1.base.x": sigma}  # the latter is no parameter
-    estimates = replace(calibration.solution.estimates, prior_sigma=known)
-    solution = replace(calibration.solution, estimates=estimates)
-    changed = replace(calibration, solution=solution)
-    changed.__dict__["result"] = calibration.result
-    rows = {row[0]: row for row in parameter_tables(changed)[0].rows}
-    assert (rows["leg2 A x"][6], rows["leg2 A x"][7]) == (number(0.01, 4), "mostly by its prior")
-    assert all(rows[name][6] == number(None, 4) for name in ("leg1 A x", "leg2 A y", "leg2 B x"))
-
-
-def test_a_table_sorts_where_its_rows_stand_alone() -> None:
-    tables = [TextTable("leg", "ratio") for _ in range(2)]
-    for name, table in zip(("b", ""), tables, strict=True):
-        table.columns[1].justify = "right"
-        table.add_row("a", "10.5 +- 2")
-        table.add_row(name, "-")
-    text = Group(*tables, "It moved.\n- one\n- two\nend")
-    verdict = Verdict("bad", "Moved", "It moved.", [])
-    section = text_page("title", text, verdict=verdict).sections[0]
-    alone, grouped, items, last = section.blocks
-    assert (alone.sortable, grouped.sortable) == (True, False)
-    assert alone.rows == [["a", Number(10.5, "10.5 +- 2")], ["b", Number(None, "-")]]
-    assert (items, last) == (Items(["one", "two"]), Text(["end"]))
-    page: Any = html.fromstring(page_html(text_page("title", text)))
-    assert [len(one.xpath(".//th/button")) for one in page.xpath("//table")] == [2, 0]
-
-
 def test_points_of_the_plots_are_the_residuals_of_the_fit(example_run: Run, page: Any) -> None:
     found = json.loads(page.xpath("string(//script[@data-plot='residuals-leg'])"))
     y = [value for trace in found["data"] for value in trace["y"]]
@@ -143,28 +107,6 @@ def test_the_worst_outlines_are_shown_and_points_lead_to_them(example_run: Run, 
     assert set(map(int, shown)) <= points
 
 
-def test_the_measured_line_of_a_crop_lies_on_its_edge(example_run: Run, page: Any) -> None:
-    # Brightness steps across the line: the outline is drawn where it was measured.
-    steps = []
-    for figure in page.xpath("//figure[@class='crop']")[-10:]:
-        data = base64.b64decode(figure.xpath(".//image/@href")[0].split(",")[1])
-        grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert grey is not None
-        _, _, width, height = map(float, figure.xpath(".//svg/@viewbox")[0].split())
-        points = figure.xpath(".//polyline[@class='measured']/@points")[0]
-        xy = np.array([list(map(float, one.split(","))) for one in points.split()])
-        normal = np.array([xy[-1, 1] - xy[0, 1], xy[0, 0] - xy[-1, 0]])
-        normal /= np.linalg.norm(normal)
-        scale = grey.shape[1] / width
-        assert grey.shape[0] / height == pytest.approx(scale, rel=0.02)
-        across = np.arange(-12.0, 13.0)
-        u, v = np.moveaxis(scale * (xy[:, None] + across[:, None] * normal) - 0.5, 2, 0)
-        sampled = map_coordinates(grey.astype(float), [v, u], order=1, mode="nearest")
-        profile = sampled.mean(axis=0)
-        steps.append(abs(across[:-1][np.argmax(np.abs(np.diff(profile)))] + 0.5))
-    assert np.median(steps) <= 1.5
-
-
 def test_the_map_of_the_workspace_agrees_with_the_models(example_run: Run) -> None:
     calibration = example_run.calibration
     found = platform_map(calibration)
@@ -184,18 +126,6 @@ def test_the_map_of_the_workspace_agrees_with_the_models(example_run: Run) -> No
     at = found.index[found.index >= 0]
     places = np.stack(np.meshgrid(found.z, found.y, found.x, indexing="ij"), axis=-1)[..., ::-1]
     assert found.position[at] == pytest.approx(places[found.index >= 0], abs=1e-12)
-
-
-def test_the_map_leaves_out_places_that_the_calibrated_legs_do_not_reach(example_run: Run) -> None:
-    calibration = example_run.calibration
-    solution, whole = calibration.solution, platform_map(calibration)
-    long = replace(solution.legs[0], q0=solution.legs[0].q0 + 0.15)
-    apart = replace(solution, legs=(long, *solution.legs[1:]))
-    found = platform_map(replace(calibration, solution=apart))
-    assert whole is not None
-    assert found is not None
-    assert 0 < len(found.position) < len(whole.position)
-    assert np.isfinite(found.sigma.displacement).all()
 
 
 def test_residuals_belong_to_their_outlines(example_run: Run) -> None:
@@ -383,24 +313,6 @@ def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
         legcal.calibrate(moved, output=tmp_path / "out", overlays=True)
 
 
-@pytest.mark.usefixtures("page")  # which writes the report of the result
-def test_pages_of_earlier_results_go_and_files_of_others_stay(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
-    calibration, page = example_run.calibration, out / "report.html"
-    assert page.exists()
-    write_result(calibration, out)  # which that page does not describe
-    assert not page.exists()
-    page.write_text("mine")
-    write_result(calibration, out)
-    assert page.read_text() == "mine"
-    monkeypatch.setattr(
-        "legcal.calibration.pipeline.calibrate", lambda *_, **__: pytest.fail("too late")
-    )
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 2
-
-
 def test_other_commands_write_what_they_print_as_a_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -436,16 +348,3 @@ def test_a_check_writes_a_page_and_never_over_that_of_a_result(
     assert run(monkeypatch, *words, tmp_path / "check") == 0
     found: Any = html.fromstring((tmp_path / "check" / "report.html").read_text("utf-8"))
     assert "No change was detected" in found.xpath("string(//section[@id='verdict'])")
-
-
-def test_images_that_were_moved_away_are_told_and_nothing_else_is_lost(
-    example_run: Run, tmp_path: Path
-) -> None:
-    calibration = example_run.calibration
-    moved = replace(calibration, dataset=replace(calibration.dataset, folder=tmp_path / "gone"))
-    moved.__dict__["result"] = calibration.result
-    found: Any = html.fromstring(page_html(calibration_page(moved, tmp_path)))
-    assert tuple(found.xpath("//main/section/@id")) == SECTIONS
-    assert "could not be read any more" in found.xpath("string(//section[@id='outlines'])")
-    assert found.xpath("//figure[@class='crop']") == []
-    assert "no longer there" in found.xpath("string(//section[@id='record'])")

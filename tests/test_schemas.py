@@ -127,7 +127,6 @@ READERS: Mapping[str, tuple[Path, Any]] = {
     "table": (ROOT / "models/tables/hexapod.yaml", read_description),
     "camera": (EXAMPLE / "camera_info.yaml", read_camera),
 }
-BOARD = {"kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03}
 
 
 @pytest.mark.parametrize(
@@ -170,29 +169,3 @@ def test_simple_faults_are_refused_by_schema_and_by_reading(
     place.write_text(yaml.safe_dump(wrong), encoding="utf-8")
     with pytest.raises(LegcalError, match=re.escape(keys.split(".")[0])):
         read(place)
-
-
-def test_boards_and_priors_as_they_may_be_written_fit_the_schema() -> None:
-    right = read_yaml(EXAMPLE / "dataset.yaml", "file")
-    for board in (BOARD, [BOARD, {**BOARD, "on": "platform"}]):
-        _check("dataset", {**right, "board": board})
-    for wrong in ({**BOARD, "kind": "dots"}, {**BOARD, "square": 30}, [], [{"kind": "charuco"}]):
-        assert not _validator("dataset").is_valid({**right, "board": wrong})
-    priors = {
-        "a": "420±0.1 mm",
-        "b": "0.42+-0.01",
-        "c": [0.42, 0.01],
-        "d": {"value": 1, "sigma": 2},
-    }
-    _check("dataset", {**right, "parameters": {"priors": priors}})
-
-
-def test_schemas_are_printed_by_name(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "schema") == 0
-    assert capsys.readouterr().out.split() == schema_names()
-    assert run(monkeypatch, "schema", "result") == 0
-    assert json.loads(capsys.readouterr().out)["title"] == "legcal result"
-    assert run(monkeypatch, "schema", "datset") == 2
-    assert "did you mean 'dataset'" in capsys.readouterr().err

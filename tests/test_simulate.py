@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from simulated import files_of, settings, simulated, small_camera
+from simulated import files_of, settings, small_camera
 
 import legcal
 from legcal.data.dataset import load_dataset
@@ -21,7 +21,6 @@ from legcal.data.measurements import View
 from legcal.data.outlines import read_observations
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.files.motions import motion_from_xyz_quat
-from legcal.geometry.motions import look_at
 from legcal.machine.loader import load_mechanism
 from legcal.report.images import simulation_table
 from legcal.simulation.cameras import mild_lens, read_lens
@@ -33,7 +32,6 @@ from legcal.simulation.settings import (
     Distribution,
     Level,
     ParameterErrors,
-    Sampling,
     SimulationSettings,
     Spread,
 )
@@ -127,18 +125,6 @@ def test_the_seed_and_nothing_else_decides_what_is_drawn(tmp_path: Path) -> None
     assert "observations.csv" not in axes
 
 
-def test_axes_of_any_seed_can_be_read(tmp_path: Path) -> None:
-    for seed in range(2):  # legs of this machine point down in the image, where theta is pi
-        made = simulated(
-            tmp_path / f"{seed}",
-            "3-spr",
-            level=Level.AXES,
-            table=TableNoise.in_radians(),
-            seed=seed,
-        )
-        assert load_dataset(made.folder, check_images=False).axes is not None
-
-
 def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path) -> None:
     nominal, lens = load_mechanism("3-rps"), small_camera(tmp_path)
     found = requested(nominal, camera=["webcam:60", str(lens)], poses="1")
@@ -149,16 +135,6 @@ def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path
     (name,) = dataset.measurements.image
     assert name.endswith(".jpg")
     assert dataset.image_reader([0])(0).shape == (150, 200)
-
-
-def test_photographs_show_the_machine_whatever_is_said_of_occlusion(tmp_path: Path) -> None:
-    few = replace(FEW, level=Level.PHOTOGRAPHS, camera=small_camera(tmp_path))
-    solid, clear = (
-        simulate("3-rps", tmp_path / str(occlusion), replace(few, occlusion=occlusion)).folder
-        for occlusion in (True, False)
-    )
-    (name,) = load_dataset(solid).measurements.image
-    assert (solid / name).read_bytes() == (clear / name).read_bytes()
 
 
 def _few_photographs(folder: Path, workers: int) -> SimulatedDataset:
@@ -242,13 +218,6 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
-def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:
-    T = look_at(np.array([1.0, 0.2, 0.3]), np.zeros(3)).inv()
-    assert np.allclose(T.apply(np.zeros(3))[:2], 0.0, atol=1e-12)
-    assert T.apply(np.zeros(3))[2] > 0.0
-    assert T.apply([0.0, 0.0, 0.1])[1] < 0.0
-
-
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
     noise = OutlineNoise(sigma_px=0.2, n_points=50)
     rng = np.random.default_rng(0)
@@ -264,10 +233,6 @@ def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points()
 VIEW = _from_the_side("side", None, 0.93)
 
 
-def test_options_that_are_not_given_are_the_defaults_of_the_settings() -> None:
-    assert requested(load_mechanism("hexapod")) == SimulationSettings()
-
-
 def test_options_become_settings(tmp_path: Path) -> None:
     lens = small_camera(tmp_path)
     joints = Spread(1e-3, Distribution.NORMAL)
@@ -281,38 +246,6 @@ def test_options_become_settings(tmp_path: Path) -> None:
         seed=4,
     )  # fmt: skip
     assert requested(load_mechanism("hexapod"), poses=str(lens)).poses == lens
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"error": ["lengths=1mm"]}, "--error lengths .* found none in the mechanism"),
-        ({"error": ["axes=1deg"]}, "--error axes .* found none in the mechanism"),
-        ({"error": ["joint=2mm"]}, "--error .* found 'joint=2mm'.*joints"),
-        ({"error": ["joints"]}, "--error .* found 'joints' without a size"),
-        ({"error": ["joints=2"]}, "--error joints .* needed a number and its unit"),
-        ({"error": ["joints=2mm:gauss"]}, "--error joints .* distribution 'gauss'"),
-        ({"error": ["joints=2m"]}, "--error joints .* found '2m', needed 0 to 1m"),
-        ({"camera": ["webcm"]}, "'webcm', neither a kind .* webcam, phone"),
-        ({"camera": ["phone:best"]}, "--camera .* found 'phone:best'"),
-        ({"camera": ["phone", "webcam"]}, "found 0 files and 2 kinds"),
-        ({"camera": ["phone"], "level": "outlines"}, "--camera phone .* --level outlines"),
-        ({"poses": "-3"}, "--poses .* found '-3'"),
-        ({"poses": "none.csv"}, "--poses .* found 'none.csv'"),
-        ({"poses": "0"}, "found 0 as poses, needed 1 to 100000"),
-        ({"board": "chess"}, "--board .* found 'chess'.*chessboard"),
-        ({"hand_held": True}, "--hand-held .* found no --board"),
-        ({"plan": Path("session"), "poses": "3"}, "found --plan and --poses"),
-        ({"plan": Path("session"), "hand_held": True}, "found --plan and --hand-held"),
-    ],
-)
-def test_options_without_sense_are_refused(options: dict[str, Any], named: str) -> None:
-    with pytest.raises(UsageError, match=named):
-        requested(load_mechanism("hexapod"), **options)
-
-
-def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
-    requested(load_mechanism("hexapod"), error=["lengths=0mm", "axes=0deg"])
 
 
 @pytest.mark.parametrize(
@@ -357,22 +290,6 @@ def test_settings_without_sense_are_refused(changes: dict[str, object], named: s
 def test_spreads_without_sense_are_refused(size: Any, distribution: Any) -> None:
     with pytest.raises(UsageError, match=r"found the size .* and the distribution"):
         Spread(size, distribution)
-
-
-def test_numbers_of_numpy_and_names_of_choices_count(tmp_path: Path) -> None:
-    found = settings(
-        poses=np.int64(2), seed=np.uint8(3), readings=Spread(np.float64(0.0), "normal"),
-        level="axes", sampling="workspace",
-    )  # fmt: skip
-    named = settings(
-        poses=2, seed=3, readings=Spread(0.0, Distribution.NORMAL), level=Level.AXES,
-        sampling=Sampling.WORKSPACE,
-    )  # fmt: skip
-    assert files_of(simulate("3-rps", tmp_path / "a", found).folder) == files_of(
-        simulate("3-rps", tmp_path / "b", named).folder
-    )
-    with pytest.raises(UsageError, match="found 0 workers, needed 1 or more"):
-        simulate("hexapod", tmp_path / "set", found, workers=0)
 
 
 @pytest.mark.parametrize(
@@ -434,8 +351,3 @@ def test_cameras_that_show_nothing_are_refused_and_nothing_is_written(
     with pytest.raises(refused, match=named):
         simulate("hexapod", tmp_path / "set", settings(views=[view]))
     assert files_of(tmp_path) == {}
-
-
-def test_an_empty_name_is_no_folder() -> None:
-    with pytest.raises(UsageError, match="dataset could not be written: found an empty text"):
-        simulate("hexapod", "", FEW)

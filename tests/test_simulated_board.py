@@ -12,13 +12,12 @@ from boards import CHARUCO
 from simulated import small_camera
 
 from legcal.data.dataset import load_dataset
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import NotVisible
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.perception.board_corners import find_corners
 from legcal.perception.board_poses import camera_poses_by_board
-from legcal.simulation.board import chosen_board
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.vision.board_file import parse_board
@@ -68,15 +67,6 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
     assert np.all(corners.sigma_px == 0.1)
 
 
-def test_the_truth_says_where_the_board_is(standing: Path, held: Path) -> None:
-    for folder in (standing, held):
-        T = parse_board(_truth(folder)["board"], folder).T_link_board
-        assert T is not None
-        given = load_dataset(folder).boards[0].T_link_board
-        assert (given is None) == (folder == held)
-        assert given is None or np.allclose(given.as_matrix(), T.as_matrix())
-
-
 def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Path) -> None:
     dataset = load_dataset(held)
     m = dataset.measurements
@@ -124,16 +114,3 @@ def test_a_board_without_a_place_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(NotVisible, match="The board could not be placed: found no place near the"):
         simulate(machine(), tmp_path / "none", settings)
-
-
-def test_a_board_comes_from_a_file_or_fits_the_machine(tmp_path: Path) -> None:
-    path = tmp_path / "board.yaml"
-    path.write_text("board: {kind: chessboard, squares_x: 9, squares_y: 6, square: 0.02}\n")
-    found = chosen_board(path, [])
-    assert found is not None
-    assert (found.kind, found.columns, found.rows, found.side) == ("chessboard", 9, 6, 0.02)
-    assert chosen_board(CHARUCO, []) is CHARUCO
-    assert chosen_board(None, []) is None
-    path.write_text("kind: chessboard\n")
-    with pytest.raises(DatasetError, match="found no block board, needed one as in"):
-        chosen_board(path, [])

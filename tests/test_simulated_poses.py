@@ -21,7 +21,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import dimensionless, is_on_same_side, singularity
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.simulation import poses as module
-from legcal.simulation.poses import are_extreme, commanded_poses, draw_poses, given_poses
+from legcal.simulation.poses import commanded_poses, draw_poses, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS, Sampling
 from legcal.simulation.truth import write_true_model
 
@@ -60,22 +60,6 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:
         assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
-
-
-def test_long_travel_leaves_some_poses_extreme_and_they_are_counted() -> None:
-    machine = load_mechanism(LONG_TRAVEL)
-    poses = _drawn(machine, 16)
-    part = _parts(machine, poses)
-    extreme = np.all((part <= JITTER) | (part >= 1.0 - JITTER), axis=1)
-    assert are_extreme(machine, poses.readings).tolist() == extreme.tolist()
-    assert 2 <= extreme.sum() < 16
-
-
-def test_poses_of_the_workspace_are_anywhere_in_the_travel() -> None:
-    machine = load_mechanism("hexapod")
-    part = _parts(machine, _drawn(machine, 40, "workspace"))
-    assert np.abs(part.mean(axis=0) - 0.5).max() < 0.2
-    assert 0.4 < np.mean((part > 0.25) & (part < 0.75)) < 0.6
 
 
 @pytest.mark.parametrize("name", ["hexapod", "tricept"])
@@ -125,13 +109,6 @@ def test_joint_limits_of_revolutes_are_kept(tmp_path: Path) -> None:
     part = _parts(narrow, poses)
     assert np.any(part < JITTER)
     assert np.any(part > 1.0 - JITTER)
-
-
-def test_whole_turns_of_a_joint_do_not_count(tmp_path: Path) -> None:
-    turned = _limited("hexapod", r"leg\d_b1", (2.0 * np.pi - 1.0, 2.0 * np.pi + 1.0), tmp_path)
-    np.testing.assert_array_equal(
-        _drawn(turned, 3).readings, _drawn(load_mechanism("hexapod"), 3).readings
-    )
 
 
 def test_a_machine_that_cannot_move_inside_its_limits_says_what_stands_in_the_way(
@@ -197,13 +174,6 @@ def test_legs_do_not_run_through_each_other(tmp_path: Path) -> None:
     assert max(_penetration(thick, T) for T in thin.poses) > 2e-3
     kept = _drawn(thick, 12)
     assert max(_penetration(thick, T) for T in kept.poses) < 0.0
-
-
-def test_cylinders_that_overlap_at_home_are_not_judged(tmp_path: Path) -> None:
-    plump = _copy("hexapod", tmp_path, lambda text: re.sub(r'radius="[^"]*"', 'radius="0.2"', text))
-    assert _penetration(plump, plump.home) > 0.0
-    assert Feasibility(plump).collision(plump.home) is None
-    assert len(_drawn(plump, 3)) == 3
 
 
 def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
@@ -300,17 +270,6 @@ def test_the_nominal_model_reaches_every_pose_at_its_readings(
         near = forward_kinematics(nominal, q)
         assert singularity(nominal, near) >= 0.05 * home
         assert np.linalg.norm(near.translation - T.translation) < 0.1
-
-
-def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
-    pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    nominal, truth = pair
-    readings = draw_poses(truth, 3, np.random.default_rng(0)).readings
-    monkeypatch.setattr(module, "_reached", lambda _, q: np.any(q != readings[1], axis=1))
-    poses = commanded_poses(truth, nominal, 3, np.random.default_rng(0), Sampling.EXTREME)
-    assert np.array_equal(poses.readings[:2], readings[[0, 2]])
-    assert len(poses.poses) == 3
 
 
 def test_a_machine_far_from_its_model_is_refused(

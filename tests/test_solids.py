@@ -58,46 +58,6 @@ def joints_at_home(machine: Machine) -> tuple[Array, Array]:
     return B - vectors_A_to_B(machine, machine.home), B
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
-    machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
-    solids = solids_of(machine)
-    A, B = joints_at_home(machine)
-    counted = {(j, c.link) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
-    assert {(s.leg, s.link) for s in solids if s.leg is not None} == counted
-    for p in placed(solids, link_poses(machine, machine.home_configuration)):
-        if p.solid.leg is not None:
-            along = B[p.solid.leg] - A[p.solid.leg]
-            axis = p.T_base_solid.rotation.as_matrix()[:, 2]
-            to_axis = np.cross(p.T_base_solid.translation - A[p.solid.leg], along)
-            assert np.linalg.norm(np.cross(axis, along)) < 1e-6
-            assert np.linalg.norm(to_axis) < 1e-6
-
-
-def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
-    (tmp_path / "urdf_meshes").mkdir()
-    (tmp_path / "urdf_meshes" / "one.stl").write_bytes(STL)
-    machine = hexapod_showing(
-        tmp_path,
-        '<visual><origin xyz="0.1 0 0" rpy="0 0 1.5"/><material name="red"/>'
-        '<geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
-        '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
-        '<visual><geometry><mesh filename="package://urdf_meshes/one.stl" scale="0.1 0.1 0.1"/>'
-        '</geometry><material name="own"><color rgba="0.2 0.4 0.6 1"/></material></visual>',
-        '<material name="red"><color rgba="0.9 0.3 0.3 1"/></material>',
-    )
-    box, ball, mesh = (s for s in solids_of(machine) if s.link == "platform")
-    assert box.shape == Box((0.1, 0.2, 0.3))
-    assert box.T_link_solid.translation == pytest.approx([0.1, 0.0, 0.0])
-    assert box.T_link_solid.rotation.as_euler("xyz") == pytest.approx([0.0, 0.0, 1.5])
-    assert box.material.albedo == pytest.approx(0.5)
-    assert box.material.tint == pytest.approx((1.8, 0.6, 0.6))
-    assert ball.shape == Sphere(0.05)
-    assert isinstance(mesh.shape, Mesh)
-    assert mesh.shape.vertices.max() == pytest.approx(0.1)
-    assert mesh.material.albedo == pytest.approx(0.4)
-
-
 @pytest.mark.parametrize(
     ("visual", "message"),
     [
@@ -193,27 +153,3 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
         local = plate.T_base_solid.inv().apply(np.concatenate([A, B, middles]))
         assert np.abs(local[:, 2]).min() > 0.5 * plate.solid.shape.length
         assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
-
-
-def test_plates_of_a_planar_machine_lie_below_its_legs_and_each_other() -> None:
-    machine = load_mechanism("3-rpr")
-    solids = placed(dressed(machine), link_poses(machine, machine.home_configuration))
-    heights = {
-        p.solid.name: (p.T_base_solid.translation - machine.A_base[0]) @ machine.base_normal
-        for p in solids
-    }
-    base, platform = (heights[f"{end}_plate"] for end in (machine.base, machine.platform))
-    thickness = max(
-        s.shape.length
-        for s in dressed(machine)
-        if s.name.endswith("_plate") and isinstance(s.shape, SolidCylinder)
-    )
-    assert base + thickness < platform
-    assert platform + thickness < min(h for name, h in heights.items() if "ball" in name)
-
-
-def test_a_link_with_visuals_of_its_own_is_not_dressed(tmp_path: Path) -> None:
-    visual = '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
-    solids = dressed(hexapod_showing(tmp_path, visual))
-    assert sum(s.link == "platform" for s in solids) == 1
-    assert sum(s.link == "base" for s in solids) == 13

@@ -10,7 +10,6 @@ from fit_sessions import (
     MachineSession,
     corners_of,
     machine_session,
-    shifted,
     with_board,
     with_camera,
 )
@@ -149,13 +148,6 @@ def test_a_freed_intrinsic_is_found(
     assert len({camera.K[0, 0] for camera in found.cameras}) == 1
 
 
-def test_an_intrinsic_fixed_at_its_value_is_used(session: MachineSession) -> None:
-    wrong_cameras = with_wrong_cameras(session, 1303.0, "fx")
-    found = fitted(wrong_cameras, fixed_at({"c1.fx": 1290.0}))
-    assert found.cameras[0].K[0, 0] == 1290.0
-    assert_exact(session, found)
-
-
 def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSession) -> None:
     for names, n_open in (
         (("k3",), 1),
@@ -163,18 +155,6 @@ def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSe
     ):
         with pytest.raises(NotIdentifiable, match=rf"do not fix {n_open} .*of camera c1"):
             fitted(session, Choices(free=frozenset(f"c1.{name}" for name in names)))
-
-
-def test_priors_determine_what_images_do_not() -> None:
-    session = machine_session("3-upu")
-    free = fitted(session)
-    assert free.estimates.status["leg2.base.x"] == "weak"
-    name = "leg2.base.x"
-    known = Choices(priors={name: Prior(true_values(session)[name], 1e-5)})
-    found = fitted(session, known)
-    assert len(found.kinematic.held) == len(free.kinematic.held) - 1
-    assert found.estimates.status[name] == "estimated"
-    assert found.estimates.values[name] == pytest.approx(true_values(session)[name], abs=1e-5)
 
 
 def test_what_is_held_stays_at_nominal() -> None:
@@ -229,22 +209,6 @@ def test_wrong_fixed_values_are_refused_with_those_of_the_measurements(
     assert found.format(true=true[wrong]) in problem
 
 
-@pytest.mark.parametrize(
-    ("choices", "found"),
-    [
-        (fixed_at({"leg1.radius.leg1_tube": 1.2 * 0.0125}), r"fixed value of leg1\.radius\.leg1_"),
-        (fixed_at({"c1.fx": 1303.0}), r"fixed value of c1\.fx .*measured about 1290 px"),
-        (Choices(priors={"leg1.offset": Prior(0.5, 1e-4)}), r"prior of leg1\.offset contradicts"),
-    ],
-    ids=["radius", "intrinsic", "prior"],
-)
-def test_other_stated_values_that_contradict_measurements_are_refused(
-    noisy: MachineSession, choices: Choices, found: str
-) -> None:
-    with pytest.raises(DidNotConverge, match=found):
-        fitted(noisy, choices)
-
-
 @pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
 @pytest.mark.parametrize("part", thinned(["offset", "platform", "radius"], ["platform"]))
 def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scale: float) -> None:
@@ -256,46 +220,6 @@ def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scal
     values = {n: v for n, v in (true_values(exact) | radii).items() if f".{part}" in n}
     found = fitted(session, fixed_at({n: v for n, v in values.items() if "axis" not in n}))
     assert found.notes == ()
-
-
-def test_right_fixed_values_are_accepted_beside_wrong_outlines(noisy: MachineSession) -> None:
-    rng = np.random.default_rng(7)
-    n = len(noisy.outlines)
-    wrong = rng.random(n) < 0.2
-    sign = np.where(rng.random(n) < 0.5, 1.0, -1.0)
-    offsets = (wrong * sign * rng.uniform(2.0, 30.0, n))[:, None] * np.ones(2)
-    outlines = shifted(noisy, noisy.outlines, offsets)
-    true = true_values(noisy)
-    choices = fixed_at({name: true[name] for name in ("leg1.offset", "leg2.base.x")})
-    found = fitted(replace(noisy, outlines=outlines), choices)
-    (note,) = found.notes
-    assert note.startswith(f"The fit rejected {wrong.sum()} of {n} outlines")
-
-
-def test_a_leg_most_of_whose_outlines_disagree_is_named(noisy: MachineSession) -> None:
-    names = ("leg", "leg.2", "leg.3", "leg.2.4", *noisy.legs.names[4:])
-    noisy = replace(noisy, legs=replace(noisy.legs, names=names))
-    own = np.flatnonzero(noisy.outlines.leg == 3)
-    offsets = np.zeros((len(noisy.outlines), 2))
-    offsets[own[: 2 * len(own) // 3]] = 12.0 * (-1.0) ** np.arange(2 * len(own) // 3)[:, None]
-    outlines = shifted(noisy, noisy.outlines, offsets)
-    true = true_values(noisy)
-    stated = ("leg.2.4.offset", "leg.2.offset")
-    choices = Choices(priors={name: Prior(true[name], 1e-3) for name in stated})
-    found = fitted(replace(noisy, outlines=outlines), choices)
-    (note,) = found.notes
-    assert f"{2 * len(own) // 3} of {len(own)} of leg.2.4" in note
-    assert "the stated values of leg.2.4.offset" in note
-    assert not {"leg.3", "leg.2.offset"} & set(note.rstrip(".").replace(",", "").split())
-
-
-def test_readings_of_a_rough_encoder_count_as_little_as_is_stated(noisy: MachineSession) -> None:
-    m, q = noisy.measurements, noisy.measurements.q.copy()
-    q[:, 0] += np.random.default_rng(3).normal(scale=1e-3, size=len(q))
-    rough = replace(m, q=q, sigma_by_joint={"leg1_prismatic": 1e-3})
-    found = fitted(replace(noisy, measurements=rough))
-    off = [abs(a.q0 - b.q0) for a, b in zip(found.legs, noisy.truth.legs, strict=True)]
-    assert max(off[1:]) < 2e-4
 
 
 @pytest.mark.slow
@@ -313,15 +237,6 @@ def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
     assert "leg2.base.x" in found.value.problems[0]
 
 
-@pytest.mark.slow
-def test_a_prior_far_off_is_named_with_that_of_the_measurements() -> None:
-    session = machine_session("tricept")
-    true = true_values(session)["centre.twist"]
-    choices = Choices(priors={"centre.twist": Prior(true - 1.4, 2e-4)})
-    with pytest.raises(DidNotConverge, match=r"prior of centre\.twist contradicts"):
-        fitted(session, choices)
-
-
 @pytest.mark.parametrize(
     ("factor", "way"),
     thinned([(0.9, "10 % smaller"), (1.1, "10 % larger")], [(1.1, "10 % larger")]),
@@ -332,15 +247,6 @@ def test_a_wrong_encoder_scale_shows_in_the_radii(factor: float, way: str) -> No
     measurements = replace(measurements, q=factor * measurements.q)
     found = fitted(replace(session, measurements=measurements, outlines=outlines))
     assert any(note.startswith(f"All radii come out {way}") for note in found.notes)
-
-
-def test_one_wrong_radius_is_no_wrong_scale(noisy: MachineSession) -> None:
-    radii = {part: r * (1.1 if part[0] == 0 else 1.0) for part, r in noisy.legs.radii.items()}
-    found = fitted(replace(noisy, legs=replace(noisy.legs, radii=radii)))
-    (note,) = found.notes
-    name = noisy.legs.names[0]
-    assert note.startswith(f"The measurements contradict radii of the model: {name}.radius.")
-    assert note.count(" against ") == sum(part[0] == 0 for part in radii)
 
 
 def _sized(seen: BoardCorners, factor: float) -> BoardCorners:
@@ -379,14 +285,3 @@ def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
     stated = Choices(priors={BOARD_SCALE: Prior(1.0, 1e-3)})
     with pytest.raises(DidNotConverge, match=rf"prior of {BOARD_SCALE} contradicts"):
         refine(*everything, board=wrong, choices=stated)
-
-
-def test_a_size_that_little_is_known_of_is_not_refused() -> None:
-    """One view that shows the board says nothing of its size that its distance could not."""
-    session = machine_session("3-rpr")
-    measurements, outlines = session.noisy(13)
-    corners = corners_of(session, seed=14)
-    once = replace(corners, used=corners.used & (measurements.view[corners.row] == 0))
-    seen, start = with_board(session, once)
-    solution = refine(session.legs, measurements, outlines, start, board=seen)
-    assert solution.estimates.values[BOARD_SCALE] == pytest.approx(1.0, abs=5e-3)

@@ -1,7 +1,6 @@
 """The Monte Carlo runner: the same results however it is run, and nothing lost."""
 
 import json
-import os
 import resource
 import signal
 import subprocess
@@ -26,14 +25,6 @@ def _lines(folder: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
 
-@pytest.mark.system
-def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() -> None:
-    study = Draws(seconds=0.002, fails_above=0.5)
-    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2)]
-    assert results[0] == results[1]
-    assert 0 < results[0]["n"] < 40
-
-
 def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_for(
     tmp_path: Path,
 ) -> None:
@@ -50,18 +41,6 @@ def test_more_runs_are_added_to_those_that_are_there_and_missing_ones_made_up_fo
     (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join([*begun[:4], *begun[6:]]))
     assert run_study(Draws(), 10, output=tmp_path).document() == few
     assert sorted(_lines(tmp_path)) == sorted(begun)
-
-
-def test_failed_runs_are_recorded_and_counted(tmp_path: Path) -> None:
-    study = Draws(fails_above=0.5)
-    result = run_study(study, 40, output=tmp_path / "out")
-    document = result.document()
-    assert document["failures"] == {"DidNotConverge": 40 - document["n"]}
-    assert 0 < document["n"] < 40
-    failed = [line for line in _lines(tmp_path / "out") if b"failure" in line]
-    assert len(failed) == 40 - document["n"]
-    again = run_study(study, 40, output=tmp_path / "out")
-    assert again.document() == document
 
 
 def test_a_study_of_failures_only_says_why() -> None:
@@ -278,14 +257,3 @@ def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> No
     n_done = len(_lines(tmp_path))
     assert 20 <= n_done < 401
     assert run_study(Draws(), 400, output=tmp_path).document() == run_study(Draws(), 400).document()
-
-
-@pytest.mark.system
-def test_ctrl_c_stops_all_processes_without_a_word_of_theirs(tmp_path: Path) -> None:
-    with _running(tmp_path) as process:
-        os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=20.0)
-    tracebacks = [line for line in told.decode().splitlines() if line.startswith("Traceback")]
-    assert len(tracebacks) == 1  # that of the program itself, which lets the interrupt pass
-    assert told.decode().splitlines()[-1].startswith("KeyboardInterrupt")
-    assert len(_lines(tmp_path)) < 401

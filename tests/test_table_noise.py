@@ -43,13 +43,6 @@ def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z(
     assert np.allclose(angles_of_direction(u), (psi, theta), atol=1e-14)
 
 
-def test_psi_is_towards_the_camera_and_theta_in_the_image() -> None:
-    psi, theta = angles_of_direction(np.array([[0.0, 0.8, 0.6], [0.6, 0.8, 0.0], [0.0, -1.0, 0.0]]))
-    assert np.allclose(psi, [np.arcsin(0.6), 0.0, 0.0])
-    assert np.allclose(theta[:2], [0.0, -np.arcsin(0.6)])
-    assert np.isclose(abs(theta[2]), np.pi)  # against the y axis: either way round
-
-
 def test_the_derivative_of_the_direction_is_that_of_finite_differences() -> None:
     rng = np.random.default_rng(1)
     psi, theta = rng.uniform(-1.5, 1.5, 20), rng.uniform(-3.1, 3.1, 20)
@@ -76,39 +69,6 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
     assert np.allclose(
         found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.1
     )
-
-
-def test_angles_with_noise_are_written_within_their_ranges() -> None:
-    n, noise = 2000, TableNoise.in_radians()
-    turns = np.random.default_rng(3)
-    # Down in the image, where theta is pi, and towards the camera or away, where psi is pi/2.
-    u = 0.05 * turns.normal(size=(n, 3)) + [0.0, 0.1, 1.0]
-    u[1::4, 2] *= -1.0
-    u[::2] = 0.05 * turns.normal(size=(n // 2, 3)) + [0.0, -1.0, 0.0]
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    A = np.tile([0.1, 0.2, 0.9], (n, 1))
-    found = table_of(*_indices(n), u, A, noise, np.random.default_rng(0)).values
-    drawn = table_of_lines(u, A) + np.random.default_rng(0).normal(size=(n, 4)) * noise.sigmas
-    for wanted, most in ((0, 0.5 * np.pi), (1, np.pi)):
-        assert np.abs(drawn[:, wanted]).max() > most + 0.01  # or nothing was to be wrapped
-        assert np.abs(found[:, wanted]).max() <= most
-    assert np.allclose(
-        direction_of_angles(*found.T[:2]), direction_of_angles(*drawn.T[:2]), atol=1e-14
-    )
-
-
-def test_the_angles_of_table_1_are_degrees_unless_radians_are_asked_for() -> None:
-    assert np.allclose(np.rad2deg(TableNoise().sigmas[:2]), [0.05, 0.06])
-    assert np.allclose(TableNoise.in_radians().sigmas[:2], [0.05, 0.06])
-    assert np.allclose(TableNoise().sigmas[2:], TableNoise.in_radians().sigmas[2:])
-
-
-def test_axes_without_noise_are_the_lines_that_they_were_made_of() -> None:
-    u, A = _random_lines(30)
-    axes = _observed(u, A, TableNoise(), None)
-    assert np.allclose(axes.u, u, atol=1e-15)
-    assert np.allclose(axes.M[:, 1], 0.0)
-    assert np.allclose(distance_to_line(A, axes.u, axes.M), 0.0, atol=1e-14)
 
 
 def test_the_simulator_has_its_own_way_to_the_table_and_it_leads_to_the_same() -> None:

@@ -24,18 +24,16 @@ from legcal.data.axes import (
     read_axes,
     write_axis_table,
 )
-from legcal.data.measurements import View, row_names
+from legcal.data.measurements import row_names
 from legcal.data.outlines import (
     ENCODING,
     QUALITY,
     Outlines,
     no_outlines,
     read_observations,
-    reject_unused_legs,
     write_observations,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
-from legcal.errors import DatasetError
 from legcal.geometry.types import Array, IntArray
 
 FAST = settings(
@@ -96,13 +94,6 @@ def edited(path: Path, row: int, **cells: str) -> Path:
     return rewritten(path, change)
 
 
-def problems(path: Path) -> tuple[str, ...]:
-    with pytest.raises(DatasetError) as refusal:
-        read_again(path)
-    assert all(problem.startswith(str(path)) for problem in refusal.value.problems)
-    return tuple(refusal.value.problems)
-
-
 # --- written and read
 
 
@@ -154,17 +145,6 @@ def test_headers_are_those_of_the_contract(
     n_rows = len(table[0]) if isinstance(table, tuple) else len(table)
     assert len(read_again(path)) == n_rows
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize("table", [outlines_of(4), axis_table(4)])
-def test_column_order_line_ends_and_byte_order_mark_do_not_matter(
-    tmp_path: Path, table: Outlines | AxisTable
-) -> None:
-    path = written(tmp_path, table)
-    expected = read_again(path)
-    found = read_again(rewritten(path, lambda lines: [cells[::-1] for cells in lines]))
-    for name, values in vars(expected).items():
-        np.testing.assert_array_equal(getattr(found, name), values)
 
 
 def test_tables_without_optional_columns_and_rows_without_the_other_edge_are_read(
@@ -233,44 +213,12 @@ def test_the_covariance_of_an_axis_is_that_of_both_of_its_outlines() -> None:
 # --- corrected by hand
 
 
-def test_an_edited_row_is_read_without_what_detection_said_of_it(tmp_path: Path) -> None:
-    outlines = outlines_of(6, rejected=0.0)
-    cells = {"source": "edited", "verdict": "rejected", "reason": "mine"}
-    found = read(edited(written(tmp_path, outlines), 3, **cells))
-    assert (found.source[2], bool(found.used[2])) == ("edited", False)
-    assert found.reason[2] == Rejection(Reason.OTHER, "mine")
-    np.testing.assert_array_equal(found.h, outlines.h)
-    for name in OPTIONAL:
-        assert np.isnan(getattr(found, name)[2])
-        assert np.isfinite(getattr(found, name)[[0, 1, 3]]).all()
-
-
 def test_a_rounded_direction_is_made_unit(tmp_path: Path) -> None:
     outlines = outlines_of(7, rejected=0.0)
     cells = {name: f"{x:.4f}" for name, x in zip("abc", outlines.h[0], strict=True)}
     found = read(edited(written(tmp_path, outlines), 1, **cells))
     assert np.linalg.norm(found.h[0]) == pytest.approx(1.0, abs=1e-15)
     np.testing.assert_allclose(found.h[0], outlines.h[0], atol=1e-4)
-
-
-def test_stale_rows_are_left_out_only_where_legcal_detected_them(tmp_path: Path) -> None:
-    outlines = outlines_of(12, rejected=0.0)
-    path = edited(written(tmp_path, outlines), 2, image="gone.png")
-    assert len(read(path, skip_stale=True)) == len(outlines) - 1
-    edited(path, 2, source="edited")
-    with pytest.raises(DatasetError, match=r"found 'gone\.png', needed an image"):
-        read(path, skip_stale=True)
-
-
-def test_legs_that_a_view_leaves_out_are_rejected() -> None:
-    outlines = outlines_of(13, rejected=0.0)
-    views = (MEASUREMENTS.views[0], View("left", MEASUREMENTS.views[1].camera, legs=("legA",)))
-    found = reject_unused_legs(outlines, replace(MEASUREMENTS, views=views), LEG_NAMES)
-    left_out = (MEASUREMENTS.view[outlines.row] == 1) & (outlines.leg != 1)
-    np.testing.assert_array_equal(found.used, ~left_out)
-    assert {found.reason[i] for i in np.flatnonzero(left_out)} == {
-        Rejection(Reason.UNUSED_LEG, "left")
-    }
 
 
 @pytest.mark.parametrize(
@@ -297,18 +245,3 @@ def test_sentences_of_earlier_versions_are_read_as_reasons(
 
 
 # --- refused
-
-
-def test_many_problems_are_listed_at_once_and_said_shortly(tmp_path: Path) -> None:
-    path = written(tmp_path, outlines_of(10, rejected=0.0))
-    edited(path, 1, view="up", leg="none", edge="0")
-    edited(path, 4, a="x", b="y")
-    edited(path, 6, a="9", s00="-1")
-    assert len(problems(path)) == 7
-    path = written(tmp_path, axis_table())
-    for row in range(1, 13):
-        edited(path, row, theta=str(-90 - row))
-    with pytest.raises(DatasetError) as refusal:
-        read_again(path)
-    assert len(refusal.value.problems) == 12
-    assert str(refusal.value).splitlines()[5:] == ["... and 7 more like these."]

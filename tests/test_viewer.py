@@ -12,12 +12,10 @@ from layouts import Layout, write_machine
 from machines import of_types
 from scipy.ndimage import map_coordinates
 
-from legcal.geometry.types import Array
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.redundancy import reading_residuals
 from legcal.viewer.motion import Motion
 from legcal.viewer.photographs import Photographs
 from legcal.viewer.source import Source, open_source
@@ -61,19 +59,6 @@ def test_a_coordinate_of_the_pose_moves_the_legs_and_no_other_coordinate(name: s
     )
 
 
-def test_redundant_motors_give_way(tmp_path: Path) -> None:
-    machine = load_mechanism(write_machine(tmp_path, of_types(["US"] * 7), Layout()))
-    motion = Motion(machine)
-    start = motion.posture.q.copy()
-    for k in range(1, 11):
-        assert not motion.read(2, start[2] + 0.002 * k).problem
-    posture = motion.posture
-    assert np.abs(reading_residuals(machine, posture.T, posture.q)).max() < 1e-9
-    assert abs(posture.q[2] - start[2] - 0.02) < 1e-3
-    others = np.delete(posture.q - start, 2)
-    assert 1e-4 < np.abs(others).max() < 0.02
-
-
 def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
     spec = of_types(["US"] * 6, ["passive"] * 6)
     motion = Motion(load_mechanism(write_machine(tmp_path, spec, Layout())))
@@ -87,51 +72,6 @@ def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def hexapod() -> Machine:
     return load_mechanism("hexapod")
-
-
-def test_legs_are_marked_where_their_travel_ends(hexapod: Machine) -> None:
-    motion = Motion(hexapod)
-    assert not motion.at_end.any()
-    motion.read(1, hexapod.legs[1].travel[1])
-    assert motion.at_end.tolist() == [j == 1 for j in range(6)]
-    ranges = motion.ranges_of_coordinates()
-    motion.home()
-    motion.place(2, ranges[2, 1])  # a little beyond
-    assert motion.at_end.any()
-    assert not motion.posture.problem
-
-
-def test_what_is_not_reached_leaves_the_machine_where_it_was(hexapod: Machine) -> None:
-    motion = Motion(hexapod)
-    T = motion.posture.T.as_matrix()
-    posture = motion.read(0, 30.0)
-    assert "could not be reached" in posture.problem
-    np.testing.assert_array_equal(posture.T.as_matrix(), T)
-    assert not motion.read(0, posture.q[0] + 0.001).problem
-    motion = Motion(load_mechanism("hexapod-rod"))
-    assert "allow no pose" in motion.place(2, 5.0).problem
-
-
-def along_z(wxyz: Array) -> Array:
-    """Return where turns take the z axis, (n, 3)."""
-    w, x, y, z = wxyz.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-
-
-def test_rods_join_the_joints(hexapod: Machine) -> None:
-    stage, motion = Stage(Source(hexapod)), Motion(hexapod)
-    motion.read(3, motion.posture.q[3] + 0.02)
-    seen = stage.seen(motion.posture)
-    np.testing.assert_allclose(
-        np.linalg.norm(seen.B - seen.A, axis=1), hexapod.lengths_at(motion.posture.q), atol=1e-12
-    )
-    along = along_z(seen.rods.wxyz)
-    A, u = seen.A[stage.rod_legs], (seen.B - seen.A)[stage.rod_legs]
-    u /= np.linalg.norm(u, axis=1)[:, None]
-    np.testing.assert_allclose(along, u, atol=1e-12)
-    off = seen.rods.position - A
-    np.testing.assert_allclose(np.cross(off, u), 0.0, atol=1e-12)
-    assert seen.beside is None
 
 
 @pytest.fixture(scope="module")
@@ -157,25 +97,6 @@ def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> No
         seen[10.0].B - nominal[1], 10.0 * (seen[1.0].B - nominal[1]), atol=1e-12
     )
     assert 1e-4 < seen[1.0].apart < 1e-2
-
-
-def test_weak_directions_are_motions_about_the_calibrated_machine(result: Source) -> None:
-    stage, motion = Stage(result), Motion(result.machine)
-    assert len(stage.motions) >= 1
-    forth, back = (stage.seen(motion.posture, 0, 1000.0, phase) for phase in (1.0, -1.0))
-    here = stage.seen(motion.posture)
-    np.testing.assert_allclose(0.5 * (forth.B + back.B), here.B, atol=1e-12)
-    assert np.abs(forth.B - here.B).max() > 1e-3
-    axes, enlarged = stage.ellipsoids
-    assert result.result is not None
-    links = result.result.result.links
-    assert links is not None
-    for side, block in links.items():
-        covariance = np.array([joint.covariance for joint in block.joints])
-        np.testing.assert_allclose(
-            axes[side] @ axes[side].transpose(0, 2, 1), covariance, atol=1e-15
-        )
-    assert 10.0 <= enlarged <= 1e4
 
 
 def test_outlines_lie_on_the_legs_as_their_camera_sees_them(result: Source) -> None:
@@ -277,29 +198,3 @@ def test_without_viser_the_command_that_installs_it_is_said(
     monkeypatch.setattr("legcal.viewer.window.find_spec", lambda name: None)
     assert run(monkeypatch, "view", "hexapod") == 2
     assert "pip install 'legcal[view]'" in capsys.readouterr().err
-
-
-def test_rims_leave_out_a_leg_in_the_middle_and_no_other() -> None:
-    for name, n in (("tricept", 3), ("hexapod", 6), ("3-rpr", 3)):
-        for rim in Stage(Source(load_mechanism(name))).rims:
-            assert len(rim) == n + 1
-            assert rim[0] == rim[-1]
-            assert len(set(rim)) == n
-
-
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
-def test_arms_and_carriages_are_drawn_to_the_joints_that_they_carry(name: str) -> None:
-    machine = load_mechanism(name)
-    stage, motion = Stage(Source(machine)), Motion(machine)
-    before = stage.seen(motion.posture)
-    motion.read(2, motion.posture.q[2] - 0.05)
-    seen = stage.seen(motion.posture)
-    np.testing.assert_allclose(np.linalg.norm(seen.B - seen.A, axis=1), machine.q0, atol=1e-9)
-    ends = seen.motors.position + 0.5 * seen.motors.scale[:, 2:] * along_z(seen.motors.wxyz)
-    where = [stage.n_standing + 2 * k for k in range(3)]  # each followed by the bar of its rods
-    middles = 0.5 * (seen.A[::2] + seen.A[1::2])
-    carried = seen.motors.position[where] if name == "linear-delta" else ends[where]
-    np.testing.assert_allclose(carried, middles, atol=1e-12)
-    np.testing.assert_allclose(seen.motors.scale, before.motors.scale, atol=1e-12)
-    moved = np.linalg.norm(seen.motors.position - before.motors.position, axis=1) > 1e-6
-    assert np.flatnonzero(moved).tolist() == [stage.n_standing + 2, stage.n_standing + 3]

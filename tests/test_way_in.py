@@ -1,6 +1,5 @@
 """The first hour: tables of joints as people write them, and from files to a calibration."""
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 from command_line import run
-from hexapod_example import ROOT, TRUTH, Run
+from hexapod_example import ROOT
 from lxml import etree
 
-from legcal import evaluate, load_mechanism
+from legcal import load_mechanism
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.picture import draw_machine
 
@@ -87,27 +86,6 @@ def test_headings_as_people_write_them_give_one_machine(
     assert {leg.travel for leg in machine.legs} == {(0.0, 0.12)}
     np.testing.assert_allclose(machine.home.as_matrix()[:3, 3], [0, 0, 0.4], atol=1e-12)
     assert machine.home.rotation.magnitude() < 1e-12
-
-
-def test_the_template_is_a_table_and_replaces_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("new", "--template", "-o", tmp_path, "--name", "mine")
-    assert run(monkeypatch, *words) == 0
-    machines = []
-    for suffix in ("yaml", "csv"):
-        assert run(monkeypatch, "new", tmp_path / f"mine.{suffix}", "-o", tmp_path / suffix) == 0
-        machines.append(load_mechanism(tmp_path / suffix / "models/mine.yaml"))
-    found = evaluate(*machines)
-    assert np.abs(found.values).max() < 1.0
-    np.testing.assert_allclose(found.values, found.references, atol=1e-12)
-    (tmp_path / "mine.csv").write_text("mine")
-    capsys.readouterr()
-    assert run(monkeypatch, *words) == 2
-    assert "mine.csv already there" in capsys.readouterr().err
-    assert (tmp_path / "mine.csv").read_text() == "mine"
-    assert run(monkeypatch, *words, "--force") == 0
-    assert run(monkeypatch, *words, "--force", tmp_path / "mine.csv") == 2
 
 
 def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
@@ -225,17 +203,6 @@ def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
         assert run(monkeypatch, "inspect", model, "--picture", place) == 2
         assert word in capsys.readouterr().err
     assert svg.read_text() == "mine"
-
-
-def test_a_result_folder_is_a_model(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    apart = evaluate(example_run.output, example_run.output / "calibrated.yaml")
-    assert apart.displacement.max() < 1e-12
-    assert run(monkeypatch, "inspect", example_run.output) == 0
-    assert run(monkeypatch, "evaluate", example_run.output, TRUTH) == 0
-    shutil.copy(example_run.output / "calibrated.yaml", tmp_path)
-    assert run(monkeypatch, "inspect", tmp_path) == 2  # a folder that legcal did not write
 
 
 def test_hostile_names_do_nothing_in_a_terminal(

@@ -10,41 +10,26 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import yaml
-from fit_sessions import machine_session
 from hexapod_example import Picture, Spoiled, spoiled
 from numpy.typing import NDArray
-from outline_tables import outlines_of
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 from legcal import calibrate, detect, load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines
-from legcal.data.reasons import USED, Reason, Rejection
-from legcal.errors import NotIdentifiable
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import BoolArray
-from legcal.machine.loader import load_mechanism
-from legcal.perception import photographs
 from legcal.perception.diagnostics import (
-    ImageExplanation,
-    OutlineCount,
-    _best,
-    _usual,
-    find_wrong_images,
     hint_notes,
-    image_verdict,
-    reject_images,
 )
-from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
+from legcal.perception.image_quality import measure_exposure
 from legcal.perception.photographs import (
     MeasuredImages,
-    _parts_not_found,
     place_and_measure,
 )
 from legcal.progress import no_progress
@@ -146,22 +131,6 @@ def test_an_image_that_is_no_good_is_named_and_left_out(
     assert not detected.outlines.used[of_row].any()
 
 
-def test_left_out_images_keep_what_they_should_not_show() -> None:
-    table = outlines_of(1, rows=(0, 1), rejected=0.0)
-    reasons = (
-        Rejection(Reason.OUTSIDE),
-        Rejection(Reason.HIDDEN, "leg2"),
-        Rejection(Reason.CONTRAST, "2.1"),
-        USED,
-    )
-    reason = (*reasons, *table.reason[4:])
-    table = replace(table, reason=reason, used=np.array([not why for why in reason]))
-    out = reject_images(table, {0: Rejection(Reason.BLACK)})
-    assert not out.used[out.row == 0].any()
-    assert out.reason[:4] == (*reasons[:2], *2 * [Rejection(Reason.BLACK)])
-    assert np.array_equal(out.used[out.row == 1], table.used[table.row == 1])
-
-
 def test_files_that_were_exchanged_are_told_from_each_other(
     bad: Spoiled, detected: Detection
 ) -> None:
@@ -251,29 +220,6 @@ def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
     assert "in its 4 images" in found.unplaced["c2"]  # once for all of them
 
 
-def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "alone", 3, ("c1", "c2"))
-    session = _session(made)
-    photographs, view = session.photographs, session.measurements.view
-    observed = _observed(made)
-    (alone,) = np.flatnonzero(view == 1)[:1].tolist()
-    found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
-    found[alone] = OutlineCount(1, 12)
-    search = photographs.search(rough_placement(session)[0])
-    usual = _usual(search, observed.placement, found, [alone], in_turn)
-    assert usual[1] > 0.3
-    reason, note, _ = image_verdict(
-        session.measurements, alone, ImageExplanation(0.0), usual, found
-    )
-    assert reason.reason is Reason.OTHER_SCENE
-    assert "found 1 of 12 outlines where its reading has the legs" in note
-    reason, note, _ = image_verdict(
-        session.measurements, alone, ImageExplanation(usual[1]), usual, found
-    )
-    assert not reason
-    assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
-
-
 @pytest.mark.system
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     made = spoiled(tmp_path / "views", 3)
@@ -292,14 +238,6 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert len([note for note in found.notes if not note.startswith(WITHOUT_GAMMA)]) == 2
     assert re.match(r"view c2: its T_base_camera is wrong: .*it suits view c3", found.notes[0])
     assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
-
-
-def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
-    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.identity())
-    for off, angle, n in (((0.03, 0, 0), 3.0, 0), ((0.15, 0, 0), 0.0, 1), ((0, 0, 0), 9.0, 1)):
-        turn = Rotation.from_rotvec([0.0, angle, 0.0], degrees=True)
-        hint = T * RigidTransform.from_components(off, turn)
-        assert len(hint_notes(["c1"], [hint], [T])) == n
 
 
 @pytest.mark.parametrize(
@@ -383,32 +321,6 @@ def test_radii_that_are_wrong_by_a_fifth_are_found(
     assert np.allclose(wrong, 0.01, rtol=0.06)
 
 
-def test_a_radius_that_one_view_alone_contradicts_is_not_doubted(tmp_path: Path) -> None:
-    """Light and shade may lie alike on a leg in all images of one camera."""
-    made = spoiled(tmp_path / "radii", 5, ("c1",))
-    made.scale_radii(0.8, "leg3")
-    observed = _observed(made)
-    assert observed.placement.unplaced == {}
-    assert not [note for note in observed.placement.notes if "than in the model" in note]
-    given = [cylinder.radius for cylinder in observed.photographs.cylinders[2]]
-    assert given == pytest.approx([0.008] * len(given))
-
-
-def test_radii_of_parts_are_doubted_whose_outlines_are_not_found_where_they_can_be(
-    fitted: Calibration,
-) -> None:
-    legs, outlines = fitted.dataset.machine.legs, fitted.solution.outlines
-    assert _parts_not_found(legs, outlines) == []
-    own = outlines.leg == 2
-    (name,) = {outlines.part[k] for k in np.flatnonzero(own)}
-    doubted = [(2, legs[2].radius_of_part[name])]
-    for why, parts in ((Reason.FAINT, doubted), (Reason.SHORT, [])):
-        rejected = [Rejection(why)] * len(outlines)
-        lost = replace(outlines, used=np.ones_like(own)).reject(own, rejected)
-        lost = replace(lost, used=outlines.used & ~own)
-        assert _parts_not_found(legs, lost) == parts
-
-
 def test_blur_is_measured_whatever_the_light() -> None:
     rng = np.random.default_rng(0)
     picture = np.zeros((300, 400), np.float32)
@@ -433,33 +345,6 @@ def test_what_is_flat_has_no_edges() -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert measure_exposure(stripes).blur < 0.6  # all slopes are the greatest
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
-
-
-def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few() -> None:
-    blurs = [0.8, 0.9, 1.0, 4.0, 3.8, 4.0]
-    exposures = {row: Exposure(10.0, 200.0, 150.0, blur) for row, blur in enumerate(blurs)}
-    alone, one = {row: row for row in exposures}, dict.fromkeys(exposures, 0)
-    soft = {row: int(row >= 4) for row in exposures}  # another camera, of which there are two
-    found = image_defects(exposures, alone, soft)
-    assert found == {3: Rejection(Reason.BLURRED, "4.0 px, the others of its camera by 0.9")}
-    found = image_defects(exposures, one, soft)
-    assert [(row, "of its view" in why.detail) for row, why in found.items()] == [
-        (row, True) for row in (3, 4, 5)
-    ]
-    soft = {row: int(row >= 3) for row in exposures}
-    assert image_defects(exposures, soft, one) == {}  # a soft view is compared with itself
-
-
-def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "hand", 3, ("c1", "c2"))
-    image = made.change("c2", 1, _blurred)
-    made.rows = [*made.rows[:3], made.row("c2", 1)]
-    found = _observed(made).placement
-    assert list(found.unplaced) == ["c2"]
-    words = (
-        rf"in its 1 image \({image}: the image is blurred by \d\.\d px, the others of its camera"
-    )
-    assert re.search(words, found.unplaced["c2"]), found.unplaced
 
 
 @pytest.fixture(scope="module")
@@ -528,38 +413,6 @@ def test_a_wrong_digit_is_named_where_outlines_of_few_legs_leave_the_pose_open(
         assert float(found[2]) == pytest.approx(1e3 * m.q[row, leg], abs=1.0)
 
 
-def test_a_wrong_angle_of_an_arm_is_named_in_degrees_beyond_its_sigma() -> None:
-    session = machine_session("delta", n_poses=3)
-    m, machine, row = session.measurements, load_mechanism("delta"), 1
-    found = refine(session.legs, m, session.outlines, session.start)
-    fit = replace(found, outlines=_with_rejected(found.outlines, found.outlines.row == row))
-    q = m.q.copy()
-    q[row, :2] += 0.25  # of both rods of the first arm
-    (note,) = outlier_images(replace(m, q=q), machine, fit).values()
-    shown = re.search(r"reading of arm1 of ([\d.-]+) \+- [\d.]+ deg, given ([\d.-]+) deg", note)
-    assert shown is not None, note
-    expected = np.degrees([m.q[row, 0], q[row, 0]])
-    np.testing.assert_allclose([float(x) for x in shown.groups()], expected, atol=0.02)
-    rough = replace(m, q=q, sigma_by_joint=dict.fromkeys(machine.motor_names, 0.06))
-    assert "its readings suit it" in outlier_images(rough, machine, fit)[row]
-
-
-def test_no_reading_is_said_that_the_travel_does_not_have(fitted: Calibration) -> None:
-    solution, m, row = fitted.solution, fitted.dataset.measurements, 1
-    machine, q = fitted.dataset.machine, m.q.copy()
-    q[row, [0, 2, 4]] += 0.05
-    limits = [(float(x) - 1e-3, float(x) + 1e-3) for x in q[row]]
-    legs = tuple(
-        replace(leg, travel=travel) for leg, travel in zip(machine.legs, limits, strict=True)
-    )
-    fit = replace(
-        solution, outlines=_with_rejected(solution.outlines, solution.outlines.row == row)
-    )
-    notes = outlier_images(replace(m, q=q), replace(machine, legs=legs), fit)
-    assert "its outlines suit no pose within the travel of the legs" in notes[row]
-    assert "mm" not in notes[row]
-
-
 def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration) -> None:
     """Although a reading is wrong: less than a third of all outlines, or those of one leg."""
     solution, m, machine = fitted.solution, fitted.dataset.measurements, fitted.dataset.machine
@@ -569,94 +422,3 @@ def test_some_wrong_outlines_do_not_make_an_image_an_outlier(fitted: Calibration
         wrong = (o.row == 1) & (np.isin(o.leg, legs) | np.isin(o.edge, edges))
         fit = replace(solution, outlines=_with_rejected(o, wrong))
         assert outlier_images(replace(m, q=q), machine, fit) == {}
-
-
-@pytest.mark.system
-def test_an_image_in_which_nothing_like_the_legs_was_found_counts_if_a_fit_finds_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = spoiled(tmp_path / "missed", 5)
-    made.change("c2", 1, _elsewhere)
-
-    def missed(*searched: Any) -> Any:
-        placement, reasons = find_wrong_images(*searched)
-        said = {0: "was left out: found nothing; look at it.", **placement.barely}
-        return replace(placement, barely=said), {0: Rejection(Reason.OTHER_SCENE), **reasons}
-
-    monkeypatch.setattr(photographs, "find_wrong_images", missed)
-    found = calibrate(made.write(), use_cache=False)
-    outlines = found.solution.outlines
-    used = [outlines.used[outlines.row == row].mean() for row in range(15)]
-    assert np.flatnonzero(np.array(used) < 0.5).tolist() == [6]
-    (note,) = (note for note in found.notes if "was left out" in note)
-    assert "images/c2" in note
-
-
-@pytest.mark.slow
-def test_what_remains_is_calibrated_or_refused(bad: Spoiled, tmp_path: Path) -> None:
-    found = calibrate(bad.path, use_cache=False)
-    again = calibrate(bad.path)
-    assert found.verdict.trustworthy
-    assert [note for note in found.notes if "was left out" in note] == [
-        note for note in again.notes if "was left out" in note
-    ]
-    made = spoiled(tmp_path / "few", 4, ("c1", "c2"))
-    for k in range(3):
-        made.change("c1", k, _mirror)
-        made.change("c2", k, lambda picture: 0 * picture)
-    with pytest.raises(NotIdentifiable, match=r"cannot be identified") as refused:
-        calibrate(made.write())
-    assert any("left and right are exchanged" in problem for problem in refused.value.problems)
-
-
-@pytest.mark.slow
-def test_without_hints_good_photographs_are_not_doubted(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "unknown", 8)
-    for view in made.entry["views"].values():
-        del view["T_base_camera"]
-    notes = calibrate(made.write()).notes
-    assert [note for note in notes if not note.startswith(("The start ", WITHOUT_GAMMA))] == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("hinted", [True, False])
-def test_a_focal_length_that_is_wrong_by_a_twentieth_is_named(tmp_path: Path, hinted: bool) -> None:
-    made = spoiled(tmp_path / "focal", 8)
-    path = made.path / "camera_info.yaml"
-    path.write_text(path.read_text().replace("645.15", "677.4"))
-    for view in made.entry["views"].values() if not hinted else ():
-        del view["T_base_camera"]
-    found = calibrate(made.write())
-    assert not found.verdict.trustworthy
-    assert any(note.startswith("The focal length of c1 does not agree") for note in found.notes)
-    assert any("camera_info.yaml" in note for note in found.notes)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "factor"), [(3, 1.2), (6, 1.15)])
-def test_a_zoom_that_leads_the_fit_away_from_the_outlines_is_named(
-    tmp_path: Path, n: int, factor: float
-) -> None:
-    made = spoiled(tmp_path / "zoom", n)
-    path = made.path / "camera_info.yaml"
-    camera = yaml.safe_load(path.read_text())
-    for k in (0, 4):
-        camera["camera_matrix"]["data"][k] /= factor
-    path.write_text(yaml.safe_dump(camera))
-    try:
-        found = calibrate(made.write())
-    except NotIdentifiable as refusal:
-        said: tuple[str, ...] = refusal.problems
-    else:
-        assert not found.verdict.trustworthy
-        said = found.notes
-    assert any(sentence.startswith("The focal length of c1 does not agree") for sentence in said)
-
-
-def test_a_reading_whose_own_image_is_right_does_not_rival_an_exchange() -> None:
-    readings = [(0.80, 7), (0.76, 3), (0.2, 5)]
-    assert _best(readings, ()) == []
-    assert _best(readings, (7, 1)) == [(0.80, 7)]
-    assert _best(readings, (7, 3)) == []
-    assert _best([(0.9, 7), (0.5, 3)], ()) == [(0.9, 7)]
-    assert _best([], (1,)) == []

@@ -57,7 +57,7 @@ from legcal.data.measurements import few, few_views, reading_columns, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
 from legcal.files.folder import output_path
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.diagnostics import TAKE_AGAIN, is_out_of_sight, left_out_notes
@@ -73,7 +73,6 @@ CLIPPED = 0.1  # of the pixels of a view
 FEW_LEGS = 0.5  # of those that a view should show
 MIN_READINGS = 6  # that have the same last digit by more than chance
 MAX_DIGITS = 10  # of readings in metres
-_UNREADABLE = " could not be read: "  # of an image; what follows is the cause
 LOOKING = "Looking at light and sharpness"  # a stage of progress
 
 
@@ -229,7 +228,7 @@ def _severest_first(one: Finding) -> tuple[int, bool, bool]:
     return SEVERITIES.index(one.severity), one.check != "files", one.check != "mistakes"
 
 
-def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[int]:
+def _look_at_files(found: _Found, problems: Sequence[tuple[int, Problem]]) -> list[int]:
     """Look for photographs that are not there or cannot be used; return the rows that can."""
     dataset, m = found.dataset, found.dataset.measurements
     n, views = sum(map(bool, m.image)), len(np.unique(m.view))
@@ -249,17 +248,17 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, str]]) -> list[i
             "remove the rows.",
             missing,
         )
-    of_files = {row: what for row, what in problems if row not in missing}
-    causes = {
-        row: cause for row, what in of_files.items() if (cause := what.partition(_UNREADABLE)[2])
-    }
-    for what, rows in by_cause(causes):
-        if len(rows) > 1:
-            images = images_in_words(m, rows)
-            found.add("files", "error", f"{dataset.table_path}: {images}{_UNREADABLE}{what}", rows)
-            of_files = {row: one for row, one in of_files.items() if row not in rows}
-    for row, what in of_files.items():
-        found.add("files", "error", what, [row])
+    of_files = {row: problem for row, problem in problems if row not in missing}
+    unread = {row: problem for row, problem in of_files.items() if problem.name}  # of an image
+    for why, rows in by_cause({row: problem.found for row, problem in unread.items()}):
+        alike = [row for row in rows if unread[row].needed == unread[rows[0]].needed]
+        if len(alike) > 1:
+            what = f"{images_in_words(m, alike)} could not be read"
+            one = replace(unread[alike[0]], what=what, found=why, row=None)
+            found.add("files", "error", str(one), alike)
+            of_files = {row: problem for row, problem in of_files.items() if row not in alike}
+    for row, problem in of_files.items():
+        found.add("files", "error", str(problem), [row])
     return [row for row in range(m.n_rows) if row not in bad]
 
 

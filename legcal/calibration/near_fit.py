@@ -37,6 +37,7 @@ from legcal.perception.photographs import (
 )
 from legcal.perception.placement import Placement, placed_arms
 
+MOVED_PX, MOST_ROUNDS = 1.0, 4  # of most joints between two fits, from where on near another round
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
 
 
@@ -58,7 +59,7 @@ def measure_again(
     rows = np.sort(np.append(rows, np.array(seen.unlike, dtype=np.intp)))
     photographs = seen.photographs.narrowed(rows, estimate.outlines)
     search = _SearchNearFit(data, photographs, seen, board, options)
-    first = best = search.fitted(estimate, {})
+    first = best = search.converged(estimate)
     trials = GammaTrials.begun(
         first.solution, known_gammas(photographs.keep, photographs.measurements)
     )
@@ -100,6 +101,33 @@ class _SearchNearFit:
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
         every = replace(self.data, seen_poses=here.seen_poses)
         return photographs, _fitted_placement(every, near.solution, self.seen)
+
+    def converged(self, near: Estimate) -> Estimate:
+        """Measure near a fit and fit again, until outlines are where they were looked for."""
+        for _ in range(MOST_ROUNDS):
+            before, near = near, self.fitted(near, {})
+            if self._moved(before, near) <= MOVED_PX:
+                break
+        return near
+
+    def _moved(self, before: Estimate, after: Estimate) -> float:
+        """Return how far joints move in photographs from one fit to another, in most [px]."""
+        m, rows, seen = self.data.measurements, self.photographs.detect, []
+        for near in (before, after):
+            _, placement = self.at(near, {})
+            joints = np.stack([placement.A_base, placement.B_base], axis=1)[rows]
+            pixels = np.full((len(rows), *joints.shape[1:3], 2), np.nan)
+            for k, row in enumerate(rows.tolist()):
+                T = placement.T_base_camera[m.view[row]]
+                if T is not None:
+                    X = T.inv().apply(joints[k].reshape(-1, 3))
+                    xy = X[:, :2] / np.where(X[:, 2:] > 0.0, X[:, 2:], np.nan)
+                    pixels[k] = (
+                        m.views[m.view[row]].camera.distort(xy).reshape(joints.shape[1:3] + (2,))
+                    )
+            seen.append(pixels)
+        away = np.linalg.norm(seen[1] - seen[0], axis=-1)
+        return float(np.nanpercentile(away, 90.0)) if np.isfinite(away).any() else 0.0
 
     def fitted(
         self, near: Estimate, gammas: Mapping[str, float], *, like: Outlines | None = None

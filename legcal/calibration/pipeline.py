@@ -97,7 +97,8 @@ def calibrate(
         The weights of the four steps: from the covariances of the axes, or all one, as the paper
         has them.
     use_cache : bool
-        Use the outlines that an earlier run left beside the dataset, if they still fit.
+        Use the outlines that an earlier run left beside the dataset, if they still fit. False
+        searches the images again; either way the new outlines replace those beside the dataset.
     workers : int, str or executor
         Search the images in that many processes; with more than one, the program that calls this
         must be safe to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address
@@ -279,7 +280,7 @@ def _estimate(
             *first.solution.camera_doubts.notes,
             *_camera_notes(data.dataset, first.solution),
         )
-        raise type(error)([*cameras, *error.problems]) from error
+        raise type(error)([*cameras, *error.facts]) from error
     return replace(
         estimate,
         image_notes=(
@@ -327,7 +328,7 @@ def _refuse_too_few(
     try:
         check_identifiable(data.at(left).in_file_order()[0], choices)
     except NotIdentifiable as failure:
-        raise NotIdentifiable([*failure.problems, *notes]) from None
+        raise NotIdentifiable([*failure.facts, *notes]) from None
 
 
 def outline_key(dataset: Dataset, choices: Choices) -> str:

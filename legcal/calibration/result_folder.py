@@ -214,7 +214,7 @@ def load_result(given: str | Path) -> EarlierResult:
     try:
         machine = load_mechanism(path.parent / RESULT_YAML)
     except (ModelError, OutOfClass) as error:
-        raise DatasetError(error.problems) from error
+        raise DatasetError(error.facts) from error
     if sorted(document.legs) != sorted(machine.leg_names):
         found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
         needed = f"{', '.join(machine.leg_names)} as in {RESULT_YAML} beside it"

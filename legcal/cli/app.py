@@ -138,8 +138,14 @@ def run(*, as_json: bool) -> int:
     except Exception as error:  # the one place that may: the boundary to the shell
         raise_if_stopped()  # libraries turn interrupts into errors of their own
         if isinstance(error, LegcalError):
-            kind, diagnosis = type(error).__name__, error.diagnosis
-            print_failure(kind, str(error), as_json=as_json, diagnosis=diagnosis)
+            kind = type(error).__name__
+            print_failure(
+                kind,
+                str(error),
+                as_json=as_json,
+                facts=error.facts,
+                diagnosis=error.diagnosis,
+            )
             return error.exit_code
         if isinstance(error, usage_error):
             print_failure("UsageError", _with_remedy(error) or NO_COMMAND, as_json=as_json)

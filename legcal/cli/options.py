@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from legcal.errors import LegcalError, OutOfResources, UsageError, printable
+from legcal.errors import LegcalError, OutOfResources, Problem, UsageError, printable
 from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
@@ -238,14 +238,22 @@ def _leave_stdout() -> None:
 
 
 def print_failure(
-    kind: str, message: str, *, as_json: bool, diagnosis: Sequence[dict[str, object]] = ()
+    kind: str,
+    message: str,
+    *,
+    as_json: bool,
+    facts: Sequence[Problem] = (),
+    diagnosis: Sequence[dict[str, object]] = (),
 ) -> None:
     """Say on stderr, or in JSON on stdout, why a command failed."""
     message = "\n".join(map(printable, message.split("\n")))
     if as_json:
         with suppress(OutOfResources):
+            error: dict[str, object] = {"kind": kind, "message": message}
+            if any(problem.is_told_apart for problem in facts):
+                error["problems"] = [problem.document() for problem in facts]
             found = {"diagnosis": list(diagnosis)} if diagnosis else {}
-            print_json({"error": {"kind": kind, "message": message}, **found})
+            print_json({"error": error, **found})
             return
     if sys.stderr is not None:
         sys.stderr.write(f"legcal: {message}\n")

@@ -325,10 +325,10 @@ def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) 
         table.refuse(
             i,
             "an axis parallel to the plane of the camera's x and z axes",
-            "one that crosses it: the point (x, 0, z) does not exist; remove the row, or give "
-            "outlines instead",
+            "one that crosses it: the point (x, 0, z) does not exist",
             "psi",
             "theta",
+            remedy="remove the row, or give outlines instead",
         )
     keys = zip(row.tolist(), leg.tolist(), strict=True)
     table.once([None if -1 in key else key for key in keys], "the same image and leg")

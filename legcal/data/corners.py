@@ -138,7 +138,7 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
         )
     for i, text in enumerate(table.text("corner")):
         if text.isdigit() and int(text) >= n_corners:
-            table.refuse(i, describe(text), f"{needed}; {remedy}", "corner")
+            table.refuse(i, describe(text), needed, "corner", remedy=remedy)
     row = find_rows(table, measurements)
     refuse_unknown_rows(table, row, measurements)
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
@@ -148,8 +148,8 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
     size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[row]]
     outside = (numbers[:, :2] < -0.5) | (numbers[:, :2] > size - 0.5)
     for i, k in np.argwhere(outside & (row >= 0)[:, None]).tolist():
-        needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image; correct it"
-        table.refuse(i, f"{numbers[i, k]:g} px", needed, NUMBERS[k])
+        needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
+        table.refuse(i, f"{numbers[i, k]:g} px", needed, NUMBERS[k], remedy="correct it")
     corner, source = table.text("corner"), table.text("source")
     keys = list(zip(row.tolist(), corner, source, strict=True))
     table.once([None if key[0] < 0 else key for key in keys], "the same image and corner")

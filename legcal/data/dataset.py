@@ -48,7 +48,7 @@ from legcal.data.reading_units import (
     sigma_in,
     sigma_too_large,
 )
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
 from legcal.files.schema import closest, describe
 from legcal.machine.files import shipped_folder, shipped_names
@@ -108,7 +108,7 @@ class Dataset:
             tuple(self._where(row) for row in rows),
         )
 
-    def inspect_image(self, row: int) -> tuple[ImageFacts, str | None]:
+    def inspect_image(self, row: int) -> tuple[ImageFacts, Problem | None]:
         """Return what the image of a row says of itself, and what keeps it from being used."""
         path = self.image_path(row)
         if path is None:
@@ -119,9 +119,9 @@ class Dataset:
         """Return the camera that took the image of a row."""
         return self.measurements.views[int(self.measurements.view[row])].camera
 
-    def _where(self, row: int) -> str:
-        """Return the place of a row for a message."""
-        return f"{self.table_path}, row {row + 1}"
+    def _where(self, row: int) -> Place:
+        """Return where a row is named."""
+        return Place(str(self.table_path), row + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +130,21 @@ class ImageReader:
 
     paths: tuple[Path | None, ...]  # the files, absolute; None where a row has no image
     cameras: tuple[Camera, ...]  # the camera of each image
-    places: tuple[str, ...]  # where each image is named, for messages
+    places: tuple[Place, ...]  # where each image is named
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
         path = self.paths[k]
         if path is None:
+            remedy = f"name one or give its outlines in {OBSERVATIONS_NAME}"
             raise DatasetError(
-                f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
-                f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
+                Problem(
+                    "its image could not be read",
+                    "an empty cell",
+                    "an image",
+                    remedy,
+                    *self.places[k],
+                )
             )
         return _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
 
@@ -147,15 +153,20 @@ _Decoded = NDArray[np.uint8] | Grey
 _kept = OrderedDict[tuple[str | int, ...], _Decoded]()  # by file; the last used at the end
 
 
-def _decoded(path: Path, camera: Camera, place: str) -> _Decoded:
+def _decoded(path: Path, camera: Camera, place: Place) -> _Decoded:
     """Decode an image; in each process once while there is room, until the file changes."""
     try:
         file = os.stat(path)
     except OSError as error:
         raise DatasetError(
-            f"{place}: its image could not be read: found '{error.strerror}' for {path} on "
-            f"{platform.node()}, needed the file there; put it back, or, where the workers of a "
-            "cluster are other machines, the dataset into a folder that they share."
+            Problem(
+                "its image could not be read",
+                f"'{error.strerror}' for {path} on {platform.node()}",
+                "the file there",
+                "put it back, or, where the workers of a cluster are other machines, the dataset "
+                "into a folder that they share",
+                *place,
+            )
         ) from error
     key = (str(path), file.st_size, file.st_mtime_ns, camera.width, camera.height)
     if key in _kept:
@@ -269,7 +280,8 @@ def load_dataset(
     folder = yaml_path.parent
     entry = read_dataset_file(yaml_path)
     boards = () if entry.board is None else parse_boards(entry.board, yaml_path)
-    problems = view_problems(yaml_path, entry.views, [board.link for board in boards])
+    problems: list[str | Problem] = []
+    problems += view_problems(yaml_path, entry.views, [board.link for board in boards])
     if found := path_problem(folder, entry.measurements):
         problems.append(
             f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
@@ -299,9 +311,9 @@ def load_dataset(
     )
     if unread:
         notes = (*notes, _without_readings(table_path, machine, unread))
-    measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
-    if problems:
-        raise DatasetError(problems)
+    measurements, origin, taken = expand_hand_held(yaml_path, rows, entry.views)
+    if taken:
+        raise DatasetError(taken)
     _refuse_two_tables(folder)
     landmarks = None
     of_clicks: list[str] = []
@@ -327,8 +339,8 @@ def load_dataset(
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
         landmarks=landmarks,
     )
-    if problems := _invisible(dataset):
-        raise DatasetError(problems)
+    if hidden := _invisible(dataset):
+        raise DatasetError(hidden)
     if not check_images:
         return dataset
     dataset, unusable = inspect_files(dataset)
@@ -372,7 +384,7 @@ def _without_photographs(dataset: Dataset) -> str:
     )
 
 
-def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, str]]]:
+def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
     """Return a dataset with what its images say of themselves, and what is wrong with rows."""
     facts, problems = inspect_rows(dataset)
     of_files = [
@@ -422,14 +434,14 @@ def _refuse_two_tables(folder: Path) -> None:
         )
 
 
-def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Camera]:
+def _read_cameras(paths: tuple[Path, ...], problems: list[str | Problem]) -> dict[Path, Camera]:
     """Return the camera of each file; files that cannot be used add to the problems."""
     cameras = {}
     for path in dict.fromkeys(paths):
         try:
             cameras[path] = read_camera(path)
         except DatasetError as error:
-            problems += error.problems
+            problems += error.facts
     return cameras
 
 
@@ -505,14 +517,20 @@ def read_given_axes(
 
 def rows_without_axes(
     table_path: Path, measurements: Measurements, axes: LegAxes
-) -> list[tuple[int, str]]:
-    """Return one sentence for each row of the measurements that has no axis."""
+) -> list[tuple[int, Problem]]:
+    """Return one problem for each row of the measurements that has no axis."""
     blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
     return [
         (
             row,
-            f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
-            f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row.",
+            Problem(
+                "the row could not be used",
+                f"no axis of it in {AXES_NAME}",
+                "one of a leg that its view uses",
+                "add one or remove the row",
+                str(table_path),
+                row + 1,
+            ),
         )
         for row in blank
     ]
@@ -534,27 +552,32 @@ def read_given_corners(
 
 def rows_without_board(
     dataset: Dataset, corners: Corners, hand_held: Sequence[int]
-) -> list[tuple[int, str]]:
-    """Return one sentence for each row of a hand-held view in which the board has no pose."""
+) -> list[tuple[int, Problem]]:
+    """Return one problem for each row of a hand-held view in which the board has no pose."""
     table_path, on_base = dataset.table_path, dataset.board_on("base")
     shown = corners.used if on_base is None else corners.used & on_base.has(corners.corner)
     counts = np.bincount(corners.row[shown], minlength=dataset.measurements.n_rows)
     return [
         (
             row,
-            f"{table_path}, row {row + 1}: its camera could not be placed: found "
-            f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {MIN_CORNERS} "
-            "in every image of a camera that is held in the hand; add them or remove the row.",
+            Problem(
+                "its camera could not be placed",
+                f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}",
+                f"{MIN_CORNERS} in every image of a camera that is held in the hand",
+                "add them or remove the row",
+                str(table_path),
+                row + 1,
+            ),
         )
         for row in hand_held
         if counts[row] < MIN_CORNERS
     ]
 
 
-def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, str]]]:
+def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, Problem]]]:
     """Return what images say of themselves, by their names, and what is wrong with rows.
 
-    That is one sentence for each row that neither an image nor tables make usable.
+    That is one problem for each row that neither an image nor tables make usable.
     """
     table_path, measurements = dataset.table_path, dataset.measurements
     held = [view.hand_held for view in measurements.views]
@@ -563,9 +586,15 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
         problems = [
             (
                 row,
-                f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
-                f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
-                "that is held in the hand; name an image or give the corners.",
+                Problem(
+                    "its camera could not be placed",
+                    f"neither an image nor {CORNERS_NAME}",
+                    "the board in every image of a camera that is held in the hand",
+                    "name an image or give the corners",
+                    str(table_path),
+                    row + 1,
+                    columns=("image",),
+                ),
             )
             for row in hand_held
             if not measurements.image[row]
@@ -584,12 +613,16 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
         if path is None and row not in given:
-            what = (
-                f"{table_path}, row {row + 1}, column image: the row could not be used: "
-                f"found neither an image nor {tables}, needed one of them; name an image or remove "
-                "the row."
+            problem = Problem(
+                "the row could not be used",
+                f"neither an image nor {tables}",
+                "one of them",
+                "name an image or remove the row",
+                str(table_path),
+                row + 1,
+                columns=("image",),
             )
-            problems.append((row, what))
+            problems.append((row, problem))
         elif path is not None and (os.path.exists(path) or row not in given):
             facts[measurements.image[row]], found = dataset.inspect_image(row)
             problems += [(row, found)] if found else []

@@ -26,11 +26,11 @@ from legcal.data.reading_units import (
     legs_with_readings,
     sigmas_of_legs,
 )
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, Problem
 from legcal.files.folder import path_problem
 from legcal.files.quantity import ANGLE, LENGTH
 from legcal.files.schema import closest, describe
-from legcal.files.table import Column, Table, place_in, read_table
+from legcal.files.table import Column, Table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import TRAVEL_MARGIN, Leg
 from legcal.vision.camera import Camera
@@ -155,12 +155,12 @@ def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements)
     for i in np.flatnonzero(row < 0).tolist():
         view, image = found[i]
         if view not in views:
-            needed = f"a view with measurements; {closest(view, views)}"
-            table.refuse(i, f"the unknown view {describe(view)}", needed, "view")
+            unknown, remedy = f"the unknown view {describe(view)}", closest(view, views)
+            table.refuse(i, unknown, "a view with measurements", "view", remedy=remedy)
         else:
             near = closest(image, [name for v, name in names if v == view])
-            needed = f"an image of view {view} in the measurements; {near}"
-            table.refuse(i, describe(image), needed, "image")
+            needed = f"an image of view {view} in the measurements"
+            table.refuse(i, describe(image), needed, "image", remedy=near)
 
 
 def find_legs(table: Table, leg_names: Sequence[str]) -> IntArray:
@@ -173,8 +173,8 @@ def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -
     """Refuse rows of a table of which :func:`find_legs` knew none."""
     names = table.text("leg")
     for i in np.flatnonzero(leg < 0).tolist():
-        needed = f"a leg of the mechanism; {closest(names[i], leg_names)}"
-        table.refuse(i, f"the unknown leg {describe(names[i])}", needed, "leg")
+        found, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
+        table.refuse(i, found, "a leg of the mechanism", "leg", remedy=remedy)
 
 
 def few(names: Sequence[str]) -> str:
@@ -284,42 +284,51 @@ def readings_in(
     for name, found, _ in beyond:
         if name in alike[1:]:
             continue
-        of_this, remedy = f"column {name}", "correct the readings or the limits"
+        of_this, remedy = [name], "correct the readings or the limits"
         if name in alike:
             remedy = cause
             if len(alike) > 1:
-                of_this, found = f"columns {few(alike)}", f"in {name} {found}"
+                of_this, found = alike, f"in {name} {found}"
         table.refuse_file(
-            f"{table.path}, {of_this}: readings are outside the travel: {found}; {remedy}."
+            Problem(
+                f"readings are outside the travel: {found}",
+                remedy=remedy,
+                file=str(table.path),
+                columns=tuple(of_this),
+            )
         )
     if not beyond:
         for doubt in doubted_units(given, readings, actuated, stated):
             if doubt.is_sure:
-                table.refuse_file(
-                    f"{doubt.in_words(table.path)}; write readings: {doubt.other} in the dataset "
-                    f"file, and convert them first if they are in {doubt.stated}."
+                remedy = (
+                    f"write readings: {doubt.other} in the dataset file, and convert them first "
+                    f"if they are in {doubt.stated}"
                 )
+                table.refuse_file(doubt.problem(table.path, remedy))
             else:
-                notes.append(
-                    f"{table.path}, {doubt.columns}: readings {doubt.uses}; check their unit."
-                )
+                columns = f"column{'s' * (len(doubt.columns) > 1)} {few(doubt.columns)}"
+                notes.append(f"{table.path}, {columns}: readings {doubt.uses}; check their unit.")
     return readings, tuple(notes)
 
 
 class DoubtedUnit(NamedTuple):
     """A unit in which readings hardly move, and a larger one in which they use the travel."""
 
-    columns: str  # in words
+    columns: tuple[str, ...]
     uses: str  # which part of the travel they use in either unit, in words
     stated: str  # the unit
     other: str  # the larger one
     is_sure: bool
 
-    def in_words(self, path: Path) -> str:
-        """Return the sentence that refuses it, up to the remedy."""
-        return (
-            f"{path}, {self.columns}: the unit of the readings could not be decided: found that "
-            f"they {self.uses}, needed the unit in which they are"
+    def problem(self, path: Path, remedy: str) -> Problem:
+        """Return what refuses it."""
+        return Problem(
+            "the unit of the readings could not be decided",
+            f"that they {self.uses}",
+            "the unit in which they are",
+            remedy,
+            str(path),
+            columns=self.columns,
         )
 
 
@@ -346,8 +355,7 @@ def doubted_units(
                 continue
             if not np.all(in_travel(meant, [legs[j] for j in some])):
                 continue
-            columns = few([str(legs[j].prismatic) for j in some])
-            columns = f"column{'s' * (len(some) > 1)} {columns}"
+            columns = tuple(str(legs[j].prismatic) for j in some)
             uses = (
                 f"use {100 * used:.2g} % of the travel in {name}, which is stated, and "
                 f"{100 * moved:.2g} % in {other}"
@@ -483,9 +491,8 @@ def in_travel(readings: Array, legs: Sequence[Leg]) -> BoolArray:
 def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
     """Return the first of some readings with their rows, and how many more there are."""
     index = np.flatnonzero(chosen).tolist()
-    shown = ", ".join(
-        f"{column[i]:g} {unit} in {place_in(table.where[i])}" for i in index[:_MAX_SHOWN]
-    )
+    places = table.places
+    shown = ", ".join(f"{column[i]:g} {unit} in {places[i]}" for i in index[:_MAX_SHOWN])
     return shown + (f" and {len(index) - _MAX_SHOWN} more" if len(index) > _MAX_SHOWN else "")
 
 
@@ -520,8 +527,8 @@ def read_measurements(
     view_names, images = table.text("view"), table.text("image")
     for row, name in enumerate(view_names):
         if name not in view_index:
-            needed = f"a view of the dataset file; {closest(name, view_index)}"
-            table.refuse(row, f"the unknown view {describe(name)}", needed, "view")
+            found, remedy = f"the unknown view {describe(name)}", closest(name, view_index)
+            table.refuse(row, found, "a view of the dataset file", "view", remedy=remedy)
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
     sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
@@ -560,14 +567,14 @@ def _refuse_images(table: Table, images: Sequence[str], folder: Path) -> None:
             targets[image] = problem or (folder / image).resolve()
         target = targets[image]
         if isinstance(target, str):
-            needed = "a relative path inside it; move the image there"
-            table.refuse(row, target, needed, "image", what=f"image {image}")
+            needed, remedy = "a relative path inside it", "move the image there"
+            table.refuse(row, target, needed, "image", remedy=remedy, what=f"image {image}")
             continue
         earlier = first.setdefault(target, row)
         if earlier != row:
-            found = f"it also in {place_in(table.where[earlier])}"
-            needed = "one row an image; remove one of them"
-            table.refuse(row, found, needed, "image", what=f"image {image}")
+            found = f"it also in {table.places[earlier]}"
+            needed, remedy = "one row an image", "remove one of them"
+            table.refuse(row, found, needed, "image", remedy=remedy, what=f"image {image}")
 
 
 def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
@@ -602,10 +609,9 @@ def _shared_readings(
             table.refuse(
                 first,
                 f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {units[j]}",
-                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {units[j]}); give "
-                "rows of "
-                "different poses different labels",
+                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {units[j]})",
                 joints[j],
+                remedy="give rows of different poses different labels",
                 what=f"pose {labels[first]}",
             )
         # fsum rounds once, so that the mean does not depend on the order of the rows.

@@ -25,6 +25,7 @@ from legcal.data.measurements import (
     refuse_unknown_rows,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
+from legcal.errors import Problem
 from legcal.files.folder import write_atomically
 from legcal.files.schema import closest, describe
 from legcal.files.table import Column, Table, format_table, read_table
@@ -280,10 +281,8 @@ def read_observations(
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]]:
             found = f"the unknown part {describe(part[i])}"
-            needed = (
-                f"a link with a cylinder of {leg_names[leg[i]]}; {closest(part[i], parts[leg[i]])}"
-            )
-            table.refuse(i, found, needed, "part")
+            needed = f"a link with a cylinder of {leg_names[leg[i]]}"
+            table.refuse(i, found, needed, "part", remedy=closest(part[i], parts[leg[i]]))
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     edited = np.array([source == "edited" for source in table.text("source")], dtype=np.bool_)
     table.need(NUMBERS, used)
@@ -322,17 +321,17 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
         a, b, c, u0, v0, u1, v1, s00, s01, s11 = numbers[i].tolist()
         norm = math.hypot(a, b, c)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
-            needed = "a unit vector; divide the three by their norm"
-            table.refuse(i, f"a vector of norm {norm:.6g}", needed, "a", "b", "c")
+            found, remedy = f"a vector of norm {norm:.6g}", "divide the three by their norm"
+            table.refuse(i, found, "a unit vector", "a", "b", "c", remedy=remedy)
         length = math.hypot(u1 - u0, v1 - v0)
         if length < MIN_PIECE:
             found = f"ends {length:.3g} px apart" if length else "both ends at the same pixel"
-            needed = "two ends of a piece of the edge; correct them"
-            table.refuse(i, found, needed, "u0", "v0", "u1", "v1")
+            needed = "two ends of a piece of the edge"
+            table.refuse(i, found, needed, "u0", "v0", "u1", "v1", remedy="correct them")
         if not (s00 > 0.0 and s11 > 0.0 and s00 * s11 > s01 * s01):
             found = f"a covariance that is not positive definite ({s00:g}, {s01:g}, {s11:g})"
-            needed = "variances of the offsets at both ends [px^2]; correct them"
-            table.refuse(i, found, needed, "s00", "s01", "s11")
+            needed = "variances of the offsets at both ends [px^2]"
+            table.refuse(i, found, needed, "s00", "s01", "s11", remedy="correct them")
             continue
         largest = 0.5 * (s00 + s11 + math.hypot(s00 - s11, 2.0 * s01))
         least = s00 * (s11 / largest) - s01 * (s01 / largest)  # the determinant is their product
@@ -340,11 +339,9 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
         if not (least >= fewest**2 and largest <= most**2):
             sigmas = math.sqrt(max(least, 0.0)), math.sqrt(largest)
             found = f"offsets known to between {sigmas[0]:.3g} and {sigmas[1]:.3g} px"
-            needed = (
-                f"standard deviations from {fewest:g} to {most:.3g} px; write px^2, or set the "
-                "verdict to rejected"
-            )
-            table.refuse(i, found, needed, "s00", "s01", "s11")
+            needed = f"standard deviations from {fewest:g} to {most:.3g} px"
+            remedy = "write px^2, or set the verdict to rejected"
+            table.refuse(i, found, needed, "s00", "s01", "s11", remedy=remedy)
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:
@@ -388,15 +385,20 @@ def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measur
     meant = _likely_form(outlines.choose(outlines.used), measurements) if most_are else ""
     if meant:
         table.refuse_file(
-            f"{table.path}: the outlines could not be used: found the ends of {off.sum()} of "
-            f"{outlines.used.sum()} up to {offset[off].max():.3g} px from their lines (a, b, c), "
-            f"needed at most {LINE_TOLERANCE_PX:g} px; they would suit them if {meant}."
+            Problem(
+                "the outlines could not be used",
+                f"the ends of {off.sum()} of {outlines.used.sum()} up to "
+                f"{offset[off].max():.3g} px from their lines (a, b, c)",
+                f"at most {LINE_TOLERANCE_PX:g} px",
+                f"they would suit them if {meant}",
+                str(table.path),
+            )
         )
         return
     for i in np.flatnonzero(off).tolist():
         found = f"ends {offset[i]:.3g} px from the line (a, b, c)"
-        needed = f"at most {LINE_TOLERANCE_PX:g} px; correct the line or its ends"
-        table.refuse(i, found, needed, *NUMBERS[:7])
+        needed, remedy = f"at most {LINE_TOLERANCE_PX:g} px", "correct the line or its ends"
+        table.refuse(i, found, needed, *NUMBERS[:7], remedy=remedy)
 
 
 def _likely_form(outlines: Outlines, measurements: Measurements) -> str:

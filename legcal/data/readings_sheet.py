@@ -147,19 +147,20 @@ class ReadingsSheet:
                 row,
                 f"{texts[j][row]} {units[j].name}, which is the reading "
                 f"{size * q[row, j]:.6g} {shown}",
-                f"one in the travel of leg '{leg.name}', {low:g} to {high:g} {shown}; correct the "
-                "reading or the limits of the model",
+                f"one in the travel of leg '{leg.name}', {low:g} to {high:g} {shown}",
                 next(text for text, name in self.taken.items() if name == self._joints[j]),
+                remedy="correct the reading or the limits of the model",
                 what="reading",
             )
         if inside.all() and not lengths:
             numbers = self._table.numbers(self._joints)
             for doubt in doubted_units(numbers, q, self.motors, units):
                 if doubt.is_sure:
-                    self._table.refuse_file(
-                        f"{doubt.in_words(self.path)}; state {doubt.other} in the headings, "
-                        f"or convert them to it if they are in {doubt.stated}."
+                    remedy = (
+                        f"state {doubt.other} in the headings, or convert them to it if they are "
+                        f"in {doubt.stated}"
                     )
+                    self._table.refuse_file(doubt.problem(self.path, remedy))
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
         last = [

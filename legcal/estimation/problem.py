@@ -426,13 +426,13 @@ class Problem(Generic[S]):
     )  # (w, m <= n_kept) fixed gauge
     name: str = "fit"  # and the remedy where it fails, for messages
     remedy: str = "check the starting values and the measurements"
-    _layout: _Layout | None = field(default=None, repr=False)  # built here
+    # Of the problem that this one was made from: what has not changed is not built again
+    earlier: _Layout | None = field(default=None, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_layout", self._make_layout(self._layout))
-
-    def _make_layout(self, old: _Layout | None) -> _Layout:
-        """Build the layout; parts of an earlier one are reused."""
+    @cached_property
+    def layout(self) -> _Layout:
+        """Columns of the unknowns, and which of them each factor touches."""
+        old = self.earlier
         touches = tuple((factor.touches, factor.element) for factor in self.factors)
         if old is not None and old.is_of(self.variables, self.eliminated, touches):
             return old
@@ -471,23 +471,19 @@ class Problem(Generic[S]):
         return _Layout(self.variables, self.eliminated, touches, columns, n_kept, tuple(sparsity))
 
     @property
-    def _layout_or_new(self) -> _Layout:
-        return self._make_layout(None) if self._layout is None else self._layout
-
-    @property
     def columns(self) -> Mapping[str, IntArray]:
         """Columns in x of each kept block, (n, d); ``n_kept`` for fixed coordinates."""
-        return self._layout_or_new.columns
+        return self.layout.columns
 
     @cached_property
     def sparsity(self) -> Mapping[str, Sparsity]:
         """Columns of the Jacobian of each factor, by its name."""
-        return dict(zip((f.name for f in self.factors), self._layout_or_new.sparsity, strict=True))
+        return dict(zip((f.name for f in self.factors), self.layout.sparsity, strict=True))
 
     @property
     def n_kept(self) -> int:
         """Number of kept unknowns."""
-        return self._layout_or_new.n_kept
+        return self.layout.n_kept
 
     @property
     def n_elements(self) -> int:
@@ -546,11 +542,14 @@ class Problem(Generic[S]):
         """Return a factor by its name."""
         return next(factor for factor in self.factors if factor.name == name)
 
+    def changed(self, **parts: Any) -> Self:
+        """Return the problem with other fields, and with what they leave of its layout."""
+        return replace(self, earlier=self.layout, **parts)
+
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
         """Replace blocks and factors by others of the same names."""
         b, f = {block.name: block for block in blocks}, {factor.name: factor for factor in factors}
-        return replace(
-            self,
+        return self.changed(
             variables=tuple(b.get(block.name, block) for block in self.variables),
             factors=tuple(f.get(factor.name, factor) for factor in self.factors),
         )

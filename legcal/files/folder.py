@@ -269,8 +269,7 @@ def _named(destination: Path, new: Path) -> Iterator[None]:
     try:
         yield
     except LegcalError as error:
-        said = [problem.replace(str(new), str(destination)) for problem in error.problems]
-        raise type(error)(said) from error
+        raise error.told(lambda problem: problem.moved(new, destination)) from error
 
 
 def _check_places(

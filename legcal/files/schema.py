@@ -7,6 +7,7 @@ import reprlib
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -25,7 +26,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
-from legcal.errors import DatasetError
+from legcal.errors import BadValue, DatasetError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
 _MOST_NAMES = 10  # that a hint lists
@@ -69,7 +70,7 @@ def is_name(name: str) -> bool:
 def _one_plain_line(name: str) -> str:
     """Refuse a name that tables and messages cannot show as it is."""
     if not is_name(name):
-        raise ValueError(f"found the name {describe(name)}, needed {NAME_NEEDED}; rename it.")
+        raise BadValue(f"the name {describe(name)}", NAME_NEEDED, "rename it")
     return name
 
 
@@ -81,22 +82,20 @@ def is_plain_name(name: object) -> bool:
 def plain_name(name: object) -> object:
     """Refuse a name that is not plain, see :func:`is_plain_name`."""
     if not is_plain_name(name):
-        raise ValueError(
-            f"found {describe(name)}, needed letters, digits, '-', '_' and '.', the first a "
-            "letter or digit, at most 100 of them; rename it."
+        needed = (
+            "letters, digits, '-', '_' and '.', the first a letter or digit, at most 100 of them"
         )
+        raise BadValue(describe(name), needed, "rename it")
     return name
 
 
 def _version(value: object) -> object:
     """Refuse true, which Python takes for one, and the formats of later versions."""
     if isinstance(value, bool):
-        raise ValueError(f"found {str(value).lower()}, needed 1; correct the value.")
+        raise BadValue(str(value).lower(), "1", "correct the value")
     if isinstance(value, int) and value > 1:
-        raise ValueError(
-            f"found {describe(value)}, needed version 1; use the legcal that wrote it, or write "
-            "the file as version 1."
-        )
+        remedy = "use the legcal that wrote it, or write the file as version 1"
+        raise BadValue(describe(value), "version 1", remedy)
     return value
 
 
@@ -191,24 +190,20 @@ def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
 
 def content_of(path: Path, what: str) -> bytes:
     """Return the bytes of a file, or refuse it in a sentence."""
-    remedy = f"check the path of the {what}"
+    unread, remedy = f"the {what} could not be read", f"check the path of the {what}"
     if not os.path.isfile(path):  # unlike that of a Path, False where a name is too long
         found = "a folder" if os.path.isdir(path) else "no such file"
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {found}, needed a file; {remedy}."
-        )
+        raise DatasetError(Problem(unread, found, "a file", remedy, str(path)))
     try:
         return read_bytes(path, MAX_TEXT)
     except TooLarge as error:
+        needed = f"at most {MAX_TEXT}"
         raise DatasetError(
-            f"{path}: the {what} could not be read: found {error.strerror}, needed at most "
-            f"{MAX_TEXT}; {remedy}."
+            Problem(unread, str(error.strerror), needed, remedy, str(path))
         ) from error
     except OSError as error:
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found '{error.strerror}', needed a readable "
-            f"file; {remedy} and its permissions."
-        ) from error
+        found, remedy = f"'{error.strerror}'", f"{remedy} and its permissions"
+        raise DatasetError(Problem(unread, found, "a readable file", remedy, str(path))) from error
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
@@ -218,26 +213,21 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
+    unread = Problem(f"the {what} could not be read", file=str(path))
     try:
         found = _loaded(content)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise DatasetError(
-            f"{path}{place}: the {what} could not be read: found {error.problem}, needed YAML; "
-            "mend that line."
-        ) from error
+        bad = replace(unread, found=str(error.problem), needed="YAML", remedy="mend that line")
+        if mark := error.problem_mark:
+            bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
+        raise DatasetError(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {_first_line(error)}, needed YAML text "
-            "in UTF-8; write the file again."
-        ) from error
-    if not isinstance(found, dict):
-        raise DatasetError(
-            f"{path}: the {what} could not be read: found {_kind_of(found)}, needed 'key: value' "
-            "lines; write the file again."
-        )
-    return typing.cast("dict[str, Any]", found)
+        found, needed = _first_line(error), "YAML text in UTF-8"
+    else:
+        if isinstance(found, dict):
+            return typing.cast("dict[str, Any]", found)
+        found, needed = _kind_of(found), "'key: value' lines"
+    raise DatasetError(replace(unread, found=found, needed=needed, remedy="write the file again"))
 
 
 def _loaded(content: bytes) -> Any:
@@ -269,8 +259,8 @@ def validate(
     try:
         return schema.model_validate(dict(found))
     except ValidationError as error:
-        sentences = [_sentence(schema, e, path, prefix) for e in error.errors(include_url=False)]
-        raise DatasetError(sentences) from error
+        found_wrong = error.errors(include_url=False)
+        raise DatasetError([_problem(schema, e, path, prefix) for e in found_wrong]) from error
 
 
 class _Short(reprlib.Repr):
@@ -310,30 +300,35 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return near[0] if near else ""
 
 
-def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> str:
-    """Return what pydantic found wrong as one sentence."""
+def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> Problem:
+    """Return what pydantic found wrong."""
     loc = [step for step in error["loc"] if not str(step).startswith("[")]  # key, or kind of value
-    place = ".".join([*[prefix] * bool(prefix), *map(str, loc)]) or "the file"
+    is_short = error["type"] == "missing" and isinstance(loc[-1], int)
+    steps = loc[:-1] if is_short else loc
+    place = ".".join([*[prefix] * bool(prefix), *map(str, steps)]) or "the file"
     context = error.get("ctx", {})
+
+    def refused(found: str, needed: str, remedy: str, done: str = "read") -> Problem:
+        what = f"{place} could not be {done}"
+        return Problem(what, found, needed, remedy, str(path), name=place)
+
     match error["type"]:
         case "extra_forbidden":
-            hint = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
-            return f"{path}: {place} could not be used: found an unknown key; {hint}"
-        case "missing" if isinstance(loc[-1], int):
-            return (
-                f"{path}: {place.rsplit('.', 1)[0]} could not be read: found {loc[-1]} numbers, "
-                "needed more; add what is missing."
-            )
+            remedy = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
+            return refused("an unknown key", "", remedy, "used")
+        case "missing" if is_short:
+            return refused(f"{loc[-1]} numbers", "more", "add what is missing")
         case "missing":
             known = _annotation_at(schema, loc)
             words = typing.get_args(known) if typing.get_origin(known) is Literal else ()
             value = " or ".join(map(str, words))
-            return (
-                f"{path}: {place} could not be read: found no such key, needed {value or 'it'}; "
-                f"add '{loc[-1]}: {value or '...'}' to the file."
-            )
+            remedy = f"add '{loc[-1]}: {value or '...'}' to the file"
+            return refused("no such key", value or "it", remedy)
         case "value_error":
-            return f"{path}: {place} could not be used: {context['error']}"
+            bad = context["error"]
+            if isinstance(bad, BadValue):
+                return refused(bad.found, bad.needed, bad.remedy, "used")
+            return Problem(f"{place} could not be used: {bad}", file=str(path), name=place)
         case "greater_than":
             needed = f"a number greater than {context['gt']:g}"
         case "less_than":
@@ -350,8 +345,7 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
             needed = f"at most {context['max_length']} entries"
         case other:
             needed = _NEEDED.get(other, error["msg"])
-    found = describe(error["input"])
-    return f"{path}: {place} could not be read: found {found}, needed {needed}; correct the value."
+    return refused(describe(error["input"]), needed, "correct the value")
 
 
 def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:

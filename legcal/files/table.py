@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, Problem
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
     NAME_NEEDED,
@@ -85,24 +85,36 @@ class Column:
 class Table:
     """The complete rows of a CSV file, their cells stripped, and what is wrong with them.
 
-    ``where[i]`` names row i in a message; ``name in table`` says whether a column is there.
+    ``places[i]`` is where row i is in the file, ``where[i]`` where it is with the file;
+    ``name in table`` says whether a column is there.
     """
 
     def __init__(self, path: Path, thing: str, columns: Sequence[Column]) -> None:
         self.path = path
         self.thing = thing  # what a row is, for messages
         self.columns = {column.name: column for column in columns}  # that the header has
-        self.where: list[str] = []
+        self._rows: list[int] = []
         self._lines: list[int] = []
         self._cells: list[list[str]] = []
         self._numbers: dict[str, Array] = {}  # of the columns of numbers
-        self._problems: list[tuple[int, str | tuple[str, ...]]] = []  # by line
+        self._problems: list[Problem] = []
 
     def __len__(self) -> int:
-        return len(self.where)
+        return len(self._rows)
 
     def __contains__(self, name: str) -> bool:
         return name in self.columns
+
+    @property
+    def places(self) -> list[str]:
+        """The place of each row in the file."""
+        numbers = zip(self._rows, self._lines, strict=True)
+        return [f"row {row} (line {line})" for row, line in numbers]
+
+    @property
+    def where(self) -> list[str]:
+        """The place of each row with its file."""
+        return [f"{self.path}, {place}" for place in self.places]
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column; empty ones of a column that is not there."""
@@ -125,22 +137,32 @@ class Table:
         columns = [self.number(name) for name in names]
         return np.column_stack(columns) if columns else np.zeros((len(self), 0))
 
-    def refuse(self, row: int, found: str, needed: str, *columns: str, what: str = "") -> None:
-        """Add a sentence about a row, about cells of some columns or about all of it."""
-        where = self.where[row]
-        if columns:
-            where += f", column{'s' * (len(columns) > 1)} {', '.join(columns)}"
-        self._problems.append((self._lines[row], (where, what or self.thing, found, needed)))
+    def refuse(
+        self, row: int, found: str, needed: str, *columns: str, remedy: str = "", what: str = ""
+    ) -> None:
+        """Refuse a row, cells of some columns or all of it."""
+        self._problems.append(
+            Problem(
+                f"the {what or self.thing} could not be used",
+                found,
+                needed,
+                remedy,
+                str(self.path),
+                self._rows[row],
+                self._lines[row],
+                columns,
+            )
+        )
 
     def refuse_cell(self, row: int, name: str, needed: str) -> None:
-        """Add a sentence about one cell that is not what its column needs."""
+        """Refuse one cell that is not what its column needs."""
         text, column = self._cells[row][self._place(name)], self.columns[name]
         found = describe(text) if text else "an empty cell"
-        self.refuse(row, found, f"{needed}; {column.remedy}", name, what=column.what)
+        self.refuse(row, found, needed, name, remedy=column.remedy, what=column.what)
 
-    def refuse_file(self, sentence: str) -> None:
-        """Add a sentence about more than one row."""
-        self._problems.append((0, sentence))
+    def refuse_file(self, problem: Problem) -> None:
+        """Refuse more than one row."""
+        self._problems.append(problem)
 
     def need(self, names: Iterable[str], rows: BoolArray) -> None:
         """Refuse cells that are empty, in some of the rows, though their column allows it."""
@@ -156,31 +178,31 @@ class Table:
         first: dict[Hashable, int] = {}
         for row, key in enumerate(keys):
             if key is not None and first.setdefault(key, row) != row:
-                earlier = place_in(self.where[first[key]])
-                self.refuse(row, f"{same} in {earlier}", "it once; remove one of them")
+                earlier = self.places[first[key]]
+                self.refuse(row, f"{same} in {earlier}", "it once", remedy="remove one of them")
 
     def keep(self, rows: BoolArray) -> None:
         """Leave out all but some rows, and what is wrong with the others."""
         gone = {line for line, kept in zip(self._lines, rows, strict=True) if not kept}
         kept_rows = np.flatnonzero(rows).tolist()
-        self.where = [self.where[row] for row in kept_rows]
+        self._rows = [self._rows[row] for row in kept_rows]
         self._lines = [self._lines[row] for row in kept_rows]
         self._cells = [self._cells[row] for row in kept_rows]
         self._numbers = {name: values[kept_rows] for name, values in self._numbers.items()}
-        self._problems = [problem for problem in self._problems if problem[0] not in gone]
+        self._problems = [problem for problem in self._problems if problem.line not in gone]
 
     def check(self) -> None:
         """Raise DatasetError with everything that is wrong, by line."""
         if self._problems:
-            self._problems.sort(key=lambda problem: problem[0])
-            raise DatasetError([_sentence(problem) for _, problem in self._problems])
+            self._problems.sort(key=lambda problem: problem.line or 0)
+            raise DatasetError(self._problems)
 
     def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
         """Take the lines below the header; those that are not complete are refused."""
         columns, n = list(self.columns.values()), len(header)
         order = [header.index(column.name) for column in columns]
         for row, (line, cells) in enumerate(lines, start=1):
-            self.where.append(f"{self.path}, row {row} (line {line})")
+            self._rows.append(row)
             self._lines.append(line)
             self._cells.append([cells[i] for i in order] if len(cells) == n else [])
             if len(cells) != n:
@@ -188,7 +210,8 @@ class Table:
                 if len(cells) > n:
                     remedy = "remove what is too much, and write decimals with points"
                 found = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
-                self.refuse(len(self) - 1, found, f"{n} as in the header; {remedy}", what="row")
+                needed = f"{n} as in the header"
+                self.refuse(len(self) - 1, found, needed, remedy=remedy, what="row")
         problems = self._problems
         self.keep(np.array([bool(cells) for cells in self._cells], dtype=np.bool_))
         self._problems = problems
@@ -308,14 +331,6 @@ def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str
     return text.getvalue()
 
 
-def _sentence(problem: str | tuple[str, ...]) -> str:
-    """Return what is wrong with a row, or with the file."""
-    if isinstance(problem, str):
-        return problem
-    where, what, found, needed = problem
-    return f"{where}: the {what} could not be used: found {found}, needed {needed}."
-
-
 def is_number(text: str) -> bool:
     """Say whether a cell holds a number."""
     return math.isfinite(_number_in(text))
@@ -325,11 +340,6 @@ def _number_in(text: str) -> float:
     """Return the number in a cell, NaN if it holds no finite one."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else math.nan
-
-
-def place_in(where: str) -> str:
-    """Return the place of a row without its file."""
-    return where.rsplit(", ", 1)[-1]
 
 
 @cache

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from legcal.errors import BadValue
 from legcal.geometry.axes import axis_angles, axis_angles_slope, turned_axis
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.motions import matrix_applied
@@ -72,29 +73,29 @@ class Pulses:
 
         Raises
         ------
-        ValueError
+        BadValue
             If a number is missing or is none of a servo, or the motor does not turn.
         """
         if centre is None and per_degree is None:
             return None
         if not turns:
-            raise ValueError(
-                "found pulses of a motor that slides, needed one that turns; leave out centre_us "
-                "and us_per_deg."
-            )
+            remedy = "leave out centre_us and us_per_deg"
+            raise BadValue("pulses of a motor that slides", "one that turns", remedy)
         if centre is None or per_degree is None:
             missing = "centre_us" if centre is None else "us_per_deg"
-            raise ValueError(
-                f"found no {missing}, needed the pulse at joint value 0 (centre_us: 1500) and the "
-                "us for one degree (us_per_deg: 11.1, negative for the other sense); add "
-                f"{missing}."
+            raise BadValue(
+                f"no {missing}",
+                "the pulse at joint value 0 (centre_us: 1500) and the us for one degree "
+                "(us_per_deg: 11.1, negative for the other sense)",
+                f"add {missing}",
             )
         least, most = US_PER_DEG
         if not (centre > 0.0 and least <= abs(per_degree) <= most):
-            raise ValueError(
-                f"found centre_us {centre:g} and us_per_deg {per_degree:g}, needed a positive "
-                f"pulse, usually 1500, and {least:g} to {most:g} us for one degree either way, "
-                "usually 5.6 to 11.1; correct them."
+            raise BadValue(
+                f"centre_us {centre:g} and us_per_deg {per_degree:g}",
+                f"a positive pulse, usually 1500, and {least:g} to {most:g} us for one degree "
+                "either way, usually 5.6 to 11.1",
+                "correct them",
             )
         return Pulses(centre, per_degree)
 

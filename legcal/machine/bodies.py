@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.errors import ModelError
+from legcal.errors import ModelError, Problem
 from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
@@ -59,8 +59,14 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
             if body_of[one] == body_of[two]:
                 raise ModelError(
-                    f"{urdf.path}: the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' "
-                    "could not be used: found both on one rigid body, needed two; remove it."
+                    Problem(
+                        f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
+                        "be used",
+                        "both on one rigid body",
+                        "two",
+                        "remove it",
+                        str(urdf.path),
+                    )
                 )
             _merge(body_of, T_body_link, one, two, np.eye(4))
     tree = [

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge
+from legcal.errors import DidNotConverge, Problem
 from legcal.geometry.motions import motions_of
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
@@ -145,9 +145,13 @@ def _require(machine: Machine, count: int, found: int) -> None:
     """Refuse a machine of which too few random poses are found."""
     if found < count:
         raise DidNotConverge(
-            f"{machine.yaml_path}: random poses could not be drawn: found {found} of "
-            f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
-            f"{machine.urdf.wording.home} and the limits of the sliders."
+            Problem(
+                "random poses could not be drawn",
+                f"{found} of {count} inside the travel in {MAX_DRAWS} tries for each",
+                "all",
+                f"check {machine.urdf.wording.home} and the limits of the sliders",
+                str(machine.yaml_path),
+            )
         )
 
 

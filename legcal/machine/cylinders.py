@@ -137,11 +137,23 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
     ]
 
 
+def is_measured(legs: Sequence[Leg], cylinder: VisualCylinder, bodies: Bodies) -> bool:
+    """Say whether outlines of a visual cylinder are a part of some leg, along it or its arm."""
+    within = coaxial_tolerance(legs)
+    return any(
+        bool(_along(leg, leg.chain, [cylinder], bodies, within)) for leg in legs if leg.chain
+    ) or any(
+        (arm.link, arm.radius, arm.length) == (cylinder.link, cylinder.radius, cylinder.length)
+        for leg in legs
+        if (arm := leg.arm) is not None
+    )
+
+
 def _along(
     leg: Leg, chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies, within: float
 ) -> tuple[Cylinder, ...]:
     """Return the cylinders along one leg, *within* so much [m] of its axis."""
-    halves = _halves(leg, chain)
+    halves = halves_of_leg(leg, chain)
     found = []
     for cylinder in shown:
         if bodies.body_of[cylinder.link] not in halves:
@@ -155,7 +167,7 @@ def _along(
     return tuple(found)
 
 
-def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
+def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
     """Return the bodies that hold the leg's axis: their side, A or B, and u from A to B."""
     halves: dict[str, Half] = {}
 

@@ -96,8 +96,8 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     )
     filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
-        needed = "one of them; empty the others"
-        table.refuse(row, "radius beside tube or rod", needed, *_RADII, what="radius")
+        found, remedy = "radius beside tube or rod", "empty the others"
+        table.refuse(row, found, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
     cells = _Cells(table)
     hangs_on = cells.texts("hangs_on")
@@ -184,8 +184,14 @@ def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict
             if entry[key] is None:
                 entry[key] = value
             elif value is not None and value != entry[key]:
-                needed = f"the same {key} in all rows of '{motor}'; correct it, or leave it empty"
-                table.refuse(row, f"another {key}", needed, "hangs_on", what="hangs_on")
+                table.refuse(
+                    row,
+                    f"another {key}",
+                    f"the same {key} in all rows of '{motor}'",
+                    "hangs_on",
+                    remedy="correct it, or leave it empty",
+                    what="hangs_on",
+                )
     table.check()
     if not motors:
         return {}

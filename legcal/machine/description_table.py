@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import DatasetError, ModelError
+from legcal.errors import BadValue, DatasetError, ModelError
 from legcal.files.motions import Quaternion, Vector
 from legcal.files.schema import (
     FileSchema,
@@ -88,7 +88,7 @@ def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
     def check(value: Any) -> Any:
         of_each = isinstance(value, list) and all(x is None or fits(x) for x in value)
         if not (of_each or fits(value)):
-            raise ValueError(f"found {describe(value)}, needed {needed}; correct it.")
+            raise BadValue(describe(value), needed, "correct it")
         return value
 
     return BeforeValidator(check)
@@ -97,7 +97,7 @@ def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
 def _lower_first(value: Any) -> Any:
     for pair in [value] if _is_pair(value) else value:
         if pair is not None and not pair[0] < pair[1]:
-            raise ValueError(f"found {pair}, needed the lower reading first; correct it.")
+            raise BadValue(str(pair), "the lower reading first", "correct it")
     return value
 
 
@@ -105,10 +105,8 @@ def _points(value: Any) -> Any:
     rows = value if isinstance(value, list) else [value]
     for i, row in enumerate(rows):
         if not (isinstance(row, list) and len(row) in (2, 3) and all(map(_is_number, row))):
-            raise ValueError(
-                f"found {describe(row)} in row {i + 1}, needed three numbers below "
-                f"{MAX_NUMBER:g}, x y z (two in the plane); correct it."
-            )
+            needed = f"three numbers below {MAX_NUMBER:g}, x y z (two in the plane)"
+            raise BadValue(f"{describe(row)} in row {i + 1}", needed, "correct it")
     return [[*row, 0.0][:3] for row in rows]
 
 
@@ -122,10 +120,8 @@ def _directions(value: Any) -> Any:
             and float(np.linalg.norm(row)) > 1e-6
         )
         if not fits:
-            raise ValueError(
-                f"found {describe(row)} in row {i + 1}, needed a direction of three numbers "
-                "that are not all zero, or null for the default; correct it."
-            )
+            needed = "a direction of three numbers that are not all zero, or null for the default"
+            raise BadValue(f"{describe(row)} in row {i + 1}", needed, "correct it")
     return rows
 
 
@@ -134,16 +130,14 @@ def _kinds(value: Any) -> Any:
     known = [kind.value for kind in LegKind]
     for kind in entries:
         if kind is not None and kind not in known:
-            raise ValueError(
-                f"found {describe(kind)}, needed {', '.join(known)}, one for all legs or a "
-                "list; correct it."
-            )
+            needed = f"{', '.join(known)}, one for all legs or a list"
+            raise BadValue(describe(kind), needed, "correct it")
     return value
 
 
 def _type_of_leg(value: object) -> object:
     if not isinstance(value, str) or leg_type(value) is None:
-        raise ValueError(f"found the leg type {describe(value)}, needed {NEEDED_TYPE}; correct it.")
+        raise BadValue(f"the leg type {describe(value)}", NEEDED_TYPE, "correct it")
     return value
 
 
@@ -151,7 +145,7 @@ def _type(value: object) -> object:
     number, _, leg = value.rpartition("-") if isinstance(value, str) else ("", "", "")
     counts = number.isascii() and number.isdigit() and len(number) < 10 and int(number) > 0
     if not leg or (not counts and value != leg):
-        raise ValueError(f"found {describe(value)}, needed a type such as 6-UPS; correct it.")
+        raise BadValue(describe(value), "a type such as 6-UPS", "correct it")
     _type_of_leg(leg)
     return value
 
@@ -212,7 +206,7 @@ class HomeEntry(FileSchema):
 
 def _ends(value: Any) -> Any:
     if not _is_pair(value):
-        raise ValueError(f"found {describe(value)}, needed [lowest, highest] reading; correct it.")
+        raise BadValue(describe(value), "[lowest, highest] reading", "correct it")
     return _lower_first(value)
 
 
@@ -376,7 +370,7 @@ def read_description(
             if unit is not None:
                 found.setdefault("unit", unit)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
     _refuse_twice(path, found, given)
     if "version" in found and "legcal_table" not in found:
         raise ModelError(
@@ -403,7 +397,7 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     try:
         file = validate(TableFile, table, source)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
     problems = _conflicting_entries(file, str(source))
     if problems:
         raise ModelError(problems)

@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError
+from legcal.errors import DidNotConverge, ModelError, Problem
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import (
@@ -117,9 +117,14 @@ def feasible_poses(
         (main, _), *_others = causes.most_common()
         what = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
         raise DidNotConverge(
-            f"{machine.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
-            f"the machine reaches in {obstacles.total() + len(found)} draws, others excluded "
-            f"{what}, needed all; {_REMEDIES[main]}."
+            Problem(
+                f"{n_poses} poses could not be drawn",
+                f"{len(found)} that the machine reaches in "
+                f"{obstacles.total() + len(found)} draws, others excluded {what}",
+                "all",
+                _REMEDIES[main],
+                str(machine.yaml_path),
+            )
         )
     return poses_at(machine, found)
 
@@ -158,9 +163,13 @@ class Feasibility:
         problem = self._beyond_limits(machine.home_configuration)
         if problem is not None:
             raise ModelError(
-                f"{machine.yaml_path}: no pose could be drawn: found {problem} at home, needed "
-                f"every joint inside its limits there; correct the limits, or "
-                f"{machine.urdf.wording.correct_home}."
+                Problem(
+                    "no pose could be drawn",
+                    f"{problem} at home",
+                    "every joint inside its limits there",
+                    f"correct the limits, or {machine.urdf.wording.correct_home}",
+                    str(machine.yaml_path),
+                )
             )
 
     def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from legcal.errors import DatasetError, ModelError
+from legcal.errors import DatasetError, ModelError, Problem
 from legcal.files.folder import RESULT
 from legcal.files.schema import content_of
 
@@ -40,38 +40,57 @@ def find_model(model: str | Path) -> Path:
             if RESULT.is_in(path):
                 return path / RESULT_YAML
             raise ModelError(
-                f"{path}: the mechanism could not be read: found {RESULT_YAML} and no whole "
-                f"{RESULT.marker} of a calibration, needed both; copy the result folder again, or "
-                f"give {path / RESULT_YAML} if it is the model that you mean."
+                Problem(
+                    "the mechanism could not be read",
+                    f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
+                    "both",
+                    f"copy the result folder again, or give {path / RESULT_YAML} if it is the "
+                    "model that you mean",
+                    str(path),
+                )
             )
         if (path / DATASET_YAML).is_file():
             raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
-            f"{path}: the mechanism could not be read: found a folder without {FOLDER_YAML}, "
-            "needed a folder with it, a result folder, or a YAML, URDF or MJCF file; give the file."
+            Problem(
+                "the mechanism could not be read",
+                f"a folder without {FOLDER_YAML}",
+                "a folder with it, a result folder, or a YAML, URDF or MJCF file",
+                "give the file",
+                str(path),
+            )
         )
     if os.path.exists(path) and not os.path.isdir(path):
         if path.suffix.lower() == ".csv":
             raise ModelError(
-                f"{path}: the mechanism could not be read: found a CSV file, needed a mechanism "
-                f"YAML, URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR"
+                Problem(
+                    "the mechanism could not be read: found a CSV file, needed a mechanism YAML, "
+                    f"URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR",
+                    file=str(path),
+                )
             )
         return path
     if is_shipped:
         return shipped_folder("models") / f"{model}.yaml"
     raise ModelError(
-        f"{path}: the mechanism could not be read: found no such file and no shipped model of that "
-        f"name, needed a mechanism YAML, its URDF, or one of {', '.join(names)}; check the path."
+        Problem(
+            "the mechanism could not be read",
+            "no such file and no shipped model of that name",
+            f"a mechanism YAML, its URDF, or one of {', '.join(names)}",
+            "check the path",
+            str(path),
+        )
     )
 
 
-def what_a_dataset_is_for(path: Path) -> str:
+def what_a_dataset_is_for(path: Path) -> Problem:
     """Return that a dataset is no model, and the commands that take one."""
     folder = path.parent if path.name == DATASET_YAML else path
-    return (
-        f"{path}: the mechanism could not be read: found a dataset, needed a model; give the "
-        f"model that it names, or judge the dataset with: legcal identify {folder}, and calibrate "
-        f"it with: legcal calibrate {folder} -o OUT"
+    return Problem(
+        "the mechanism could not be read: found a dataset, needed a model; give the model that it "
+        f"names, or judge the dataset with: legcal identify {folder}, and calibrate it with: "
+        f"legcal calibrate {folder} -o OUT",
+        file=str(path),
     )
 
 
@@ -85,8 +104,11 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
         if path.is_file():
             return path
     raise ModelError(
-        f"{yaml_path}: the URDF of the mechanism could not be found: looked for {near[0]} and "
-        f"{near[1]}, needed one of them; write its path in legcal.urdf."
+        Problem(
+            f"the URDF of the mechanism could not be found: looked for {near[0]} and "
+            f"{near[1]}, needed one of them; write its path in legcal.urdf.",
+            file=str(yaml_path),
+        )
     )
 
 
@@ -95,7 +117,7 @@ def read_file(path: Path, what: str) -> bytes:
     try:
         return content_of(path, what)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
 
 
 def yaml_of_urdf(path: Path) -> Path | None:

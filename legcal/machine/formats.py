@@ -10,13 +10,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from lxml import etree
 from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass
+from legcal.errors import ModelError, OutOfClass, Problem
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.machine.bodies import rigid_bodies
@@ -96,15 +97,25 @@ def _read_xml(path: Path) -> Source:
         return read_mjcf_source(path, content)
     if root.tag != "robot":
         raise ModelError(
-            f"{path}, line {root.sourceline}: the mechanism could not be read: found <{root.tag}> "
-            "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give one of them."
+            Problem(
+                f"the mechanism could not be read: found <{root.tag}> "
+                "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give "
+                "one of them.",
+                file=str(path),
+                line=cast("int", root.sourceline),
+            )
         )
     if any(element.tag in LOOP_TAGS for element in root):
         return read_loop_source(path, content)
     raise OutOfClass(
-        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
-        f"loops, and no YAML that closes them; write {path.with_suffix('.yaml')} with closed_loop, "
-        "type, name_mot and a legcal block."
+        Problem(
+            "this is not a parallel mechanism",
+            "a URDF, which is a tree without closed loops, and no YAML that closes them",
+            "",
+            f"write {path.with_suffix('.yaml')} with closed_loop, type, name_mot and "
+            "a legcal block",
+            str(path),
+        )
     )
 
 
@@ -140,9 +151,13 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
         on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
         if on_replaced:
             raise ModelError(
-                f"{path}: legcal.legs could not be used: found '{on_replaced[0]}', which stands "
-                "for another joint (joint_name), needed another joint of that leg; name its "
-                "prismatic joint."
+                Problem(
+                    "legcal.legs could not be used",
+                    f"'{on_replaced[0]}', which stands for another joint (joint_name)",
+                    "another joint of that leg",
+                    "name its prismatic joint",
+                    str(path),
+                )
             )
     wording = NO_BLOCK if file.legcal is None else BLOCK
     completed = replace(completed, wording=wording)
@@ -155,23 +170,43 @@ def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
         if name not in urdf.joints:
             problems.append(
-                f"{path}: joint_name.{i} could not be used: found the joint '{name}', which is not "
-                f"in {urdf.path.name}; {closest(name, sorted(urdf.joints))}"
+                Problem(
+                    f"joint_name.{i} could not be used",
+                    f"the joint '{name}', which is not in {urdf.path.name}",
+                    "",
+                    closest(name, sorted(urdf.joints)),
+                    str(path),
+                )
             )
         elif file.joint_name.index(name) != i:
             problems.append(
-                f"{path}: joint_name.{i} could not be used: found '{name}' twice, needed each "
-                "joint once; remove one."
+                Problem(
+                    f"joint_name.{i} could not be used",
+                    f"'{name}' twice",
+                    "each joint once",
+                    "remove one",
+                    str(path),
+                )
             )
         elif name in file.name_mot and kind != "FIXED":
             problems.append(
-                f"{path}: name_mot could not be used: found '{name}', which stands for "
-                f"{kind} (joint_name.{i}), needed a joint with one reading; remove it."
+                Problem(
+                    "name_mot could not be used",
+                    f"'{name}', which stands for {kind} (joint_name.{i})",
+                    "a joint with one reading",
+                    "remove it",
+                    str(path),
+                )
             )
         if rotation_letters(kind) is None:
             problems.append(
-                f"{path}: joint_type.{i} could not be used: found '{kind}', needed SPHERICAL, "
-                "FIXED, or UJOINT_ and two different letters of X, Y, Z; correct it."
+                Problem(
+                    f"joint_type.{i} could not be used",
+                    f"'{kind}'",
+                    "SPHERICAL, FIXED, or UJOINT_ and two different letters of X, Y, Z",
+                    "correct it",
+                    str(path),
+                )
             )
     if problems:
         raise ModelError(problems)
@@ -234,8 +269,13 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     elements = [element for element in robot if element.tag in LOOP_TAGS]
     if len(elements) > MAX_LOOPS:
         raise ModelError(
-            f"{path}: the loops could not be closed: found {len(elements)} of them, needed at most "
-            f"{MAX_LOOPS}; give one mechanism."
+            Problem(
+                "the loops could not be closed",
+                f"{len(elements)} of them",
+                f"at most {MAX_LOOPS}",
+                "give one mechanism",
+                str(path),
+            )
         )
     bare = checked_tree(robot, path, content, problems, travel_needed=False)
     loops = _loops(elements, bare, problems)
@@ -367,7 +407,7 @@ def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[
         given = common if part is None else part
         axis = x if given is None else _three(element, given, "xyz", problems)
         norm = float(np.linalg.norm(axis))
-        if norm < 1e-9 and not problems.sentences:
+        if norm < 1e-9 and not problems:
             problems.add(element, "has a zero axis, needed a direction", "correct its xyz")
         axes.append(axis / max(norm, 1e-9))
     return axes[0], axes[1]
@@ -403,9 +443,7 @@ def completed(source: Source) -> Source:
     try:
         chain = ClosedChain(source.urdf.text, closures)
     except ModelError as error:
-        raise ModelError(
-            [f"{source.urdf.path}: {problem}" for problem in error.problems]
-        ) from error
+        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, ModelError
+from legcal.errors import DidNotConverge, ModelError, Problem
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
@@ -74,8 +74,13 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     projected, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
-            f"{machine.yaml_path}: {machine.urdf.wording.home} could not be used: found {problem} "
-            f"there, needed a closed pose; {machine.urdf.wording.correct_home}."
+            Problem(
+                f"{machine.urdf.wording.home} could not be used",
+                f"{problem} there",
+                "a closed pose",
+                machine.urdf.wording.correct_home,
+                str(machine.yaml_path),
+            )
         )
     return projected
 
@@ -124,9 +129,12 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             break
     if best is None:
         raise DidNotConverge(
-            f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
-            f"loops did not close from {TRIALS} starts, needed a closed pose; "
-            f"{machine.urdf.wording.state_home}."
+            Problem(
+                f"no home pose was found: with all legs at mid-travel the "
+                f"loops did not close from {TRIALS} starts, needed a closed pose; "
+                f"{machine.urdf.wording.state_home}.",
+                file=str(machine.yaml_path),
+            )
         )
     home = best[1]
     if machine.actuators:
@@ -138,10 +146,14 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
             wording = machine.urdf.wording
             raise ModelError(
-                f"{machine.yaml_path}: the assembly at home is ambiguous: found that "
-                f"{wording.no_home}, and that at the same readings of the motors the rods reach "
-                f"the platform at {poses}, needed one; {wording.state_home}, as the machine is "
-                "assembled."
+                Problem(
+                    "the assembly at home is ambiguous",
+                    f"that {wording.no_home}, and that at the same readings of the motors the "
+                    f"rods reach the platform at {poses}",
+                    "one",
+                    f"{wording.state_home}, as the machine is assembled",
+                    str(machine.yaml_path),
+                )
             )
     return home
 
@@ -292,9 +304,14 @@ def check_home_travel(machine: Machine) -> None:
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
-        f"{machine.yaml_path}: legcal.home could not be used: found {name} at {reading} "
-        f"there{others}, needed a reading near its travel of {travel}; correct legcal.home or the "
-        f"limits of the {'slider' if leg.actuator is None else 'motor'}."
+        Problem(
+            "legcal.home could not be used",
+            f"{name} at {reading} there{others}",
+            f"a reading near its travel of {travel}",
+            "correct legcal.home or the limits of the "
+            f"{'slider' if leg.actuator is None else 'motor'}",
+            str(machine.yaml_path),
+        )
     )
 
 

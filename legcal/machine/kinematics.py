@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import close_at, closure_equations
@@ -299,8 +299,13 @@ def _disagreement(
     if not found:
         return None
     return DidNotConverge(
-        f"{machine.yaml_path}: the pose at the readings{which} could not be computed: found "
-        f"{found[0].in_words(machine)}; check this reading, its encoder and the offset of the leg."
+        Problem(
+            f"the pose at the readings{which} could not be computed",
+            found[0].in_words(machine),
+            "",
+            "check this reading, its encoder and the offset of the leg",
+            str(machine.yaml_path),
+        )
     )
 
 
@@ -330,10 +335,14 @@ def _check_determined(machine: Machine) -> None:
     """Refuse a mechanism whose motors do not determine the pose."""
     if not machine.is_determined:
         raise NotIdentifiable(
-            f"{machine.yaml_path}: the pose cannot be computed from readings: found mobility "
-            f"{machine.mobility} and {len(machine.motors)} motors that hold {machine.motor_rank} "
-            "of these freedoms, needed motors that hold all; correct name_mot, or do not ask for "
-            "poses of this mechanism."
+            Problem(
+                "the pose cannot be computed from readings",
+                f"mobility {machine.mobility} and {len(machine.motors)} motors that hold "
+                f"{machine.motor_rank} of these freedoms",
+                "motors that hold all",
+                "correct name_mot, or do not ask for poses of this mechanism",
+                str(machine.yaml_path),
+            )
         )
 
 
@@ -432,20 +441,28 @@ def follow(
             if failure is not None:
                 raise failure
         raise DidNotConverge(
-            f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
-            f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
-            "legs meet no more or the mechanism is singular, needed a regular path; check the "
-            f"readings and {machine.urdf.wording.home}."
+            Problem(
+                f"the pose at the readings{which} could not be reached: at "
+                f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
+                "legs meet no more or the mechanism is singular, needed a regular path; check the "
+                f"readings and {machine.urdf.wording.home}.",
+                file=str(machine.yaml_path),
+            )
         )
     sliders = dict(zip(q_columns, last.tolist(), strict=True)) if not is_redundant else {}
     closed = _closed_at(machine, T, configuration, sliders, free)
     if closed is None:
         raise DidNotConverge(
-            f"{machine.yaml_path}: the pose at the readings{which} could not be reached: found a "
-            "platform pose at which the legs have the right lengths, but joints that were not "
-            "closed there, needed a closed chain; give the joints of the legs axes at right angles "
-            "(of three revolutes, and of a universal joint and its leg), which turn anywhere, or "
-            "cut spherical joints with 3d."
+            Problem(
+                f"the pose at the readings{which} could not be reached",
+                "a platform pose at which the legs have the right lengths, but joints "
+                "that were not closed there",
+                "a closed chain",
+                "give the joints of the legs axes at right angles (of three revolutes, "
+                "and of a universal joint and its leg), which turn anywhere, or cut "
+                "spherical joints with 3d",
+                str(machine.yaml_path),
+            )
         )
     return closed
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -112,6 +112,19 @@ class JointType(StrEnum):
         return self is JointType.UNIVERSAL
 
 
+class Cover(NamedTuple):
+    """A stretch of a leg inside a solid that moves with one half of it, as of a `Cylinder`."""
+
+    side: Literal["base", "platform"]
+    start: float  # [m]
+    end: float
+
+    def span(self, length: float) -> tuple[float, float]:
+        """Return both ends as distances from A along a leg of that length [m]."""
+        shift = 0.0 if self.side == "base" else length
+        return self.start + shift, self.end + shift
+
+
 @dataclass(frozen=True)
 class Cylinder:
     """A visible cylinder coaxial with its leg: a tube or a rod."""
@@ -121,6 +134,7 @@ class Cylinder:
     side: Literal["base", "platform"]  # the half of the leg that it moves with
     start: float  # ends along the leg [m], start < end: from A for base, from B for platform,
     end: float  # positive from A to B
+    covers: tuple[Cover, ...] = ()  # where other solids of the leg enclose it
 
     def span(self, length: float) -> tuple[float, float]:
         """Return both ends as distances from A along a leg of that length [m]."""

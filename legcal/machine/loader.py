@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError, OutOfClass
+from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problem
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.schema import closest
+from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.bodies import Bodies, rigid_bodies
@@ -59,6 +59,7 @@ from legcal.machine.mobility import (
     motor_rank,
 )
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
+from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_own_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
@@ -220,6 +221,9 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     names = list(block.legs)
     base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
+    legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
+    solids = visual_solids(urdf)
+    occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
     machine = Machine(
         name=urdf.name,
         yaml_path=yaml_path,
@@ -227,7 +231,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0]),
+        legs=with_covers(legs, occluders),
         frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
@@ -236,6 +240,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         urdf=urdf,
         base_normal=base_normal,
         platform_normal=platform_normal,
+        occluders=occluders,
     )
     _check_frames(machine)
     return machine
@@ -255,7 +260,7 @@ def _closed_chain(
         normals = normals_of_closures(in_plane, closures, block, urdf)
         return ClosedChain(urdf.text, closures, normals, gains)
     except ModelError as error:
-        raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
+        raise error.told(lambda problem: problem.in_file(urdf.path)) from error
 
 
 def _actuators(
@@ -277,18 +282,23 @@ def _actuators(
     }
     problems = []
     for name, entry in (block.motors or {}).items():
-        actuator, where = stated.get(name), f"{path}: legcal.motors.{name} could not be used"
+        actuator, place = stated.get(name), f"legcal.motors.{name}"
+        wrong = Problem(f"{place} could not be used", file=str(path), name=place)
         if actuator is None:
             known = sorted(str(motor) for motor in stated)
             problems.append(
-                f"{where}: found no motor of that name that carries rods, needed one of "
-                f"{', '.join(known) or 'them in the model'}; {closest(name, known or ['none'])}"
+                replace(
+                    wrong,
+                    found="no motor of that name that carries rods",
+                    needed=f"one of {', '.join(known) or 'them in the model'}",
+                    remedy=closest(name, known or ["none"]),
+                )
             )
             continue
         try:
             pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
-        except ValueError as error:
-            problems.append(f"{where}: {error}")
+        except BadValue as bad:
+            problems.append(replace(wrong, found=bad.found, needed=bad.needed, remedy=bad.remedy))
         else:
             stated[name] = replace(actuator, gain=entry.gain, pulses=pulses)
     if problems:
@@ -318,8 +328,13 @@ def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
     for name in given:
         if name not in known:
             raise ModelError(
-                f"{machine.yaml_path}: legcal.home_readings.{name} could not be used: found no "
-                f"actuator of that name, needed one of {', '.join(known)}; {closest(name, known)}"
+                Problem(
+                    f"legcal.home_readings.{name} could not be used",
+                    "no actuator of that name",
+                    f"one of {', '.join(known)}",
+                    closest(name, known),
+                    str(machine.yaml_path),
+                )
             )
 
 
@@ -358,10 +373,14 @@ def _readings_at_home(
             if not leg.in_travel(np.array([wanted]))[0]:
                 degrees = ", in radians" if leg.reads_angle else ""
                 raise ModelError(
-                    f"{path}: legcal.home_readings.{leg.actuator.joint} could not be used: found "
-                    f"{wanted:g} {leg.reading_unit}, outside the travel of {leg.travel[0]:.4g} to "
-                    f"{leg.travel[1]:.4g} {leg.reading_unit}, needed the one of {said} that is "
-                    f"that of home; correct it{degrees}."
+                    Problem(
+                        f"legcal.home_readings.{leg.actuator.joint} could not be used",
+                        f"{wanted:g} {leg.reading_unit}, outside the travel of "
+                        f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
+                        f"the one of {said} that is that of home",
+                        f"correct it{degrees}",
+                        str(path),
+                    )
                 )
             continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
@@ -371,10 +390,14 @@ def _readings_at_home(
             continue
         if all(inside) and abs(both[0] - both[1]) > scale:
             raise ModelError(
-                f"{path}: the assembly of leg '{leg.name}' at home is ambiguous: found that its "
-                f"rod reaches the platform at {said} of '{leg.actuator.joint}', both inside its "
-                f"travel, needed one; {machine.urdf.wording.state_readings}, or narrow the limits "
-                "of the joint."
+                Problem(
+                    f"the assembly of leg '{leg.name}' at home is ambiguous",
+                    f"that its rod reaches the platform at {said} of '{leg.actuator.joint}', "
+                    "both inside its travel",
+                    "one",
+                    f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
+                    str(path),
+                )
             )
         middle = 0.5 * sum(leg.travel)
         q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
@@ -397,21 +420,35 @@ def _legs_in_order(
         found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
         if not found:
             problems.append(
-                f"{path}: legcal.legs.{name} could not be used: found the joint '{joint}', which "
-                "is on no leg between base and platform, needed one that moves with the leg; name "
-                "its prismatic joint."
+                Problem(
+                    f"legcal.legs.{name} could not be used",
+                    f"the joint '{joint}', which is on no leg between base and platform",
+                    "one that moves with the leg",
+                    "name its prismatic joint",
+                    str(path),
+                )
             )
         elif id(found[0]) in owner:
             problems.append(
-                f"{path}: legcal.legs.{name} could not be used: found '{joint}' on the leg that "
-                f"is already named '{owner[id(found[0])]}', needed a leg of its own; correct it."
+                Problem(
+                    f"legcal.legs.{name} could not be used",
+                    f"'{joint}' on the leg that is already named '{owner[id(found[0])]}'",
+                    "a leg of its own",
+                    "correct it",
+                    str(path),
+                )
             )
         else:
             owner[id(found[0])] = name
             ordered.append(found[0])
     problems += [
-        f"{path}: legcal.legs is incomplete: found no name for the leg with joint "
-        f"'{own_joint(chain)}', needed every leg; add a line for it."
+        Problem(
+            "legcal.legs is incomplete",
+            f"no name for the leg with joint '{own_joint(chain)}'",
+            "every leg",
+            "add a line for it",
+            str(path),
+        )
         for chain in chains
         if id(chain) not in owner and not problems
     ]
@@ -455,24 +492,80 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         if block.platform_joint is not None:
             named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
     problems = [
-        f"{path}: {place} could not be used: found the {what} '{name}', which is not in "
-        f"{urdf.path.name}; {closest(name, sorted(known))}"
+        Problem(
+            f"{place} could not be used",
+            f"the {what} '{name}', which is not in {urdf.path.name}",
+            "",
+            closest(name, sorted(known)),
+            str(path),
+        )
         for place, name, what, known in named
         if name not in known
     ]
     problems += [
-        f"{path}: closed_loop.{i} could not be used: found '{one}' twice, needed two frames; "
-        "correct one of them."
+        Problem(
+            f"closed_loop.{i} could not be used",
+            f"'{one}' twice",
+            "two frames",
+            "correct one of them",
+            str(path),
+        )
         for i, (one, two) in enumerate(file.closed_loop)
         if one == two
     ]
+    problems += _frames_of_neighbours(file, urdf, path)
     if block is not None and block.base == block.platform:
         problems.append(
-            f"{path}: legcal.platform could not be used: found the link '{block.base}' as base and "
-            "as platform, needed two links; correct one of them."
+            Problem(
+                "legcal.platform could not be used",
+                f"the link '{block.base}' as base and as platform",
+                "two links",
+                "correct one of them",
+                str(path),
+            )
         )
     if problems:
         raise ModelError(problems)
+
+
+def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[Problem]:
+    """Say where a closure names the frame of another one, and its own is left over.
+
+    Legs that meet in a point may share a frame: then no similar name beside it is unused.
+    """
+    places: dict[str, list[int]] = {}
+    for i, pair in enumerate(file.closed_loop):
+        for frame in set(pair):
+            places.setdefault(frame, []).append(i)
+    above = {joint.child: joint for joint in urdf.joints.values()}
+    parents = {joint.parent for joint in urdf.joints.values()}
+    spare = {
+        link: joint.parent
+        for link, joint in above.items()
+        if not joint.moves and not {link, joint.name} & places.keys() and link not in parents
+    }
+    problems = []
+    for frame, closures in places.items():
+        if len(closures) == 1 or frame not in above:
+            continue
+        beside = [link for link, parent in spare.items() if parent == above[frame].parent]
+        spared = nearest(frame, beside)
+        if spared:
+            *others, last = closures
+            named = " and ".join(f"closed_loop.{i}" for i in others)
+            problems.append(
+                Problem(
+                    f"closed_loop.{last} could not be used",
+                    f"the frame '{frame}', which {named} "
+                    f"{'names' if len(others) == 1 else 'name'} too, and '{spared}' in no "
+                    "closure",
+                    "",
+                    f"write '{spared}' in one of them, or remove it from {urdf.path.name} "
+                    "where these legs meet in one point",
+                    str(path),
+                )
+            )
+    return problems
 
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
@@ -488,27 +581,44 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
     if len(chains) < n_d:
         where = "in space" if spatial else "in a plane"
         raise OutOfClass(
-            f"{path}: this mechanism is outside the method: found {len(chains)} "
-            f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
-            "define the frames of base and platform; this machine cannot be calibrated this way."
+            Problem(
+                "this mechanism is outside the method",
+                f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {where}",
+                f"at least {n_d}, whose joints define the frames of base and platform",
+                "this machine cannot be calibrated this way",
+                str(path),
+            )
         )
     if len(chains) > MAX_LEGS:
         raise OutOfClass(
-            f"{path}: this mechanism is outside the method: found {len(chains)} legs, needed at "
-            f"most {MAX_LEGS}, since the work grows with their cube; leave out passive legs."
+            Problem(
+                "this mechanism is outside the method",
+                f"{len(chains)} legs",
+                f"at most {MAX_LEGS}, since the work grows with their cube",
+                "leave out passive legs",
+                str(path),
+            )
         )
     fixed = [chain for chain in chains if chain.platform.type is JointType.FIXED]
     if fixed and not spatial:
         raise OutOfClass(
-            f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
-            "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
-            "machine cannot be calibrated this way."
+            Problem(
+                f"the leg of joint '{any_joint(fixed[0])}' is outside the method",
+                "it fixed to the platform of a planar mechanism",
+                "a revolute joint there",
+                "this machine cannot be calibrated this way",
+                str(path),
+            )
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
         raise OutOfClass(
-            f"{path}: this mechanism is outside the method: found a planar machine whose "
-            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
-            "the legs; this machine cannot be calibrated this way."
+            Problem(
+                "this mechanism is outside the method",
+                "a planar machine whose joints at A move on carriages or arms",
+                "a machine in space, or sliders along the legs",
+                "this machine cannot be calibrated this way",
+                str(path),
+            )
         )
 
 
@@ -526,28 +636,46 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
         kind = urdf.joints[motor].type
         if kind == "continuous" and motor in moving:
             problems.append(
-                f"{path}: the motor '{motor}' could not be used: found a continuous joint, needed "
-                "one with the limits of its readings; write its type as revolute, with <limit>."
+                Problem(
+                    f"the motor '{motor}' could not be used",
+                    "a continuous joint",
+                    "one with the limits of its readings",
+                    "write its type as revolute, with <limit>",
+                    str(path),
+                )
             )
         elif kind == "revolute" and motor in moving and _beyond_turns(urdf.joints[motor]):
             lower, upper = urdf.joints[motor].limits or (0.0, 0.0)
             problems.append(
-                f"{path}: the motor '{motor}' could not be used: found the limits {lower:g} to "
-                f"{upper:g} rad, needed at most two turns either way; these look like degrees: "
-                "write its limits, and its readings, in radian."
+                Problem(
+                    f"the motor '{motor}' could not be used",
+                    f"the limits {lower:g} to {upper:g} rad",
+                    "at most two turns either way",
+                    "these look like degrees: write its limits, and its readings, in radian",
+                    str(path),
+                )
             )
         elif kind != "prismatic" and motor not in moving:
             problems.append(
-                f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
-                "name_mot that does not stand between the base and an arm with rods, needed "
-                "sliders of legs, or joints on the base that carry the joints of rods; remove it "
-                "from name_mot if it has no motor, otherwise this machine cannot be calibrated "
-                "this way."
+                Problem(
+                    f"the motor '{motor}' is outside the method",
+                    f"a {kind} joint in name_mot that does not stand between the base and an "
+                    "arm with rods",
+                    "sliders of legs, or joints on the base that carry the joints of rods",
+                    "remove it from name_mot if it has no motor, otherwise this machine "
+                    "cannot be calibrated this way",
+                    str(path),
+                )
             )
         elif motor not in moving:
             problems.append(
-                f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed "
-                "the slider of a leg; remove it from name_mot."
+                Problem(
+                    f"the motor '{motor}' is outside the method",
+                    "it on no leg",
+                    "the slider of a leg",
+                    "remove it from name_mot",
+                    str(path),
+                )
             )
     if problems:
         raise OutOfClass(problems)
@@ -571,8 +699,13 @@ def _check_frames(machine: Machine) -> None:
     if len(chosen) != n_d:
         where = "in space" if machine.spatial else "in a plane"
         raise ModelError(
-            f"{path}: legcal.base_frame could not be used: found {len(chosen)} legs, needed {n_d} "
-            f"for a mechanism {where}; name {n_d} legs."
+            Problem(
+                "legcal.base_frame could not be used",
+                f"{len(chosen)} legs",
+                f"{n_d} for a mechanism {where}",
+                f"name {n_d} legs",
+                str(path),
+            )
         )
     problems = []
     for side in ("base", "platform"):
@@ -581,9 +714,13 @@ def _check_frames(machine: Machine) -> None:
         except ValueError:
             needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
             problems.append(
-                f"{path}: legcal.base_frame could not be used: found {side} joints of "
-                f"{', '.join(chosen)} in one point or on one line, needed {needed}; choose other "
-                "legs."
+                Problem(
+                    "legcal.base_frame could not be used",
+                    f"{side} joints of {', '.join(chosen)} in one point or on one line",
+                    needed,
+                    "choose other legs",
+                    str(path),
+                )
             )
     if problems:
         raise ModelError(problems)
@@ -601,9 +738,13 @@ def _check_origins(urdf: Urdf) -> None:
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
         if away > MAX_ORIGIN:
             raise ModelError(
-                f"{urdf.path}: the lengths could not be used: found the origin of joint "
-                f"'{joint.name}' {away:.4g} m away from its parent link, needed at most "
-                f"{MAX_ORIGIN:g} m; write all lengths in metres (are they millimetres?)."
+                Problem(
+                    "the lengths could not be used",
+                    f"the origin of joint '{joint.name}' {away:.4g} m away from its parent link",
+                    f"at most {MAX_ORIGIN:g} m",
+                    "write all lengths in metres (are they millimetres?)",
+                    str(urdf.path),
+                )
             )
 
 
@@ -622,9 +763,13 @@ def _check_spread(machine: Machine) -> None:
     for name, size in sizes.items():
         if size > MAX_LENGTH:
             raise ModelError(
-                f"{machine.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
-                f"apart, needed at most {MAX_LENGTH:g} m; write all lengths in metres (are they "
-                "millimetres?)."
+                Problem(
+                    "the lengths could not be used",
+                    f"{name} {size:.4g} m apart",
+                    f"at most {MAX_LENGTH:g} m",
+                    "write all lengths in metres (are they millimetres?)",
+                    str(machine.urdf_path),
+                )
             )
 
 
@@ -642,17 +787,25 @@ def _check_unit(machine: Machine) -> None:
     odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
     if len(odd):
         raise ModelError(
-            f"{machine.urdf_path}: the lengths could not be used: found leg "
-            f"'{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
-            "20 m; write all lengths in metres (are they millimetres?)."
+            Problem(
+                "the lengths could not be used",
+                f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
+                "1 mm to 20 m",
+                "write all lengths in metres (are they millimetres?)",
+                str(machine.urdf_path),
+            )
         )
     for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
         if leg.is_motor and not leg.reads_angle and reach > MAX_LENGTH:
             raise ModelError(
-                f"{machine.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
-                "limits of its slider in metres (are they millimetres?)."
+                Problem(
+                    f"the travel of leg '{leg.name}' could not be used",
+                    f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
+                    "at most 20 m",
+                    "write the limits of its slider in metres (are they millimetres?)",
+                    str(machine.urdf_path),
+                )
             )
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
         seen = [(c.link, c.radius, f"along leg '{leg.name}'") for c in leg.cylinders]
@@ -661,10 +814,14 @@ def _check_unit(machine: Machine) -> None:
         for link, radius, where in seen:
             if not MIN_RADIUS < radius / length < MAX_RADIUS:
                 raise ModelError(
-                    f"{machine.urdf_path}: the <visual> cylinder of link '{link}' could not be "
-                    f"used: found a radius of {1e3 * radius:.4g} mm {where}, which is "
-                    f"{1e3 * length:.4g} mm long at home, needed {MIN_RADIUS:g} to "
-                    f"{MAX_RADIUS:g} of the length; correct radius and its unit."
+                    Problem(
+                        f"the <visual> cylinder of link '{link}' could not be used",
+                        f"a radius of {1e3 * radius:.4g} mm {where}, which is {1e3 * length:.4g} "
+                        "mm long at home",
+                        f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length",
+                        "correct radius and its unit",
+                        str(machine.urdf_path),
+                    )
                 )
 
 
@@ -681,10 +838,15 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
     if nearly > (n_dependent_at_home(machine) if closes else 0):
         n = n_pose_constraints(machine.legs)
         raise OutOfClass(
-            f"{machine.yaml_path}: the mechanism '{machine.name}' could not be used: found that "
-            f"{nearly} of the {n} constraints of its joints follow from the others to 1 mrad but "
-            "not exactly, needed an overconstrained machine to have its mobility exactly; write "
-            "axes that are parallel, perpendicular or meet with all digits (12 decimals or more)."
+            Problem(
+                f"the mechanism '{machine.name}' could not be used",
+                f"that {nearly} of the {n} constraints of its joints follow from the "
+                "others to 1 mrad but not exactly",
+                "an overconstrained machine to have its mobility exactly",
+                "write axes that are parallel, perpendicular or meet with all digits (12 "
+                "decimals or more)",
+                str(machine.yaml_path),
+            )
         )
 
 
@@ -709,18 +871,27 @@ def _check_ties(machine: Machine) -> None:
                 "calibrated this way"
             )
         raise OutOfClass(
-            f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
-            f"overconstrained ({n_dependent_at_home(machine)} of the {n} constraints of its joints "
-            "follow from the others) with joints at A that move, needed none that follow; "
-            f"{remedy}."
+            Problem(
+                f"the mechanism '{machine.name}' is outside the method",
+                f"it overconstrained ({n_dependent_at_home(machine)} of the {n} "
+                "constraints of its joints follow from the others) with joints at A that "
+                "move",
+                "none that follow",
+                remedy,
+                str(machine.yaml_path),
+            )
         )
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(
-            f"{machine.yaml_path}: the mechanism '{machine.name}' is outside the method: found it "
-            f"overconstrained ({ties.n_dependent} of the {n} constraints of its joints follow from "
-            "the others) and no errors of its parameters near the model with which it keeps its "
-            f"mobility {machine.mobility}, needed parameters that can be tied so; give a leg "
-            "another joint, or leave out a leg without a motor."
+            Problem(
+                f"the mechanism '{machine.name}' is outside the method",
+                f"it overconstrained ({ties.n_dependent} of the {n} constraints of its "
+                "joints follow from the others) and no errors of its parameters near the "
+                f"model with which it keeps its mobility {machine.mobility}",
+                "parameters that can be tied so",
+                "give a leg another joint, or leave out a leg without a motor",
+                str(machine.yaml_path),
+            )
         )
 
 
@@ -741,11 +912,14 @@ def _check_across(machine: Machine) -> None:
         row += closure.rows
         if gap > within or tilt > PERPENDICULAR:
             problems.append(
-                f"{machine.yaml_path}: the loops could not be closed: found "
-                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
-                f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
-                f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg; correct "
-                "the origins and axes along this leg."
+                Problem(
+                    "the loops could not be closed",
+                    f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                    f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move",
+                    f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg",
+                    "correct the origins and axes along this leg",
+                    str(machine.yaml_path),
+                )
             )
     if problems:
         raise OutOfClass(problems)
@@ -774,7 +948,7 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
         if leg.actuator is None:
             values[:, 0] -= leg.sign * q[:, j]
         of_legs.append((leg.name, equations.kinds, np.abs(values)))
-    problems: dict[str, str] = {}
+    problems: dict[str, Problem] = {}
     within = joint_tolerance((machine.A_base, machine.B_platform))
     for k in range(len(configurations)):
         for name, kinds, values in of_legs:
@@ -783,8 +957,13 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
                 if problem is not None:
                     problems.setdefault(
                         name,
-                        f"{machine.yaml_path}: leg '{name}' is outside the method: found "
-                        f"{problem} at a closed pose; check the origins and axes along the leg.",
+                        Problem(
+                            f"leg '{name}' is outside the method",
+                            f"{problem} at a closed pose",
+                            "",
+                            "check the origins and axes along the leg",
+                            str(machine.yaml_path),
+                        ),
                     )
     if problems:
         raise OutOfClass(list(problems.values()))

@@ -17,7 +17,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass
+from legcal.errors import ModelError, OutOfClass, Problem
 from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
@@ -67,8 +67,13 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
     if n_parts > MAX_PARTS:
         raise ModelError(
-            f"{path}: the MJCF file could not be used: found {n_parts} bodies, joints, frames and "
-            f"default classes, needed at most {MAX_PARTS}; give the mechanism alone."
+            Problem(
+                "the MJCF file could not be used",
+                f"{n_parts} bodies, joints, frames and default classes",
+                f"at most {MAX_PARTS}",
+                "give the mechanism alone",
+                str(path),
+            )
         )
     reader = MjcfReader(root, Problems(path))
     reader.read_bodies()
@@ -77,14 +82,24 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     reader.problems.raise_if_any()
     if len(loops) > MAX_LOOPS:
         raise ModelError(
-            f"{path}: the loops could not be closed: found {len(loops)} of them, needed at most "
-            f"{MAX_LOOPS}; give one mechanism."
+            Problem(
+                "the loops could not be closed",
+                f"{len(loops)} of them",
+                f"at most {MAX_LOOPS}",
+                "give one mechanism",
+                str(path),
+            )
         )
     if not loops:
         raise OutOfClass(
-            f"{path}: this is not a parallel mechanism: found an MJCF file without <connect> or "
-            "<weld> in <equality>, which is a tree without closed loops, needed the closures of "
-            "its loops; add them."
+            Problem(
+                "this is not a parallel mechanism",
+                "an MJCF file without <connect> or <weld> in <equality>, which is a tree "
+                "without closed loops",
+                "the closures of its loops",
+                "add them",
+                str(path),
+            )
         )
     pairs = [close_loop(loop, reader.tree, reader.poses) for loop in loops]
     name = root.get("model", "").strip() or path.stem
@@ -658,8 +673,13 @@ def _without_loose_bodies(
     other = [j.name for j in joints if j.moves and j.type != "floating"]
     if other:
         raise OutOfClass(
-            f"{urdf.path}: the mechanism could not be read: found joints of something else beside "
-            f"it ('{other[0]}'), needed one mechanism in the file; remove the other bodies."
+            Problem(
+                "the mechanism could not be read",
+                f"joints of something else beside it ('{other[0]}')",
+                "one mechanism in the file",
+                "remove the other bodies",
+                str(urdf.path),
+            )
         )
     for joint in joints:
         del tree.joints[joint.name]

@@ -23,6 +23,7 @@ from legcal.machine.leg import (
     with_platform_points,
     with_radii,
 )
+from legcal.machine.occluders import Occluder, reordered
 from legcal.machine.rods import (
     AT_ZERO,
     actuators_of,
@@ -57,6 +58,7 @@ class Machine:
     diagnostics: tuple[str, ...] = ()  # what the reader should know, one sentence each
     base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
     platform_normal: Array | None = None  # platform, the same way up; None in space
+    occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
 
     @property
     def upward(self) -> Array:
@@ -265,6 +267,7 @@ class Machine:
             self,
             legs=tuple(self.legs[j] for j in order),
             frame_legs=tuple(order.index(j) for j in self.frame_legs),
+            occluders=reordered(self.occluders, order),
         )
 
 

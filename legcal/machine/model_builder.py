@@ -1,12 +1,12 @@
 """A new model of a described machine: its YAML and its URDF, written and loaded."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from legcal.errors import LegcalError, OutOfResources, UsageError
+from legcal.errors import LegcalError, OutOfResources, Problem, UsageError
 from legcal.files.folder import temporary_folder
 from legcal.files.published import write_schemas
 from legcal.geometry.lines import cross
@@ -319,5 +319,12 @@ def _load(path: Path, temporary: Path, source: str) -> None:
     try:
         load_mechanism(path)
     except LegcalError as error:
-        problems = [p.replace(f"{temporary}{os.sep}", f"{source}: ") for p in error.problems]
-        raise type(error)(problems) from error
+        raise error.told(lambda problem: _of_source(problem, temporary, source)) from error
+
+
+def _of_source(problem: Problem, temporary: Path, source: str) -> Problem:
+    """Return a problem of a file in the temporary folder as one of the source."""
+    file = Path(problem.file)
+    if not file.is_relative_to(temporary):
+        return problem
+    return replace(problem, file=f"{source}: {file.relative_to(temporary)}")

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import OutOfClass, Problem
 from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
@@ -117,14 +117,15 @@ def with_own_origins(
                 below = urdf.joints[missing.joint].child
                 link, joint = _unused(f"{missing.joint}_mount", names)
                 patch.add_link_below(missing.joint, link, joint)
-                changed = _renamed(changed, missing.joint, below)
+                changed = [_with_frame(closure, missing.joint, below) for closure in changed]
             else:
                 frame = str(missing.frame)
                 link, joint = _unused(f"{frame}_mount", names)
                 patch.add_frame(
                     frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
                 )
-                changed = _renamed(changed, frame, link)
+                # In this closure alone: frames that closures share get one link for each
+                changed[missing.closure] = _with_frame(changed[missing.closure], frame, link)
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
             return urdf, changed
@@ -150,16 +151,12 @@ def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
     return name, f"{name}_joint"
 
 
-def _renamed(closures: Sequence[Closure], old: str, new: str) -> list[Closure]:
-    """Return closures with another name of a frame."""
-    return [
-        Closure(
-            closure.kind,
-            new if closure.frame_1 == old else closure.frame_1,
-            new if closure.frame_2 == old else closure.frame_2,
-        )
-        for closure in closures
-    ]
+def _with_frame(closure: Closure, old: str, new: str) -> Closure:
+    """Return a closure with another name of a frame."""
+    frame_1, frame_2 = (
+        new if frame == old else frame for frame in (closure.frame_1, closure.frame_2)
+    )
+    return Closure(closure.kind, frame_1, frame_2)
 
 
 class Handle(NamedTuple):
@@ -172,9 +169,11 @@ class Handle(NamedTuple):
 class NoOriginError(LookupError):
     """No origin moves a joint or a frame of a closure alone."""
 
-    def __init__(self, *, joint: str | None = None, frame: str | None = None) -> None:
-        super().__init__(joint, frame)
-        self.joint, self.frame = joint, frame
+    def __init__(
+        self, *, joint: str | None = None, frame: str | None = None, closure: int = -1
+    ) -> None:
+        super().__init__(joint, frame, closure)
+        self.joint, self.frame, self.closure = joint, frame, closure
 
 
 class Handles:
@@ -191,8 +190,7 @@ class Handles:
         """Return what moves a joint in a body."""
         connection = step.connection
         if connection.closure is not None:
-            closure = self._closures[connection.closure]
-            return Handle(self._carrier((closure.frame_1, closure.frame_2)[side]), False)
+            return Handle(self._carrier(connection.closure, side), False)
         joint = self._urdf.joints[str(connection.joint)]
         if side == 0:
             return Handle(joint, False)
@@ -230,13 +228,13 @@ class Handles:
         """Return the fixed joint under a frame of the closure that welds a leg to a body."""
         ours, theirs = self._fixed.body_of[body], self._fixed.body_of[joint.child]
         problem: NoOriginError | None = None
-        for closure in self._closures:
+        for i, closure in enumerate(self._closures):
             frames = closure.frame_1, closure.frame_2
             on = [self._fixed.body_of[frame_link(self._urdf, frame)] for frame in frames]
             if closure.kind == "6d" and set(on) == {ours, theirs}:
                 for wanted in (ours, theirs):
                     try:
-                        carrier = self._carrier(frames[on.index(wanted)])
+                        carrier = self._carrier(i, on.index(wanted))
                     except NoOriginError as error:
                         problem = problem or error
                         continue
@@ -244,18 +242,23 @@ class Handles:
         if problem is not None:
             raise problem
         raise OutOfClass(
-            f"{self._urdf.path}: leg '{leg}' is outside the method: found several welds between "
-            f"joint '{joint.name}' and the link '{body}', needed one, which moves with the "
-            "parameters of the leg; close the leg once."
+            Problem(
+                f"leg '{leg}' is outside the method",
+                f"several welds between joint '{joint.name}' and the link '{body}'",
+                "one, which moves with the parameters of the leg",
+                "close the leg once",
+                str(self._urdf.path),
+            )
         )
 
-    def _carrier(self, frame: str) -> UrdfJoint:
+    def _carrier(self, closure: int, side: int) -> UrdfJoint:
         """Return the fixed joint under a closure's frame, which must carry nothing else."""
+        frame = (self._closures[closure].frame_1, self._closures[closure].frame_2)[side]
         link = frame_link(self._urdf, frame)
         above = self._above.get(link)
         if above is not None and not above.moves and self._carries_only(link, None, closures=1):
             return above
-        raise NoOriginError(frame=frame)
+        raise NoOriginError(frame=frame, closure=closure)
 
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
         """Say whether a link carries one joint or none, and so many frames of closures."""

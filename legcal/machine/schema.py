@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from legcal.errors import DatasetError, ModelError
+from legcal.errors import BadValue, DatasetError, ModelError, Problem
 from legcal.files.motions import MotionEntry
 from legcal.files.published import with_schema
 from legcal.files.schema import (
@@ -60,9 +60,8 @@ class LegcalBlock(FileSchema):
             return None
         repeated = sorted({name for name in value if value.count(name) > 1})
         if repeated:
-            raise ValueError(
-                f"found the leg '{repeated[0]}' more than once, needed different legs; "
-                "name each once."
+            raise BadValue(
+                f"the leg '{repeated[0]}' more than once", "different legs", "name each once"
             )
         return value
 
@@ -93,7 +92,7 @@ def read_mechanism_file(path: Path) -> MechanismFile:
         _check_kind(found, path)
         file = validate(MechanismFile, _without_nulls(found), path)
     except DatasetError as error:
-        raise ModelError(error.problems) from error
+        raise ModelError(error.facts) from error
     problems = _contradictions(file, path)
     if problems:
         raise ModelError(problems)
@@ -104,8 +103,11 @@ def _check_kind(found: Mapping[str, Any], path: Path) -> None:
     """Refuse the other YAML files that legcal reads, with the command for each."""
     if "legcal_table" in found:
         raise ModelError(
-            f"{path}: the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
-            f"model; write the model of the table with: legcal new {path} -o DIR"
+            Problem(
+                f"the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
+                f"model; write the model of the table with: legcal new {path} -o DIR",
+                file=str(path),
+            )
         )
     if path.name == DATASET_YAML:
         raise ModelError(what_a_dataset_is_for(path))
@@ -118,49 +120,83 @@ def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _contradictions(file: MechanismFile, path: Path) -> list[str]:
+def _contradictions(file: MechanismFile, path: Path) -> list[Problem]:
     """Return what does not fit together within the file."""
     problems = []
     if len(file.type) != len(file.closed_loop):
         problems.append(
-            f"{path}: the loops could not be closed: found {len(file.closed_loop)} pairs in "
-            f"closed_loop and {len(file.type)} entries in type, needed equal numbers; write one "
-            "type for each pair."
+            Problem(
+                "the loops could not be closed",
+                f"{len(file.closed_loop)} pairs in closed_loop and {len(file.type)} "
+                "entries in type",
+                "equal numbers",
+                "write one type for each pair",
+                str(path),
+            )
         )
     problems += [
-        f"{path}: type.{i} could not be used: found '{kind}', needed '3d' (points coincide) or "
-        "'6d' (frames coincide); correct it."
+        Problem(
+            f"type.{i} could not be used",
+            f"'{kind}'",
+            "'3d' (points coincide) or '6d' (frames coincide)",
+            "correct it",
+            str(path),
+        )
         for i, kind in enumerate(file.type)
         if kind not in ("3d", "6d")
     ]
     if len(file.closed_loop) > MAX_LOOPS:
         problems.append(
-            f"{path}: the loops could not be closed: found {len(file.closed_loop)} pairs in "
-            f"closed_loop, needed at most {MAX_LOOPS}; give one mechanism."
+            Problem(
+                "the loops could not be closed",
+                f"{len(file.closed_loop)} pairs in closed_loop",
+                f"at most {MAX_LOOPS}",
+                "give one mechanism",
+                str(path),
+            )
         )
     if not file.closed_loop:
         problems.append(
-            f"{path}: the mechanism could not be closed: found no pair in closed_loop, needed the "
-            "loops of a parallel mechanism; write the pairs of frames that coincide."
+            Problem(
+                "the mechanism could not be closed",
+                "no pair in closed_loop",
+                "the loops of a parallel mechanism",
+                "write the pairs of frames that coincide",
+                str(path),
+            )
         )
     if len(file.joint_name) != len(file.joint_type):
         problems.append(
-            f"{path}: joint_name could not be used: found {len(file.joint_name)} names and "
-            f"{len(file.joint_type)} entries in joint_type, needed equal numbers; write one type "
-            "for each joint."
+            Problem(
+                "joint_name could not be used",
+                f"{len(file.joint_name)} names and {len(file.joint_type)} entries in joint_type",
+                "equal numbers",
+                "write one type for each joint",
+                str(path),
+            )
         )
     repeated = sorted({name for name in file.name_mot if file.name_mot.count(name) > 1})
     problems += [
-        f"{path}: name_mot could not be used: found '{name}' more than once, needed each motor "
-        "once; remove the repetition."
+        Problem(
+            "name_mot could not be used",
+            f"'{name}' more than once",
+            "each motor once",
+            "remove the repetition",
+            str(path),
+        )
         for name in repeated
     ]
     block = file.legcal
     if block is None:
         return problems
     problems += [
-        f"{path}: legcal.base_frame could not be used: found '{name}', which is not a leg; "
-        f"{closest(name, block.legs)}"
+        Problem(
+            "legcal.base_frame could not be used",
+            f"'{name}', which is not a leg",
+            "",
+            closest(name, block.legs),
+            str(path),
+        )
         for name in block.base_frame or ()
         if name not in block.legs
     ]

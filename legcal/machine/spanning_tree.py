@@ -17,7 +17,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import OutOfClass, Problem
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
@@ -171,8 +171,13 @@ def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Pat
     if len(closed) > 1:
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
-            f"{path}: the mechanism could not be read: found {len(closed)} mechanisms, which have "
-            f"no moving body in common (with {names}), needed one; write each to its own file."
+            Problem(
+                "the mechanism could not be read",
+                f"{len(closed)} mechanisms, which have no moving body in common (with {names})",
+                "one",
+                "write each to its own file",
+                str(path),
+            )
         )
 
 

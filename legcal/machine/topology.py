@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import OutOfClass, Problem
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
@@ -59,8 +59,13 @@ def find_chains(
     ends = bodies.body_of[base], bodies.body_of[platform]
     if ends[0] == ends[1]:
         raise OutOfClass(
-            f"{urdf.path}: this is not a parallel mechanism: found the platform '{platform}' fixed "
-            f"to the base '{base}', needed legs between them; {urdf.wording.correct_ends}."
+            Problem(
+                "this is not a parallel mechanism",
+                f"the platform '{platform}' fixed to the base '{base}'",
+                "legs between them",
+                urdf.wording.correct_ends,
+                str(urdf.path),
+            )
         )
     origin = bodies.T_body_link[platform][:3, 3]
     within = joint_tolerance(_joints_on(bodies, end) for end in ends)
@@ -112,13 +117,18 @@ def _paths(
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
-                    f"{urdf.path}: this is not a platform on legs: found a leg of more than "
-                    f"{MAX_JOINTS_OF_LEG} joints from {_name(steps[0].connection)}, needed joint, "
-                    "slider, joint; give the mechanism alone."
+                    Problem(
+                        "this is not a platform on legs",
+                        f"a leg of more than {MAX_JOINTS_OF_LEG} joints from "
+                        f"{_name(steps[0].connection)}",
+                        "joint, slider, joint",
+                        "give the mechanism alone",
+                        str(urdf.path),
+                    )
                 )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
-                problem = ""
+                problem = None
                 if len(onward) > 1 and not _is_an_arm(steps, within):
                     problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
                 raise OutOfClass(
@@ -129,8 +139,13 @@ def _paths(
     stray = [c for c in bodies.connections if id(c) not in used]
     if stray:
         raise OutOfClass(
-            f"{urdf.path}: this is not a platform on legs: found {_name(stray[0])} on no chain "
-            "from base to platform, needed every joint on a leg; fix it or remove it."
+            Problem(
+                "this is not a platform on legs",
+                f"{_name(stray[0])} on no chain from base to platform",
+                "every joint on a leg",
+                "fix it or remove it",
+                str(urdf.path),
+            )
         )
     return paths
 
@@ -287,16 +302,23 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
     joint = urdf.joints[block.platform_joint]
     if joint.type not in ("floating", "planar"):
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a {joint.type} "
-            "joint, needed a floating or planar one, which only says where the platform is; "
-            "correct it, or write null if a leg carries the platform."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"a {joint.type} joint",
+                "a floating or planar one, which only says where the platform is",
+                "correct it, or write null if a leg carries the platform",
+                str(path),
+            )
         )
     if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
         axis = ", ".join(f"{x:g}" for x in joint.axis)
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
-            f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
-            "plane of its frame; turn its origin rpy instead."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+                f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
+                "plane of its frame; turn its origin rpy instead.",
+                file=str(path),
+            )
         )
 
 
@@ -314,9 +336,13 @@ def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> 
     found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
     if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found it between the "
-            f"parent '{joint.parent}' and the child '{joint.child}', needed '{block.base}' and "
-            f"'{block.platform}'; name the joint that carries the platform, or write null."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"it between the parent '{joint.parent}' and the child '{joint.child}'",
+                f"'{block.base}' and '{block.platform}'",
+                "name the joint that carries the platform, or write null",
+                str(path),
+            )
         )
 
 
@@ -337,18 +363,27 @@ def check_plane(
         return
     if normals is None:
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
-            "needed a floating one, because the axes of the legs do not let the platform move in "
-            "one plane; correct its type."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered",
+                "a planar joint",
+                "a floating one, because the axes of the legs do not let the platform "
+                "move in one plane",
+                "correct its type",
+                str(path),
+            )
         )
     z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
     normal = bodies.T_body_link[joint.parent][:3, :3].T @ normals[0]
     if not parallel(z, normal):
         tilt = 90.0 - np.degrees(off_square(z, normal))
         raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found its plane "
-            f"{tilt:.4g} deg from the plane in which the legs move, needed the same plane within "
-            "0.057 deg; correct its origin rpy."
+            Problem(
+                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"its plane {tilt:.4g} deg from the plane in which the legs move",
+                "the same plane within 0.057 deg",
+                "correct its origin rpy",
+                str(path),
+            )
         )
 
 
@@ -374,9 +409,14 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
         if other != find(platform) and others.count(other) > 1:
             member = _most_joined(bodies, {body for body in group if find(body) == other})
             raise OutOfClass(
-                f"{urdf.path}: the mechanism could not be read: found a second mechanism on the "
-                f"base, with link '{member}', that has no moving body in common with the platform "
-                f"'{platform}', needed one; write each to its own file."
+                Problem(
+                    "the mechanism could not be read",
+                    f"a second mechanism on the base, with link '{member}', that has no "
+                    f"moving body in common with the platform '{platform}'",
+                    "one",
+                    "write each to its own file",
+                    str(urdf.path),
+                )
             )
 
 
@@ -417,55 +457,74 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
         "planar",
     ):
         raise OutOfClass(
-            f"{urdf.path}: this mechanism is outside the method: found the "
-            f"{urdf.joints[connection.joint].type} joint '{connection.joint}' inside it, needed "
-            "at most the virtual one that carries the platform; name that one in "
-            "legcal.platform_joint."
+            Problem(
+                "this mechanism is outside the method",
+                f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
+                "at most the virtual one that carries the platform",
+                "name that one in legcal.platform_joint",
+                str(urdf.path),
+            )
         )
     if connection.bodies[0] == connection.bodies[1]:
         raise OutOfClass(
-            f"{urdf.path}: this mechanism is outside the method: found {_name(connection)} "
-            "between two links that are rigidly connected, needed a joint that can move; remove it."
+            Problem(
+                "this mechanism is outside the method",
+                f"{_name(connection)} between two links that are rigidly connected",
+                "a joint that can move",
+                "remove it",
+                str(urdf.path),
+            )
         )
     if set(connection.bodies) == {base, platform}:
         raise OutOfClass(
-            f"{urdf.path}: this mechanism is outside the method: found {_name(connection)} "
-            "directly between base and platform, needed legs; name it in legcal.platform_joint if "
-            "it is the virtual joint that carries the platform."
+            Problem(
+                "this mechanism is outside the method",
+                f"{_name(connection)} directly between base and platform",
+                "legs",
+                "name it in legcal.platform_joint if it is the virtual joint that "
+                "carries the platform",
+                str(urdf.path),
+            )
         )
 
 
 def _several_bodies(
     bodies: Bodies, urdf: Urdf, steps: Sequence[Step], body: str, ends: tuple[str, str]
-) -> str:
-    """Return which loop inside a leg, or platform of several bodies, a body belongs to; else "".
+) -> Problem | None:
+    """Return which loop inside a leg, or platform of several bodies, a body belongs to, if any.
 
     Seen from the body without base and platform, the joints of a loop inside a leg reach the base
     by one joint, and those of a part of the platform by those of several legs.
     """
     on_base, on_platform = _reached(bodies, body, ends)
     if len(on_platform) != 1:
-        return ""
+        return None
     if len(on_base) == 1:
-        return (
-            f"{urdf.path}: this machine is outside the method: found a loop inside the leg that "
-            f"starts with {_name(steps[0].connection)}, closed at link '{body}', needed chains "
-            "without loops that end on the platform itself; if these are the rods of a "
-            "parallelogram on an arm or a carriage, close each on the platform as a leg of its "
-            "own, otherwise this machine cannot be calibrated this way."
+        return Problem(
+            "this machine is outside the method",
+            f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
+            f"closed at link '{body}'",
+            "chains without loops that end on the platform itself",
+            "if these are the rods of a parallelogram on an arm or a carriage, close "
+            "each on the platform as a leg of its own, otherwise this machine cannot "
+            "be calibrated this way",
+            str(urdf.path),
         )
     if len(on_base) > 1:
         return _platform_of_several_bodies(urdf, body, on_platform[0])
-    return ""
+    return None
 
 
-def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> str:
+def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Problem:
     """Return why a platform that carries a body on which legs end is refused."""
-    return (
-        f"{urdf.path}: this machine is outside the method: found a platform of several bodies (as "
-        f"of an H4 or I4), because legs end on link '{body}', which {_name(joint)} connects to the "
-        f"platform, needed legs that end on one rigid platform; make {_name(joint)} fixed if it "
-        "does not move, otherwise this machine cannot be calibrated this way."
+    return Problem(
+        "this machine is outside the method",
+        "a platform of several bodies (as of an H4 or I4), because legs end on "
+        f"link '{body}', which {_name(joint)} connects to the platform",
+        "legs that end on one rigid platform",
+        f"make {_name(joint)} fixed if it does not move, otherwise this machine "
+        "cannot be calibrated this way",
+        str(urdf.path),
     )
 
 
@@ -500,23 +559,22 @@ def _not_a_chain(
     n_onward: int,
     motors: Sequence[str],
     within: float,
-) -> str:
+) -> Problem:
     """Return why the leg that starts with some joints is not a chain."""
-    needed = "needed one unbranched chain from base to platform for each leg;"
+    needed, remedy = "one unbranched chain from base to platform for each leg", ""
     first = steps[0].connection
     last = steps[-1].connection
     if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
         moves = first.joint in motors
-        return (
-            f"{urdf.path}: the leg that starts with {_name(first)} is outside the method: found "
-            f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}, needed the motor "
-            "of an arm or a carriage on the base itself; "
-            + (
-                "arms on arms cannot be calibrated this way."
-                if moves
-                else "make joints between it and the base fixed if they do not move, otherwise "
-                "this machine cannot be calibrated this way."
-            )
+        return Problem(
+            f"the leg that starts with {_name(first)} is outside the method",
+            f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}",
+            "the motor of an arm or a carriage on the base itself",
+            "arms on arms cannot be calibrated this way"
+            if moves
+            else "make joints between it and the base fixed if they do not move, otherwise "
+            "this machine cannot be calibrated this way",
+            str(urdf.path),
         )
     if body == base:
         found = "returns to the base"
@@ -524,16 +582,18 @@ def _not_a_chain(
         found = f"ends at link '{body}' without reaching the platform"
     elif n_onward > 1 and _is_an_arm(steps, within):
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
-        needed = (
-            "needed joints whose centres are fixed in the base, or a motor in name_mot that moves "
-            f"this link; name {_name(first)} in name_mot if a motor turns it, otherwise"
-        )
+        moved = "a motor in name_mot that moves this link"
+        needed = f"joints whose centres are fixed in the base, or {moved}"
+        remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
     else:
         found = f"shares link '{body}' with another leg or branches there"
-    return (
-        f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, {needed} check {urdf.wording.closures}, or "
-        f"{urdf.wording.correct_ends}."
+    return Problem(
+        "this is not a platform on separate legs: the chain that starts with "
+        f"{_name(first)} {found}",
+        "",
+        needed,
+        f"{remedy}check {urdf.wording.closures}, or {urdf.wording.correct_ends}",
+        str(urdf.path),
     )
 
 
@@ -586,9 +646,13 @@ def _platform_body(
     if n_base < 2:
         joints = "1 joint" if n_base == 1 else "no joint"
         raise OutOfClass(
-            f"{path}: this is not a parallel mechanism: found {joints} on the base "
-            f"({urdf.wording.root}), needed one for each leg; {urdf.wording.state_ends} if another "
-            "link is the base."
+            Problem(
+                "this is not a parallel mechanism",
+                f"{joints} on the base ({urdf.wording.root})",
+                "one for each leg",
+                f"{urdf.wording.state_ends} if another link is the base",
+                str(path),
+            )
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
     candidates = meeting or [body for body in at if body != base]
@@ -606,16 +670,26 @@ def _platform_body(
         return found[0]
     if found:
         raise OutOfClass(
-            f"{path}: no platform could be proposed: found several links where legs could end "
-            f"({', '.join(found)}), needed one; {urdf.wording.state_ends}."
+            Problem(
+                "no platform could be proposed",
+                f"several links where legs could end ({', '.join(found)})",
+                "one",
+                urdf.wording.state_ends,
+                str(path),
+            )
         )
     if meeting:
         raise reasons[0]
     raise OutOfClass(
-        f"{path}: this mechanism is outside the method: found one closed chain in which no link is "
-        "a platform on legs, because on each side of any link more than a slider or a rod moves "
-        "the joint at A; needed legs of type joint, slider or rod, joint; this machine cannot be "
-        "calibrated this way."
+        Problem(
+            "this mechanism is outside the method",
+            "one closed chain in which no link is a platform on legs, because on "
+            "each side of any link more than a slider or a rod moves the joint at A; "
+            "needed legs of type joint, slider or rod, joint",
+            "",
+            "this machine cannot be calibrated this way",
+            str(path),
+        )
     )
 
 

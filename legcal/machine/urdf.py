@@ -13,7 +13,7 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
-from legcal.errors import ModelError
+from legcal.errors import ModelError, Problem
 from legcal.files.schema import NAME_NEEDED, describe, is_name
 from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
@@ -31,18 +31,30 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
     robot = parse_xml(path, content, "URDF")
     if robot.tag != "robot":
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <{robot.tag}> "
-            "as its outermost element, needed <robot>; give the URDF of the mechanism."
+            Problem(
+                f"the URDF could not be read: found <{robot.tag}> "
+                "as its outermost element, needed <robot>; give the URDF of the mechanism.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     if not robot.get("name", "").isprintable():
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> with the "
-            f"name {describe(robot.get('name'))}, needed printable characters; rename it."
+            Problem(
+                f"the URDF could not be read: found <robot> with the "
+                f"name {describe(robot.get('name'))}, needed printable characters; rename it.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     if not robot.get("name", "").strip():
         raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> without "
-            "a name, needed one; write <robot name=...>."
+            Problem(
+                "the URDF could not be read: found <robot> without "
+                "a name, needed one; write <robot name=...>.",
+                file=str(path),
+                line=cast("int", robot.sourceline),
+            )
         )
     return robot
 
@@ -58,26 +70,45 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
         raise ModelError(
-            f"{path}, line {line}: the {what} could not be read: found {error.msg}, needed "
-            "well-formed XML; mend that line, or copy the file again if it was cut off."
+            Problem(
+                f"the {what} could not be read: found {error.msg}, needed "
+                "well-formed XML; mend that line, or copy the file again if it was cut off.",
+                file=str(path),
+                line=line,
+            )
         ) from error
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
         raise ModelError(
-            f"{path}: the {what} could not be read: found more than {MAX_ELEMENTS} elements, "
-            "needed fewer; give the file of one mechanism."
+            Problem(
+                f"the {what} could not be read",
+                f"more than {MAX_ELEMENTS} elements",
+                "fewer",
+                "give the file of one mechanism",
+                str(path),
+            )
         )
     document: Any = root.getroottree().docinfo
     if document.doctype or document.internalDTD is not None:
         raise ModelError(
-            f"{path}: the {what} could not be read: found a document type (<!DOCTYPE>), whose "
-            "entities are never expanded, needed plain XML; remove it."
+            Problem(
+                f"the {what} could not be read",
+                "a document type (<!DOCTYPE>), whose entities are never expanded",
+                "plain XML",
+                "remove it",
+                str(path),
+            )
         )
     try:
         content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ModelError(
-            f"{path}: the {what} could not be read: found text in another encoding, needed "
-            "UTF-8; save it as UTF-8."
+            Problem(
+                f"the {what} could not be read",
+                "text in another encoding",
+                "UTF-8",
+                "save it as UTF-8",
+                str(path),
+            )
         ) from error
     return root
 
@@ -108,23 +139,32 @@ class Problems:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.sentences: list[str] = []
+        self.all: list[Problem] = []
 
     def __len__(self) -> int:
-        return len(self.sentences)
+        return len(self.all)
 
     def add(self, element: etree._Element, found: str, remedy: str) -> None:
         """Note what is wrong with an element of the file and how to mend it."""
-        what = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
-        self.sentences.append(
-            f"{self.path}, line {element.sourceline}: {what} could not be used: it {found}; "
-            f"{remedy}{'' if remedy.endswith('?') else '.'}"
+        name = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
+        self.all.append(
+            Problem(
+                f"{name} could not be used: it {found}",
+                remedy=remedy,
+                file=str(self.path),
+                line=cast("int", element.sourceline),
+                name=name,
+            )
         )
+
+    def add_of_file(self, what: str, found: str, needed: str, remedy: str) -> None:
+        """Note what is wrong with the whole file."""
+        self.all.append(Problem(what, found, needed, remedy, str(self.path)))
 
     def raise_if_any(self) -> None:
         """Raise all problems as one error."""
-        if self.sentences:
-            raise ModelError(self.sentences)
+        if self.all:
+            raise ModelError(self.all)
 
 
 def number_list(text: str, count: int) -> list[float] | None:
@@ -229,16 +269,20 @@ def _root(
     """Return the one link without a parent, from which all others must hang."""
     roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
-        problems.sentences.append(
-            f"{problems.path}: the URDF could not be used: found no <link>, needed the links of a "
-            "mechanism; expand it with xacro first if it is a xacro file."
+        problems.add_of_file(
+            "the URDF could not be used",
+            "no <link>",
+            "the links of a mechanism",
+            "expand it with xacro first if it is a xacro file",
         )
         return ""
     if len(roots) > 1:
         names = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
-        problems.sentences.append(
-            f"{problems.path}: the URDF could not be used: found {len(roots)} links without a "
-            f"parent ({names}), needed one; join them with joints, a platform by a floating one."
+        problems.add_of_file(
+            "the URDF could not be used",
+            f"{len(roots)} links without a parent ({names})",
+            "one",
+            "join them with joints, a platform by a floating one",
         )
     root = roots[0].get("name", "") if roots else ""
     reached: set[str] = set()
@@ -250,10 +294,12 @@ def _root(
             pending.extend(children.get(link, ()))
     cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
     if cyclic:
-        problems.sentences.append(
-            f"{problems.path}: the URDF could not be used: the links "
-            f"{', '.join(repr(name) for name in cyclic[:6])} hang from each other in a cycle, "
-            "needed a tree; cut the loop and close it in closed_loop of the mechanism YAML."
+        names = ", ".join(repr(name) for name in cyclic[:6])
+        problems.add_of_file(
+            f"the URDF could not be used: the links {names} hang from each other in a cycle",
+            "",
+            "a tree",
+            "cut the loop and close it in closed_loop of the mechanism YAML",
         )
     return root
 
@@ -345,8 +391,13 @@ def checked_tree(
     ):
         if found > most:
             raise ModelError(
-                f"{path}: the mechanism could not be read: found {found} {what}, needed at most "
-                f"{most}; give one mechanism, with fixed joints where nothing moves."
+                Problem(
+                    "the mechanism could not be read",
+                    f"{found} {what}",
+                    f"at most {most}",
+                    "give one mechanism, with fixed joints where nothing moves",
+                    str(path),
+                )
             )
     for element in (*links, *joints):
         check_numbers(element, problems)

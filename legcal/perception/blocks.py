@@ -15,7 +15,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
 from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
-from legcal.perception.profiles import TAPER, Edge, fading, read_profiles
+from legcal.perception.profiles import Edge, fading, read_profiles
 from legcal.perception.tuning import BLOCK_SIGMAS
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
@@ -198,7 +198,7 @@ class Blocks:
         depth = np.clip(MILD_DEPTH * self.half_width, least, depth_for_blur(blur))
         depth = np.minimum(depth, MAX_NEAR_DEPTH * self.half_width)
         d = self.d - self.moved[:, None].astype(np.float32)
-        window = fading(depth[self.edge, None].astype(np.float32) + np.float32(0.5 * TAPER) - d)
+        window = fading(d, depth[self.edge, None].astype(np.float32))
         self.weight, self.window, self.last = self.weight * window, self.window * window, None
 
     def fit(self, blur: float, n_rounds: int) -> None:

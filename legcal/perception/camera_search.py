@@ -9,12 +9,14 @@ left and right exchanged.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
@@ -28,20 +30,59 @@ from legcal.perception.pair_matching import (
 from legcal.perception.pose_hypotheses import pose_hypotheses
 from legcal.perception.tuning import FITTING, JOINT_ERROR, LEAD, SEARCHING, SUPPORT
 
-# Lead over the next pose that is enough, clear, or that of a pose with few legs: in legs of all
-# images together, and as a part of them.
-ENOUGH, CLEAR, ALONE = (LEAD, 0.16), (2.0 * LEAD, 0.35), (1.5 * LEAD, 0.3)
-HINTED_SUPPORT = 3.0 * SUPPORT  # share of the expected legs near a rough pose that is clear
+# Share of the expected legs that accepts a pose is SUPPORT; that of a pose that leads alone, of a
+# clear one, of a clear one near a rough pose, and which mirrored images do not reach:
+LONE_SUPPORT, CLEAR_SUPPORT = 0.6 * SUPPORT, 1.75 * SUPPORT
+HINTED_SUPPORT, NOT_MIRRORED_SUPPORT = 3.0 * SUPPORT, 2.25 * SUPPORT
+# Legs that agree in all images together, at least: two always fit some pose
+MIN_LEGS, MIN_LEGS_HINTED = 2.8, 1.6
+# Lead over the next pose, in legs of all images together and as a part of the score: that is
+# enough, that is clear, that a pose with few legs needs, and that mirrored images need.
+ENOUGH_LEAD, CLEAR_LEAD = (LEAD, 0.16), (2.0 * LEAD, 0.35)
+LONE_LEAD, MIRRORED_LEAD = (1.5 * LEAD, 0.3), (0.5 * LEAD, 0.06)
+SHIFT_COST = 0.06  # in legs, of shifts of joints as likely as one standard deviation (chi^2 / 2)
 START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, until one is clear
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 N_KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
+N_POLISHED, N_POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
 POLISH = SEARCHING[3:6]  # tolerances
+POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
+NEAR_TURN = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 SAME_POSE = np.deg2rad(8.0), 0.08  # within an angle and a part of the distance
+SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same,
+OTHER_POSE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
+SAME_LEG_TURN, SAME_LEG_WIDTHS = np.deg2rad(4.0), 0.6  # of two pairs: angle, distance [widths]
 MIN_MATCH_SCORE = 0.15  # score of a segment with its pair that counts as a match
+MIN_MATCHES, ERROR_OF_FEW = 3, 0.5 * JOINT_ERROR  # below so many, a leg is at least so uncertain
 
 LEFT_RIGHT = np.array([-1.0, 1.0])
 UP_DOWN = np.array([1.0, -1.0])
 UPSIDE_DOWN = np.array([-1.0, -1.0])
+
+
+class EdgeStep(NamedTuple):
+    """How poses are moved to edges."""
+
+    blur: float  # how far edges count [cells of half the size, or of the maps]
+    turn: float  # by which poses are turned, one standard deviation [deg]
+    part: float  # and moved, as a part of the distance
+    n_kept: int
+    is_fine: bool = False
+    all_pictures: bool = False
+
+
+N_SUGGESTING, N_MOVED, N_TRIED = 4, 60, 24  # pictures; poses that are moved, and so often
+EDGE_STEPS = (
+    EdgeStep(4.0, 6.0, 0.08, 40),
+    EdgeStep(4.0, 3.0, 0.05, 30),
+    EdgeStep(3.0, 2.0, 0.03, 20),
+    EdgeStep(2.0, 1.5, 0.02, 12),
+    EdgeStep(2.0, 1.0, 0.012, 8),
+    EdgeStep(1.5, 0.6, 0.008, 6, all_pictures=True),
+    EdgeStep(2.0, 0.4, 0.005, 6, is_fine=True, all_pictures=True),
+    EdgeStep(1.5, 0.2, 0.003, 4, is_fine=True, all_pictures=True),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +98,15 @@ class PoseCandidates:
     hinted: bool = False  # whether it was searched for near a rough pose only
     by_outlines: bool | None = None  # whether outlines measured at the poses support the first
     # one; None where pairs were clear
+    along_edges: float = 0.0  # legs with edges along them at the first pose, where it is by edges
 
     @property
     def needed(self) -> float:
         """How many legs must match in a picture on average for a pose to be accepted."""
         n = self.support.shape[1]
-        alone = not self.hinted and self._leads(ALONE)
-        share = 0.6 * SUPPORT if alone else SUPPORT
-        least = 1.6 if self.hinted else 2.8  # legs in all images: two always fit some pose
+        alone = not self.hinted and self._leads(LONE_LEAD)
+        share = LONE_SUPPORT if alone else SUPPORT
+        least = MIN_LEGS_HINTED if self.hinted else MIN_LEGS
         return float(max(share * self.expected[0].mean(), least / n))
 
     @property
@@ -82,12 +124,12 @@ class PoseCandidates:
     @property
     def leads_clearly(self) -> bool:
         """Whether the first pose is clearly better than the second one by pairs."""
-        return self._leads(CLEAR)
+        return self._leads(CLEAR_LEAD)
 
     @property
     def leads(self) -> bool:
         """Whether the first pose is better than the second one by pairs."""
-        return self._leads(ENOUGH)
+        return self._leads(ENOUGH_LEAD)
 
     @property
     def is_convincing(self) -> bool:
@@ -103,7 +145,7 @@ class PoseCandidates:
             return False
         if self.hinted:
             return self.share >= HINTED_SUPPORT
-        return self.share >= 1.75 * SUPPORT and self.leads_clearly
+        return self.share >= CLEAR_SUPPORT and self.leads_clearly
 
     @property
     def share(self) -> float:
@@ -151,12 +193,12 @@ def place_camera(
         score = scores(some, poses, SEARCHING[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         poses = CameraPoses.joined(
-            [poses, _reversed(some, poses.take(np.arange(min(4, len(poses)))))]
+            [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
         )
         poses = refined(some, poses, SEARCHING[3:], JOINT_ERROR)
         score = scores(some, poses, SEARCHING[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
-        poses = CameraPoses.joined([poses, _polished(some.take(slice(4)), poses)])
+        poses = CameraPoses.joined([poses, _polished(some.take(slice(N_POLISHING)), poses)])
         best = _candidates(every, refined(every, poses, FITTING, JOINT_ERROR))
     return best
 
@@ -182,7 +224,7 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """
     n_legs = poses.shift.shape[1]
     found = []
-    for i in range(min(2, len(poses))):
+    for i in range(min(N_POLISHED, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
         around = refined(pictures, around, POLISH, JOINT_ERROR)
         score = scores(pictures, around, POLISH[-1])
@@ -197,13 +239,66 @@ def _reversed(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
 
 
 def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
-    """Return poses around one: turned by 3 degrees, 5 % further or nearer, and as it is."""
+    """Return poses around one: the machine turned a little, further, nearer, or as it is."""
     ends = pictures.all_ends
     middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
-    turns = np.deg2rad(3.0) * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
-    further = 1.0 + 0.05 * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
+    turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
+    further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
     new = Rotation.from_rotvec(turns).as_matrix() @ R
     return CameraPoses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
+
+
+def place_by_edges(
+    pictures: Sequence[Picture], maps: EdgeMaps, n_legs: int, known: CameraPoses
+) -> PoseCandidates:
+    """Return the camera poses along whose limbs most edges of pictures lie.
+
+    Pairs of edges and known poses suggest them; they are moved at random, less and less, to where
+    edges are. ``maps`` are of the same pictures. Pairs do not say which pose is best: see
+    :attr:`PoseCandidates.by_outlines`.
+    """
+    every = Pictures.of(pictures)
+    suggested = [_suggested(picture, n_legs) for picture in pictures[:N_SUGGESTING]]
+    poses = CameraPoses.joined([known, *suggested])
+    if len(poses) == 0:
+        return _candidates(every, poses)
+    coarse, rng = maps.halved(), np.random.default_rng(len(poses))
+    few = slice(0, N_SUGGESTING)
+    some, maps_of_some = every.take(few), maps.take(range(len(pictures))[few])
+    rough = maps_of_some.halved()
+    score = rough.blurred(EDGE_STEPS[0].blur).scores(some, poses)
+    poses = poses.take(_best(score, N_MOVED))
+    for step in EDGE_STEPS:
+        of_step, seen = (maps_of_some, some) if step.is_fine else (rough, some)
+        if step.all_pictures:
+            of_step, seen = (maps if step.is_fine else coarse), every
+        poses, score = _moved_to_edges(of_step.blurred(step.blur), seen, poses, step, rng)
+        poses = poses.take(_distinct(poses, score, step.n_kept))
+    found = match_pairs(every, poses, FITTING[-1])
+    support, expected = (_by_legs(every, x).T for x in (found.exclusive_score, found.visible))
+    error = _leg_error(every, poses.take(slice(0, 1)))
+    first = float(score.max()) / len(pictures)
+    return PoseCandidates(poses, support, expected, support.sum(axis=1), error, along_edges=first)
+
+
+def _moved_to_edges(
+    maps: EdgeMaps, pictures: Pictures, poses: CameraPoses, step: EdgeStep, rng: np.random.Generator
+) -> tuple[CameraPoses, Array]:
+    """Return for each pose the best one of some around it, and the scores."""
+    n, middle = len(poses), pictures.all_ends.mean(axis=0)
+    R, t = np.repeat(poses.R, N_TRIED, axis=0), np.repeat(poses.t, N_TRIED, axis=0)
+    at = R @ middle + t
+    distance = np.linalg.norm(at, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec(np.deg2rad(step.turn) * rng.normal(size=(len(R), 3)))
+    at = at + step.part * distance * rng.normal(size=at.shape) * np.array([0.5, 0.5, 1.0])
+    R = turns.as_matrix() @ R
+    around = CameraPoses.rigid(R, at - R @ middle, poses.shift.shape[1])
+    tried = CameraPoses.joined([poses, around])
+    score = maps.scores(pictures, tried)
+    parent = np.concatenate([np.arange(n), np.repeat(np.arange(n), N_TRIED)])
+    order = np.lexsort([-score, parent])
+    best = order[np.flatnonzero(np.diff(parent[order], prepend=-1))]
+    return tried.take(best), score[best]
 
 
 def place_near(
@@ -211,7 +306,7 @@ def place_near(
 ) -> PoseCandidates:
     """Return the camera pose near a rough one on which the pictures of a view agree."""
     T = T_base_camera.inv()
-    turns = np.deg2rad(2.5) * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    turns = NEAR_TURN * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     every = Pictures.of(pictures)
@@ -245,7 +340,7 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     support, expected = (_by_legs(pictures, x).T for x in (value, found.visible))
     joint_error = JOINT_ERROR * pictures.size
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
-    score = support.sum(axis=1) - 0.06 * cost  # legs, for half a squared sigma
+    score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, found, value >= MIN_MATCH_SCORE, score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
@@ -273,8 +368,8 @@ def _different(
     least = np.maximum(np.diag(common), 1.0)
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
-        alike = common[i, kept] / least[i] >= 0.5
-        if not np.any(alike & _near(poses, kept, i, np.deg2rad(20.0), 0.25)):
+        alike = common[i, kept] / least[i] >= SAME_MATCHES
+        if not np.any(alike & _near(poses, kept, i, *OTHER_POSE)):
             kept.append(i)
     return np.array(kept, dtype=np.intp)
 
@@ -282,13 +377,12 @@ def _different(
 def _one_leg(pairs: Array) -> BoolArray:
     """Return which pairs (n, n) may be of one leg: they continue each other or overlap.
 
-    They lie within 4 degrees and 0.6 widths of each other.
     Pairs (n, 9) are as in :class:`legcal.perception.pair_matching.Pictures`.
     """
     middle, along, normal, width = pairs[:, :2], pairs[:, 2:4], pairs[:, 4:6], pairs[:, 8]
     apart = np.abs(np.sum(middle * normal, axis=1)[:, None] - normal @ middle.T)
-    near = np.maximum(apart, apart.T) <= 0.6 * width[:, None]
-    return np.asarray(near & (np.abs(along @ along.T) >= np.cos(np.deg2rad(4.0))))
+    near = np.maximum(apart, apart.T) <= SAME_LEG_WIDTHS * width[:, None]
+    return np.asarray(near & (np.abs(along @ along.T) >= np.cos(SAME_LEG_TURN)))
 
 
 def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
@@ -302,23 +396,27 @@ def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
         np.add.at(square, pictures.leg[matched], distance[matched] ** 2)
         np.add.at(count, pictures.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))
-    error = np.where(count < 3, np.maximum(error, 0.5 * JOINT_ERROR), error)  # of few matches
+    error = np.where(count < MIN_MATCHES, np.maximum(error, ERROR_OF_FEW), error)
     return np.where(count > 0, error, np.inf)
 
 
 def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     """Return the poses that suit a picture best, among those that two of its pairs suggest."""
-    poses = pose_hypotheses(picture, n_legs)
+    poses = _suggested(picture, n_legs)
     if len(poses) == 0:
         return poses
-    # From the frame of the picture to that of the poses.
-    back = picture.R.T
-    poses = CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     own = Pictures.of([picture])
     poses = poses.take(_best(scores(own, poses, SEARCHING[0]), N_KEPT[0]))
     poses = refined(own, poses, SEARCHING[:3])
     score = scores(own, poses, SEARCHING[2])
     return poses.take(_distinct(poses, score, N_KEPT[1]))
+
+
+def _suggested(picture: Picture, n_legs: int) -> CameraPoses:
+    """Return the poses that two pairs of a picture suggest."""
+    poses, back = pose_hypotheses(picture, n_legs), picture.R.T
+    # From the frame of the picture to that of the poses.
+    return CameraPoses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
 
 
 def refined(
@@ -392,7 +490,7 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 def may_be_mirrored(own: PoseCandidates) -> bool:
     """Say whether a placed view needs to be compared with its mirror image."""
-    return not own.is_convincing or own.share < 2.25 * SUPPORT
+    return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
 
 
 def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
@@ -403,4 +501,5 @@ def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
     if not own.is_convincing:
         return other.is_clear
     lead = float(other.score[0] - own.score[0])
-    return other.is_convincing and lead >= max(0.5 * LEAD, 0.06 * float(other.score[0]))
+    legs, part = MIRRORED_LEAD
+    return other.is_convincing and lead >= max(legs, part * float(other.score[0]))

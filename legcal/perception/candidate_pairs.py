@@ -6,6 +6,7 @@ is, and whether it is a leg at all, is not known here.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +21,12 @@ from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
+LEG_WIDTH = 8.0  # of the thinnest leg after that [reduced px]
+# Of what stands still in pictures of a view: so many pictures, in most of which at most this part
+# moves, that is, differs by several times what most pixels do and this part of the brightest light
+MIN_STILL, MAX_MOVING, NOISE_FACTOR, DIFFERS = 4, 0.5, 3.0, 0.02
+NEAR_MOVING, MIN_MOVING = 2, 8  # pixels around such differences; pieces there, to leave out others
+MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
 MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
 MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
 MAX_GAP = 3.0  # between such pieces [lengths of the shorter one]
@@ -61,10 +68,69 @@ class EdgeSegments:
         return len(self.ends)
 
 
-def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
-    """Return the straight edges of a picture, which is reduced if it is large."""
-    factor = int(np.clip(max(grey.shape) // LONG_SIDE, 1, MAX_REDUCTION))
-    pieces = _pieces(reduce(grey, factor))
+def reduction(camera: Camera, part: float) -> int:
+    """Return the whole factor by which pictures are reduced.
+
+    ``part`` is how thick the thinnest leg is, in mean leg lengths; these take up about half of a
+    picture.
+    """
+    size = max(camera.width, camera.height)
+    factor = min(size // LONG_SIDE, int(0.5 * part * size / LEG_WIDTH))
+    return int(np.clip(factor, 1, MAX_REDUCTION))
+
+
+def still_picture(pictures: Sequence[Grey]) -> Grey | None:
+    """Return what stands still in reduced pictures of one view; None where the camera does not.
+
+    Legs are somewhere else in most pictures.
+    """
+    if len(pictures) < MIN_STILL:
+        return None
+    still = np.median(np.stack(pictures), axis=0).astype(np.float32)
+    moving = [float(np.mean(_differs(one, still))) for one in pictures]
+    return still if float(np.median(moving)) <= MAX_MOVING else None
+
+
+def _differs(picture: Grey, still: Grey) -> BoolArray:
+    """Return which pixels of a picture are not those of what stands still."""
+    away = np.abs(picture - still)
+    least = max(NOISE_FACTOR * _middle(away[::STRIDE, ::STRIDE]), DIFFERS * float(still.max()))
+    return np.asarray(away > least)
+
+
+def moving_pixels(picture: Grey, still: Grey) -> Image:
+    """Return 1 near pixels of a picture that are not those of what stands still, else 0."""
+    size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
+    return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
+
+
+def _moving(pieces: Array, picture: Grey, still: Grey) -> BoolArray:
+    """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
+    differs = moving_pixels(picture, still)
+    share = np.linspace(0.0, 1.0, 12)[:, None]
+    along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
+    x, y = np.rint(np.clip(along, 0, np.array(picture.shape[::-1]) - 1)).astype(np.intp).T
+    return np.asarray(differs[y, x].mean(axis=0) > 0.5)
+
+
+def find_segments(
+    grey: Grey, camera: Camera, factor: int | None = None, still: Grey | None = None
+) -> EdgeSegments:
+    """Return the straight edges of a picture, reduced by a factor, but of what stands still."""
+    factor = reduction(camera, 1.0) if factor is None else factor
+    return segments_of_reduced(reduce(grey, factor), camera, factor, still)
+
+
+def segments_of_reduced(
+    small: Grey, camera: Camera, factor: int, still: Grey | None = None
+) -> EdgeSegments:
+    """Return the straight edges of a reduced picture, but of what stands still."""
+    pieces = _pieces(small)
+    if still is not None and len(pieces):
+        moving = _moving(pieces, small, still)
+        if np.count_nonzero(moving) >= MIN_MOVING:
+            pieces = pieces[moving]
+    pieces = pieces[:MAX_PIECES]
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
     pixel = factor / focal
     if len(pieces) == 0:
@@ -101,7 +167,7 @@ def _pieces(small: Grey) -> Array:
     pieces = _straight(_edge_middles(slopes, at, gradient), gradient, chain.take(order))
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MAX_PIECES]
-    return np.asarray(pieces[order[length[order] >= 0.5 * EDGE_LENGTH]])
+    return np.asarray(pieces[order[length[order] >= MIN_PIECE_LENGTH]])
 
 
 def _middle(values: Image) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from legcal.data.outlines import Outlines, join_outlines, no_outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array
+from legcal.machine.occluders import PlacedOccluders
 from legcal.perception.outline import (
     ImageSearch,
     Method,
@@ -38,7 +39,7 @@ def measure_outlines(
     """
     if placement.window is not None:
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
-    search = replace(search, edge_pairs={})  # of no use to worker processes
+    search = replace(search, edge_pairs={}, still={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
     task = partial(_of_image, search, placement, method)
     for row, (outlines, blur[row]) in zip(rows, run(task, rows), strict=True):
@@ -59,10 +60,13 @@ def _of_image(
         window += placement.window[row]
     wanted = [leg for leg in np.flatnonzero(~np.isnan(window)).tolist() if search.cylinders[leg]]
     predicted: list[PredictedLeg] = []
-    arms = placement.arms
+    arms, occluders = placement.arms, PlacedOccluders.none()
     if T is not None:
         ends = placement.A_base, placement.B_base
         predicted = predict_legs_and_arms(camera, T, ends, search.cylinders, arms, row)
+        here = (of_rows[row : row + 1] for of_rows in ends)
+        (occluders,) = PlacedOccluders.at(search.occluders, *here)
+        occluders = occluders.before(T.as_matrix())
     window = np.concatenate([window, window[list(arms)]])
     if placement.window is None:
         error = np.broadcast_to(placement.joint_error, search.wanted.shape)[view]
@@ -83,6 +87,7 @@ def _of_image(
         blur=blur or None,
         near_fit=not np.isnan(known),
         arms=tuple(arms),
+        occluders=occluders,
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}

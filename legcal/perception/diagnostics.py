@@ -36,13 +36,22 @@ from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
 TOLERANCE = SEARCHING[-1]  # of an axis from its edge pair
-NOMINAL_TOLERANCE = 2.5 * TOLERANCE  # of a leg that nothing has moved from where the model has it
+NOMINAL_TOLERANCE = 0.0375  # of a leg that nothing has moved from where the model has it
+# Share of the legs of another explanation of an image: at least, times that of its own reading,
+# and more than that.
+MIN_SHARE, MIN_GAIN, MIN_MORE = 0.35, 2.0, 0.15
+AMBIGUOUS = 0.85  # part of the best explanation from which on another one is about as good
+LONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
+ZOOMS = 1.02 ** np.setdiff1d(np.arange(-12, 36), 0)  # of images cut out and scaled
 _ORIGINAL = "replace it by the original"  # a remedy
 _FLIPS = (
     (LEFT_RIGHT, Reason.MIRRORED), (UP_DOWN, Reason.MIRRORED), (UPSIDE_DOWN, Reason.UPSIDE_DOWN)
 )  # fmt: skip
 
 N_REFERENCES = 3  # good images that others are compared with
+MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
+GOOD_PERCENTILE = 75.0  # of the shares that images show, for what good ones do
+MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
 TAKE_AGAIN = "take it again"  # a remedy
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 
@@ -264,7 +273,7 @@ def explain(
     tried = [(share, why, _ORIGINAL) for share, why in others]
     zooms = [
         (_share(replace(picture, pairs=shrunk(pairs, picture.corners, z)), placement, view), z)
-        for z in 1.02 ** np.setdiff1d(np.arange(-12, 36), 0)
+        for z in ZOOMS
     ]
     share = max(share for share, _ in zooms)
     zoom = float(np.median([z for own, z in zooms if own == share]))
@@ -301,7 +310,8 @@ def explain(
             )
     share, why, remedy = max(tried, key=lambda one: one[0])
     # Clearly more of the legs than the reading's own, and enough of them
-    least = max(0.35, SHARE_OF_OTHERS * usual.get(view, 0.0), 2.0 * own, own + 0.15)
+    of_others = SHARE_OF_OTHERS * usual.get(view, 0.0)
+    least = max(MIN_SHARE, of_others, MIN_GAIN * own, own + MIN_MORE)
     return ImageExplanation(own, why, remedy) if share >= least else ImageExplanation(own)
 
 
@@ -321,7 +331,7 @@ def _at_other_reading(
     why = f"its legs are about where the reading of image {image} has them"
     difference = np.abs(measurements.q[row] - measurements.q[other])
     *_, second, first = np.argsort(np.nan_to_num(difference))
-    if difference[first] > 3.0 * difference[second]:
+    if difference[first] > LONE_READING * difference[second]:
         given, there = 1e3 * measurements.q[[row, other], first]
         name = search.leg_names[first]
         remedy = f"check its reading of {name}, {given:.2f} mm against {there:.2f} mm, and {remedy}"
@@ -338,7 +348,7 @@ def _best(
     ranked = sorted(readings, key=lambda one: -one[0])
     if ranked and ranked[0][1] in suspects:
         ranked = [one for one in ranked if one[1] in suspects]
-    if len(ranked) > 1 and ranked[1][0] > 0.85 * ranked[0][0]:
+    if len(ranked) > 1 and ranked[1][0] > AMBIGUOUS * ranked[0][0]:
         return []
     return ranked[:1]
 
@@ -399,8 +409,8 @@ def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
         every = [other.share for other in found.values()]
-        usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, 75.0))
-        if usual >= 0.3 and count.share < SHARE_OF_OTHERS * usual:
+        usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, GOOD_PERCENTILE))
+        if usual >= MIN_USUAL_SHARE and count.share < SHARE_OF_OTHERS * usual:
             suspects.append(row)
     return suspects
 
@@ -472,7 +482,9 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
         for leg, name in enumerate(search.leg_names)
         if not search.wanted[v, leg]
         and search.cylinders[leg]
-        and all(share_shown(search, placement, row, legs=np.array([leg])) >= 0.5 for row in rows)
+        and all(
+            share_shown(search, placement, row, legs=np.array([leg])) >= MIN_VISIBLE for row in rows
+        )
     ]
     if not clear:
         return []

@@ -64,7 +64,7 @@ KEPT = (100, 30, 8, 3)  # of them, before a step with each of these tolerances
 TOLERANCES = SEARCHING[:4]  # of an axis beside its pair, cameras being rough
 FITTED = (*SEARCHING[2:], SEARCHING[-1])  # of all images together
 EQUATION_SIGMA = 0.5 * JOINT_ERROR  # of lengths and constraints by the nominal model
-TRAVEL_SIGMA = JOINT_ERROR / 1.2  # beyond the travel of a slider without a motor
+TRAVEL_SIGMA = 0.0125  # beyond the travel of a slider without a motor
 # Of the score, for squares of what the model says against a pose; larger ones count no more.
 MODEL_COST, MODEL_WIDTH = 0.01, 5.0
 CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle [rad], place as a part of the distance

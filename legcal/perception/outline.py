@@ -7,7 +7,7 @@ the limb model fitted to all outlines of the image; the verdict on each part, wi
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.occluders import PlacedOccluders
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
 from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
@@ -25,6 +26,20 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
+MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
+MIN_WIDTH = 5.0  # of a part [px]
+MAX_GUIDED_WINDOW = 0.8  # of the width, up to which a window separates both outlines
+MIN_KEPT = 0.25  # share of all unhidden blocks that must lie on the line of an outline
+MIN_CLEAR_KEPT = 0.5  # the same of an outline without its partner
+SCATTER_BLURS = 1.2  # of the blocks of an edge [blurs], where that is more than SCATTER_PX
+MAX_SIGMA = 1.0  # of an outline [px]
+STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
+MIN_STEP = 1.15  # part of the step that a saturated background must leave [px]
+# Of two outlines that are predicted well, from the predicted width: [px], standard deviations
+NEAR_WIDTH_PX, NEAR_WIDTH_SIGMAS = 0.2, 3.0
+MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
+# How far a lone outline may be from its prediction: of the window, of its partner's distance
+LONE_OFFSET, LONE_RATIO = 0.5, 0.5
 WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
 NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
@@ -46,6 +61,7 @@ class ImageSearch:
     near_fit: bool = False  # whether outlines are known to tenths of a pixel, and the blur as well
     # The legs of which arms are parts: they follow the legs, and no fit knows their widths
     arms: tuple[int, ...] = ()
+    occluders: PlacedOccluders = field(default_factory=PlacedOccluders.none)  # in its frame
 
     @property
     def n_legs(self) -> int:
@@ -156,23 +172,24 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
                 continue
             v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
             width = 0.5 * float((v[1] - v[0]).sum())
-            if width < 5.0:  # px
+            if width < MIN_WIDTH:
                 reject(leg, segment.link, Reason.NARROW, f"{width:.1f}")
             elif band.length < least_length(width):
                 reject(leg, segment.link, Reason.SHORT, f"{band.length:.0f} px in the image")
             else:
                 searched.append(_Predicted(leg, segment, band, h, v, width))
     free_parts: list[LegPart] = []
-    for predicted, front in zip(searched, _in_front(search.legs, searched), strict=True):
+    names = [*search.names, *(occluder.link for occluder in search.occluders.occluders)]
+    for predicted, front in zip(searched, _in_front(search, searched), strict=True):
         leg, segment, band, _, v, width = predicted
         hidden = np.any(front >= 0, axis=0)
         if np.mean(~hidden) * band.length < least_length(width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
-            in_front = search.names[values[np.argmax(counts)]]
+            in_front = names[values[np.argmax(counts)]]
             reject(leg, segment.link, Reason.HIDDEN, in_front)
         else:
             window = float(search.window[leg.leg])
-            guided = search.guided and window <= 0.8 * width  # which separates both outlines
+            guided = search.guided and window <= MAX_GUIDED_WINDOW * width
             free_parts.append(LegPart(leg, segment, band, v, hidden, window, guided))
     parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
@@ -236,8 +253,11 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     )
 
 
-def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> list[IntArray]:
-    """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
+def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntArray]:
+    """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free.
+
+    Other solids of the machine count on from the legs and arms.
+    """
     if not searched:
         return []
     points = []
@@ -248,9 +268,13 @@ def _in_front(legs: Sequence[PredictedLeg], searched: Sequence[_Predicted]) -> l
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
     n = [len(of_part) for of_part in points]
     own = np.repeat([part.leg.leg for part in searched], n)
-    # Within 4 px beside a leg in front, that hides others
-    margin = np.repeat([4.0 / part.band.scale for part in searched], n)
-    front = hidden_by(legs, own, np.concatenate(points), margin)
+    margin = np.repeat([MARGIN / part.band.scale for part in searched], n)
+    P_camera = np.concatenate(points)
+    front = hidden_by(search.legs, own, P_camera, margin)
+    if len(search.occluders):
+        reach = margin * np.linalg.norm(P_camera, axis=1)
+        solid = search.occluders.hide(P_camera, np.where(own < search.n_legs, own, -1), reach)
+        front = np.where(solid >= 0, len(search.names) + solid, front)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
 
@@ -330,7 +354,7 @@ def verdict(
     stands = [
         edge is not None
         and _is_clear_step(edge)
-        and bool(confirmed or (may if window is None else _off(edge, at) <= 0.5 * window))
+        and bool(confirmed or (may if window is None else _off(edge, at) <= LONE_OFFSET * window))
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
@@ -348,7 +372,7 @@ def _by_width(
     sigma_one, sigma_two = one.sigma, two.sigma
     tolerance = WIDTH_PX + WIDTH_PART * expected
     if near_fit:  # both are predicted well
-        near = 0.2 + 3.0 * math.hypot(sigma_one, sigma_two)
+        near = NEAR_WIDTH_PX + NEAR_WIDTH_SIGMAS * math.hypot(sigma_one, sigma_two)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
     if near_fit:
@@ -367,7 +391,7 @@ def _by_width(
     if (
         near_fit
         or np.any(widths >= expected)
-        or ratio > 0.75  # of an outline to the edge of a shade
+        or ratio > MAX_SIGMA_RATIO
         or not _is_clear_step(better)
     ):
         return PartVerdict((reason, reason))
@@ -384,7 +408,8 @@ def _by_place(
     """Judge two edges at a wrong distance, one of which is where an outline should be."""
     off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
     near = int(np.argmin(off))
-    if off[near] > min(0.5 * window, 0.5 * off[1 - near]) or not _is_clear_step(measured[near]):
+    most = min(LONE_OFFSET * window, LONE_RATIO * off[1 - near])
+    if off[near] > most or not _is_clear_step(measured[near]):
         return judged
     return PartVerdict((judged.reasons[0] if near else USED, USED if near else judged.reasons[1]))
 
@@ -396,16 +421,15 @@ def _off(edge: MeasuredEdge, predicted: Array) -> float:
 
 def _is_clear_step(edge: MeasuredEdge) -> bool:
     """Say whether an edge is a step of the picture on most of its length."""
-    return edge.is_step and float(np.mean(edge.line.kept)) >= 0.5
+    return edge.is_step and float(np.mean(edge.line.kept)) >= MIN_CLEAR_KEPT
 
 
 def _rejection(edge: MeasuredEdge | None, length: float, width: float) -> Rejection:
     """Return why an edge cannot be trusted whatever its partner."""
     if edge is None:
         return Rejection(Reason.FAINT)
-    # The blurred step reaches 1.5 blurs deep; a saturated background must leave a part of it
-    step = (1.5 - edge.clipped) * edge.blur
-    if step < 1.15:
+    step = (STEP_END - edge.clipped) * edge.blur
+    if step < MIN_STEP:
         return Rejection(Reason.OVEREXPOSED, f"{max(step, 0.0):.1f}")
     line = edge.line
     visible = (line.last - line.first) * length
@@ -414,13 +438,13 @@ def _rejection(edge: MeasuredEdge | None, length: float, width: float) -> Reject
     if line.inlier_share < INLIER_SHARE:
         return Rejection(Reason.NOT_STRAIGHT, f"{100 * line.inlier_share:.0f}")
     kept = float(np.mean(line.kept))
-    if kept < 0.25:  # of all unhidden blocks
+    if kept < MIN_KEPT:
         return Rejection(Reason.FAINT, f"{100 * kept:.0f}")
     if edge.contrast < CONTRAST:
         return Rejection(Reason.CONTRAST, f"{edge.contrast:.1f}")
-    if line.scatter > SCATTER_PX * max(1.0, 2.0 * edge.blur):
+    if line.scatter > max(SCATTER_PX, SCATTER_BLURS * edge.blur):
         return Rejection(Reason.ROUGH, f"{line.scatter:.2f}")
     sigma = edge.sigma
-    if sigma > 1.0:  # px
+    if sigma > MAX_SIGMA:
         return Rejection(Reason.UNCERTAIN, f"{sigma:.2f}")
     return USED

@@ -18,7 +18,7 @@ from legcal.geometry.rotations import cross_matrices, rotation_matrices
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.perception.tuning import JOINT_ERROR, WIDTH_ERROR
+from legcal.perception.tuning import WIDTH_ERROR
 from legcal.vision.visibility import visible_segments
 
 # Lengths are parts of the mean leg length of the machine.
@@ -27,7 +27,7 @@ WIDTH_PIXELS = 1.0  # and of a pair in its pixels
 MAX_WIDTH_SIGMAS = 2.5  # standard deviations
 WIDTH_BIAS_PIXELS = 0.4  # of pairs: shading ends inside an outline [px of a pair]
 TOLERANCE_PIXELS = 1.5  # added to every tolerance [px of a pair]
-LINE_ERROR, LINE_PIXELS = JOINT_ERROR / 3.0, 0.7  # of an axis beside its pair: length, [px]
+LINE_ERROR, LINE_PIXELS = 0.005, 0.7  # of an axis beside its pair: length, [px]
 ALONG_ERROR = 0.1  # of the middle of a pair that is as long as its segment, in its length
 MIN_LINE_SHARE = 1.0 / 6.0  # at least this part of the tolerance
 MIN_OVERLAP = 0.8  # share of a pair that should lie along the leg
@@ -271,7 +271,7 @@ def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
     return PairMatches(*(np.concatenate(x, axis=axis) for x in zip(*parts, strict=True)))
 
 
-def _projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
+def projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
     """Return ends X (K, n, T, 2, 3) [m], points (K, n, T, 2, 2) and widths (K, n, T, 2).
 
     Of K pictures, n poses and T segments.
@@ -308,7 +308,7 @@ def _shown(xy: Array, corners: Array) -> Array:
 
 def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match a few poses to a few pictures."""
-    X, xy, width = _projected(pictures, poses)
+    X, xy, width = projected(pictures, poses)
     front = (X[..., 0, 2] > pictures.min_depth) & (X[..., 1, 2] > pictures.min_depth)
     front &= pictures.share[:, None] > 0.0
     visible = np.where(front, _shown(xy, pictures.corners[:, None, None]), 0.0)
@@ -444,7 +444,7 @@ def segment_equations(
     which alone are accurate enough to move joints, by shifts of A and B of the leg; residuals and
     weights (K, n, T, 4).
     """
-    X, xy, width = _projected(pictures, poses)
+    X, xy, width = projected(pictures, poses)
     K, n_pairs = pictures.pairs.shape[:2]
     table = np.concatenate([pictures.pairs, _width_sigmas(pictures)[..., None]], axis=2)
     at = found.pair + (n_pairs * np.arange(K))[:, None, None]
@@ -510,7 +510,7 @@ def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Arr
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
     _, _, residual, _ = segment_equations(pictures, poses, found, 1.0)
-    X, _, _ = _projected(pictures, poses)
+    X, _, _ = projected(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 
 

@@ -31,9 +31,15 @@ MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
+OUTER_GAP, OUTER_PART = 2, 0.5  # columns between parallel lines; and what the outer one takes
+LEAST_LEFT = 1e-3  # of the score of a line
 SEPARATION = 2  # columns and differences of ends up to which a line is the same as a better one
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
-LONE_SCORE = EDGE_SCORE / 0.3  # of an edge that may stand alone
+LONE_SCORE = 0.5  # of an edge that may stand alone
+LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
+MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
+BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
 # An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
 # multiples of half a pixel: between two of these, rounding decides nothing.
 MAX_PREDICTION_ERROR = 1.25
@@ -100,7 +106,7 @@ def _pairs(parts: Sequence[LegPart], shift: Array, score: Array) -> list[EdgePai
     predicted = np.array([part.predicted for part in parts])
     i, j, together = _best_pairs(parts, predicted, shift, score)
     guided = np.array([part.guided for part in parts])
-    alone = _alone(shift, score, np.where(guided, 0.7 * LONE_SCORE, LONE_SCORE))
+    alone = _alone(shift, score, np.where(guided, LONE_SCORE_GUIDED, LONE_SCORE))
     best = score[..., 0]
     edge = np.argmax(np.where(alone, best, 0.0), axis=1)
     every = np.arange(len(parts))
@@ -144,7 +150,7 @@ def _best_pairs(
 def _alone(shift: Array, score: Array, least: Array) -> BoolArray:
     """Return whether the best line near each edge (n_parts, 2) is good enough without rivals."""
     middle = shift.sum(axis=-1)
-    other = np.abs(middle - middle[..., :1]) > 2.0 * 3.0  # px between lines that are not one
+    other = np.abs(middle - middle[..., :1]) > 2.0 * MIN_RIVAL_DISTANCE  # sums of both ends
     best = score[..., 0]
     rivalled = np.any(other & (score > RIVAL * best[..., None]), axis=-1)
     return np.asarray((best >= least[:, None]) & (best > 0.0) & ~rivalled)
@@ -230,10 +236,10 @@ def _sharpness(profiles: Samples, seen: BoolArray, n_blocks: IntArray) -> Sample
     peak = np.where(gradient >= wide, gradient, np.float32(0.0)) ** 2
     bounds = np.concatenate([[0], np.cumsum(n_blocks)]).tolist()
     typical = np.array([_median(gradient[i:j], seen[i:j]) for i, j in pairwise(bounds)])
-    level = np.repeat((4.0 * typical) ** 2 + 1e-3, n_blocks).astype(np.float32)
+    level = np.repeat((NOISE_LEVELS * typical) ** 2 + 1e-3, n_blocks).astype(np.float32)
     sharpness = peak / (peak + level[:, None])
     widened = np.asarray(cv2.dilate(sharpness, beside), dtype=np.float32)
-    return np.asarray(np.maximum(sharpness, np.float32(0.8) * widened), dtype=np.float32)
+    return np.asarray(np.maximum(sharpness, np.float32(BESIDE_WEIGHT) * widened), dtype=np.float32)
 
 
 def _median(values: Samples, seen: BoolArray) -> float:
@@ -263,6 +269,7 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
             rows = np.concatenate([np.arange(first[e], first[e] + n_blocks[e]) for e in own])
             of_own = votes[rows, most - half : most + half + 1]
             score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
+    _mark_down_inner(score)
     flat, every = score.reshape(n, -1), np.arange(n)
     around = np.arange(-SEPARATION, SEPARATION + 1)
     around = (around[:, None] * side + around).ravel()
@@ -275,6 +282,23 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
     change, place = 0.5 * (tilt - middle), place - middle
     shifts = np.stack([place - change, place + change], axis=-1)
     return np.where(best.T[..., None] > 0.0, shifts, 0.0), best.T
+
+
+def _mark_down_inner(score: Samples) -> None:
+    """Take from scores (n_patches, tilts, middles) of lines what parallel ones further out have.
+
+    A rod reflects the room in stripes along it, and nothing behind it runs along it for long: of
+    several parallel lines the outermost is the limb. Patches alternate between edges 1 and 2.
+    """
+    wide = score.copy()
+    np.maximum(wide[:, 1:], score[:, :-1], out=wide[:, 1:])
+    np.maximum(wide[:, :-1], score[:, 1:], out=wide[:, :-1])
+    for first, outwards in ((0, 1), (1, -1)):  # edge 1 is outermost where places are least
+        of_edge, lines = score[first::2, :, ::outwards], wide[first::2, :, ::outwards]
+        further_out = np.maximum.accumulate(lines, axis=2)[:, :, :-OUTER_GAP]
+        inner = of_edge[:, :, OUTER_GAP:]
+        left = np.maximum(inner - OUTER_PART * further_out, LEAST_LEFT * inner)
+        of_edge[:, :, OUTER_GAP:] = left
 
 
 def _added(votes: Samples, n_blocks: IntArray, halves: IntArray, half: int) -> Samples:

@@ -26,7 +26,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.model import Machine, vectors_at
 from legcal.machine.rods import joints_at, measured_readings
-from legcal.perception.candidate_pairs import CandidatePairs
+from legcal.perception.candidate_pairs import CandidatePairs, still_picture
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     find_wrong_images,
@@ -35,6 +35,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
+from legcal.perception.light import reduce
 from legcal.perception.outline import Method, measure, measure_in_brief
 from legcal.perception.placement import (
     Joined,
@@ -50,6 +51,7 @@ from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.image_file import Grey
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
@@ -84,6 +86,7 @@ class Photographs:
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
+    still: dict[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -122,6 +125,8 @@ class Photographs:
             self.machine.size,
             {} if pairs is None else pairs,
             {} if blur is None else blur,
+            self.machine.occluders,
+            self.still,
         )
 
     def with_found(self, found: Outlines) -> Outlines:
@@ -506,16 +511,36 @@ def _inspect_images(
     groups = group_views(measurements, photographs.detect, hints, joined)
     free = not photographs.machine.is_determined
     first = {r for g in groups for r in (g.rows if g.hint is None or free else g.some)}
-    exposures, pairs = dict[int, Exposure](), dict[int, CandidatePairs]()
+    exposures, small = dict[int, Exposure](), dict[int, Grey]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
         if own is not None:
-            pairs[row] = own
+            small[row] = own
         count(row)
     defects = defects_of(measurements, exposures)
+    photographs.still.update(_still_pictures(measurements, small, defects))
+    pairs_of = partial(_pairs_of_reduced, photographs.search(nominal))
+    pairs = dict(zip(small, photographs.run(pairs_of, list(small.items())), strict=True))
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
+
+
+def _still_pictures(
+    measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
+) -> dict[int, Grey]:
+    """Return what stands still in the reduced pictures of each view whose camera does."""
+    of_view: dict[int, list[Grey]] = {}
+    for row, picture in small.items():
+        if row not in defects:
+            of_view.setdefault(int(measurements.view[row]), []).append(picture)
+    still = {view: still_picture(pictures) for view, pictures in of_view.items()}
+    return {view: picture for view, picture in still.items() if picture is not None}
+
+
+def _pairs_of_reduced(search: Search, reduced: tuple[int, Grey]) -> CandidatePairs:
+    """Return the candidate pairs of an image by its row and the reduced image."""
+    return search.pairs_of_reduced(*reduced)
 
 
 def defects_of(
@@ -528,14 +553,11 @@ def defects_of(
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 
 
-def _inspect(
-    search: Search, rows: Collection[int], row: int
-) -> tuple[Exposure, CandidatePairs | None]:
-    """Return how an image was exposed, and its candidate pairs if it is one of rows."""
+def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Grey | None]:
+    """Return how an image was exposed, and reduced if it is one of rows."""
     image = search.load(row)
-    view = int(search.measurements.view[row])
-    pairs = replace(search, load=lambda _: image).pairs(row, view) if row in rows else None
-    return measure_exposure(image), pairs
+    factor = search.reduction(int(search.measurements.view[row]))
+    return measure_exposure(image), reduce(image, factor) if row in rows else None
 
 
 def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]:

@@ -12,6 +12,7 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.image_causes import by_cause, image_notes
@@ -19,11 +20,21 @@ from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
+from legcal.machine.occluders import LegHalf, Occluder
 from legcal.machine.rods import arms_at
-from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
+from legcal.perception.candidate_pairs import (
+    CandidatePairs,
+    find_candidate_pairs,
+    find_segments,
+    moving_pixels,
+    reduction,
+    segments_of_reduced,
+)
+from legcal.perception.edge_maps import EdgeMaps
+from legcal.perception.light import reduce
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
-from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
+from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -32,7 +43,9 @@ Load = Callable[[int], Grey]  # the image of a row
 Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
 
 # Of joint centres that the nominal model and its platform pose predict, of the mean leg length
-PREDICTED_JOINT_ERROR = JOINT_ERROR / 1.5
+PREDICTED_JOINT_ERROR = 0.01
+# Of solids around legs by which these are recognised: distance of their axes, length [radii]
+HOUSING_OFF, HOUSING_LENGTH = 0.4, 4.0
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 
@@ -50,6 +63,8 @@ class Search:
     size: float  # mean leg length of the machine [m]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
+    occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
+    still: Mapping[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
     def n_legs(self) -> int:
@@ -67,8 +82,33 @@ class Search:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
-        camera = self.measurements.views[view].camera
-        return find_candidate_pairs(find_segments(self.load(row), camera))
+        camera, still = self.measurements.views[view].camera, self.still.get(view)
+        factor = self.reduction(view)
+        return find_candidate_pairs(find_segments(self.load(row), camera, factor, still))
+
+    def reduction(self, view: int) -> int:
+        """Return the factor by which the pictures of a view are reduced."""
+        thinnest = min((c.radius for one in self.cylinders for c in one), default=self.size)
+        return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
+
+    def edge_maps(self, rows: Sequence[int]) -> EdgeMaps:
+        """Return where the images of rows show edges of each direction, if these move."""
+        views = [int(self.measurements.view[row]) for row in rows]
+        factors = [self.reduction(view) for view in views]
+        cameras = [self.measurements.views[view].camera for view in views]
+        small = [reduce(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
+        moving = [
+            moving_pixels(picture, self.still[view]) if view in self.still else None
+            for picture, view in zip(small, views, strict=True)
+        ]
+        return EdgeMaps.of(small, moving, cameras, factors)
+
+    def pairs_of_reduced(self, row: int, small: Grey) -> CandidatePairs:
+        """Return the edge pairs of an image that has been reduced."""
+        view = int(self.measurements.view[row])
+        camera, factor = self.measurements.views[view].camera, self.reduction(view)
+        segments = segments_of_reduced(small, camera, factor, self.still.get(view))
+        return find_candidate_pairs(segments)
 
     def own_pairs(self, row: int) -> CandidatePairs:
         """Return the edge pairs of an image."""
@@ -77,11 +117,41 @@ class Search:
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""
         legs = np.flatnonzero(self.wanted[view])
-        return leg_segments(self.A_base[row], self.B_base[row], self.cylinders, legs)
+        parts = self.cylinders
+        if self.occluders:
+            parts = [
+                (*own, *housings)
+                for own, housings in zip(
+                    parts, housings_of_legs(self.occluders, len(parts)), strict=True
+                )
+            ]
+        return leg_segments(self.A_base[row], self.B_base[row], parts, legs)
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
         """Return what an image shows with what it should show by other cylinders."""
         return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
+
+
+def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
+    """Return long solids around the axis of each leg as cylinders that look as thick.
+
+    A convex solid is as wide as its circumference over pi, in the mean of all directions from
+    which it is seen; a square one differs from that by up to 21 %.
+    """
+    found: list[list[Cylinder]] = [[] for _ in range(n_legs)]
+    for occluder in occluders:
+        half = occluder.carrier
+        if not isinstance(half, LegHalf):
+            continue
+        across, along = occluder.corners[:, :2], occluder.corners[:, 2]
+        start, end = float(along.min()), float(along.max())
+        hull = across[ConvexHull(across).vertices]
+        around = float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
+        radius = around / (2.0 * np.pi)
+        off = float(np.linalg.norm(hull.mean(axis=0)))
+        if off <= HOUSING_OFF * radius and end - start >= HOUSING_LENGTH * radius:
+            found[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
+    return found
 
 
 def sensor_extent(camera: Camera) -> Array:

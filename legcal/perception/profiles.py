@@ -86,7 +86,8 @@ def read_profiles(
     centre, tangent = nodes.at(rows, nodes.offset), nodes.at(rows, nodes.slope)
     cosine = 1.0 / np.sqrt(1.0 + tangent**2)
     across = nodes.at(rows, nodes.across)
-    outside, inside_of = depths[0] + 0.5 * TAPER, depths[1][rows.edge] + 0.5 * TAPER
+    inner = depths[1][rows.edge]
+    outside, inside_of = depths[0] + 0.5 * TAPER, inner + 0.5 * TAPER
     first = np.ceil(centre - np.where(across > 0.0, outside, inside_of) / cosine)
     n_columns = int(np.max((outside + inside_of) / cosine, initial=0.0)) + 1
     columns = first[:, None] + np.arange(n_columns)
@@ -96,7 +97,7 @@ def read_profiles(
     along = rows.along[:, None]
     n_columns_there, n_rows_there = np.where(flat, height, width), np.where(flat, width, height)
     inside = (columns >= 0) & (columns < n_columns_there) & (along >= 0) & (along < n_rows_there)
-    window = fading(np.minimum(d + outside, inside_of[:, None] - d)) * inside
+    window = np.minimum(fading(-d, depths[0]), fading(d, inner[:, None])) * inside
     inside = window > 0.0
     row = np.clip(along, 0, n_rows_there - 1) * np.where(flat, 1, width)
     column = np.clip(columns, 0, n_columns_there - 1) * np.where(flat, width, 1)
@@ -118,9 +119,13 @@ def read_profiles(
     )
 
 
-def fading(within: NDArray[Any]) -> NDArray[Any]:
-    """Return how much pixels count that are so far within the range that is used [px]."""
-    return np.asarray(np.clip(within / TAPER, 0.0, 1.0), dtype=within.dtype)
+def fading(depth: NDArray[Any], end: NDArray[Any] | float) -> NDArray[Any]:
+    """Return how much pixels count at depths, where the range that is used ends at ``end`` [px].
+
+    From 1 to 0 within TAPER, half of it to either side of the end.
+    """
+    within = end + 0.5 * TAPER - depth
+    return np.asarray(np.clip(within / TAPER, 0.0, 1.0), dtype=depth.dtype)
 
 
 class _Rows(NamedTuple):

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -21,11 +22,13 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Cylinder, with_radii
 from legcal.perception.camera_search import (
+    SOME_PICTURES,
     START_PICTURES,
     PoseCandidates,
     is_mirrored,
     may_be_mirrored,
     mirrored,
+    place_by_edges,
     place_camera,
     place_near,
     with_first,
@@ -47,15 +50,18 @@ from legcal.workers import Run, in_turn
 
 MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
+MIRRORED_EDGES = 1.06  # legs along edges of mirrored pictures, in those of the pictures
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
-MIN_ERROR = JOINT_ERROR / 3.75  # of the joint centres of a leg that a view shows
+# Of the joint centres of a leg that a view shows: at least, besides standard deviations
+MIN_ERROR, ERROR_SIGMAS = 0.004, 2.5
+POSE_JOINT_ERROR = 0.0075  # of the legs as a pose has them
 
 N_POSES, N_REFINED = 4, 3  # at which outlines are measured, and at the best missing legs sought
-MARGIN = 3.0  # of the evidence for a pose over the least
+MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of a single image
 # Of the evidence for a pose to that for any other one: where edge pairs are convincing by
 # themselves, of a single image, and from which on no margin is needed.
-RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = (EVIDENCE_RATIO / 1.6 * x for x in (1.5, 2.5, 4.0))
+RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
 
@@ -92,6 +98,11 @@ def place_views(
     for k, of_group, one in zip(unclear, of_groups, anywhere, strict=True):
         hint = groups[k].hint
         found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
+    # Views that pairs do not place, by all edges along legs.
+    left = [k for k in unclear if (one := found[k]) is None or not one.is_convincing]
+    of_left = [_ByEdges(groups[k], pictures, found[k]) for k in left]
+    for k, one in zip(left, run(partial(_by_edges, search), of_left), strict=True):
+        found[k] = one
     placed = [one for one in found if one is not None]
     return PlacedViews(search, hints, groups, pictures, placed)
 
@@ -212,6 +223,30 @@ def _pictures(
     return found
 
 
+class _ByEdges(NamedTuple):
+    """A group that is placed by all edges along legs."""
+
+    group: Group
+    pictures: Mapping[int, Picture]  # by row
+    by_pairs: PoseCandidates | None  # where pairs have it
+    is_mirrored: bool = False  # whether left and right are exchanged
+
+
+def _by_edges(search: Search, task: _ByEdges) -> PoseCandidates:
+    """Return the camera of a group by all edges along legs in a few of its pictures."""
+    group, pictures, by_pairs, is_mirrored = task
+    merit = {row: float(pictures[row].pairs.merit[:8].sum()) for row in group.rows}
+    rows = sorted(group.rows, key=lambda row: -merit[row])[:SOME_PICTURES]
+    known = CameraPoses.none(search.n_legs)
+    if by_pairs is not None and len(by_pairs.poses):
+        known = CameraPoses.rigid(by_pairs.poses.R, by_pairs.poses.t, search.n_legs)
+    maps, some = search.edge_maps(rows), group.pictures(pictures, rows)
+    if is_mirrored:
+        maps = maps.mirrored(np.array([one.corners[:, 0].mean() for one in some]))
+        some = mirrored(some)
+    return place_by_edges(some, maps, search.n_legs, known)
+
+
 def _anywhere(
     groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], run: Run
 ) -> list[PoseCandidates]:
@@ -302,7 +337,7 @@ def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int
     T: list[RigidTransform | None] = [None] * n_views
     for v in group.views:
         T[v] = candidates.pose(i) * group.T_group_camera[v]
-    placement = Placement(search.A_base, search.B_base, tuple(T), 0.5 * JOINT_ERROR)
+    placement = Placement(search.A_base, search.B_base, tuple(T), POSE_JOINT_ERROR)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
@@ -324,7 +359,7 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
     alone = len(group.rows) == 1
-    margin, ratio = (2.0 * MARGIN, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
+    margin, ratio = (MARGIN_ALONE, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
@@ -373,6 +408,12 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
         flipped.append(mirrored(found.of_group(g, groups[g].some if few else None)))
     mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
     exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(placed[g], m)}
+    # Pairs say little of views that are placed by other edges.
+    doubted = [g for g in sorted(exchanged) if placed[g].along_edges and placed[g].is_convincing]
+    others = [_ByEdges(groups[g], found.pictures, None, is_mirrored=True) for g in doubted]
+    for g, other in zip(doubted, run(partial(_by_edges, search), others), strict=True):
+        if other.along_edges < MIRRORED_EDGES * placed[g].along_edges:
+            exchanged.remove(g)
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         names = [views[v].name for v in group.views]
         if g in exchanged or not one.is_convincing:
@@ -385,7 +426,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
         for v in group.views:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + 2.5 * one.leg_error, JOINT_ERROR)
+            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, JOINT_ERROR)
     placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 

@@ -43,25 +43,28 @@ from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
-from legcal.perception.tuning import (
-    EVIDENCE,
-    JOINT_ERROR,
-    OUTLIER_SIGMAS,
-    OUTLINE_SIGMA_PX,
-    WINDOW_PX,
-)
+from legcal.perception.tuning import EVIDENCE, JOINT_ERROR, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
 # Lengths are parts of the mean leg length.
-IMAGE_SIGMA = JOINT_ERROR / 3.0  # of the platform joints in an image besides, at first
-# Between which legs and images may show that and the errors of joints in all images
-JOINT_SIGMA_BOUNDS, IMAGE_SIGMA_BOUNDS = ((least, 2.0 * JOINT_ERROR) for least in (0.0038, 0.0018))
+JOINT_SIGMA_BOUNDS = 0.0038, 0.03  # of joint centres in all images, as legs may show them
+IMAGE_SIGMA = 0.005  # of the platform joints in an image besides, at first
+IMAGE_SIGMA_BOUNDS = 0.0018, 0.03  # between which images may show it
 TURN_SIGMA, DISTANCE_SIGMA = 0.3, 0.15  # prior of the pose: angle, displacement by its distance
 MAX_TURN, MAX_DISPLACEMENT = 0.2, 0.1  # of a step: angle, part of the distance
 ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas are estimated
 OUTLINE_EVIDENCE, MAX_OUTLINES = 2.0, 4  # of an outline, half a square; of a leg in an image
+EVIDENCE_OF_IMAGE = 0.15  # of EVIDENCE, for each image: more of them agree more by chance
+WEAK = 0.7  # part of the least evidence without which a view that edge pairs placed is none
+SHIFT_COST = 0.25  # of a squared shift [standard deviations^-2]: half, as some are the pose's
+GOOD_FIT = 0.85  # part of the evidence that outlines can give at most
+CAUCHY_WIDTH = 2.0  # from which on a leg of an image counts less [standard deviations]
+# Of the joints of a leg, and of one of which only single outlines were found: it may be another
+MAX_SHIFT, MAX_LONE_SHIFT = 4.0, 2.5  # [standard deviations]
+MAX_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
+NEAR_PX, NEAR_SIGMAS, MAX_NEAR_PX = 2.0, 3.0, 40.0  # where missing outlines are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,7 @@ class ViewFit:
     def is_good(self) -> bool:
         """Whether nearly all outlines agree with the fit as well as they can."""
         most = OUTLINE_EVIDENCE * np.minimum(self.n_outlines, MAX_OUTLINES).sum()
-        return self.evidence >= 0.85 * float(most)
+        return self.evidence >= GOOD_FIT * float(most)
 
     @property
     def outliers(self) -> BoolArray:
@@ -95,8 +98,7 @@ class ViewFit:
         shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
         alone = np.ones(len(self.shift), dtype=np.bool_)
         alone[self.leg[self.n_outlines > 1]] = False
-        # A leg of which only single outlines were found may be another one
-        far = shift > np.where(alone, OUTLIER_SIGMAS / 1.4, OUTLIER_SIGMAS / 0.875)
+        far = shift > np.where(alone, MAX_LONE_SHIFT, MAX_SHIFT)
         return np.asarray((self.distance > OUTLIER_SIGMAS) | far[self.leg])
 
     def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
@@ -107,8 +109,8 @@ class ViewFit:
 
     @property
     def is_determined(self) -> bool:
-        """Whether outlines determine the pose, to 10 degrees: else legs may be others."""
-        return bool(self.turn_sigma <= np.deg2rad(10.0))
+        """Whether the outlines determine the pose: else legs may be others."""
+        return bool(self.turn_sigma <= MAX_TURN_SIGMA)
 
     @property
     def turn_sigma(self) -> float:
@@ -163,7 +165,7 @@ def fit_view(
             linear = linearize(problem, state)
             rows = linear["outlines"]
             square, offset_square = _squared_distances(lines, rows, state.offset, image_sigma)
-            weight = 1.0 / (1.0 + square / (lines.size * 2.0**2))  # Cauchy
+            weight = 1.0 / (1.0 + square / (lines.size * CAUCHY_WIDTH**2))
             if iteration >= FIXED_ITERATIONS:  # most legs and images are alike
                 variance = np.diag(normal.kept_covariance())[6:].reshape(state.shift.shape)
                 of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
@@ -308,13 +310,12 @@ def _evidence(
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
     joint = max(JOINT_ERROR * size, joint_sigma)
-    # Half of half a square: some shifts are those of the pose
-    return float(of_legs - 0.25 * np.sum(state.shift**2) / joint**2)
+    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
 
 
 def min_evidence(group: Group) -> float:
     """Return how much evidence outlines must give: more images agree more by chance."""
-    return EVIDENCE * (1.0 + 0.15 * len(group.rows))
+    return EVIDENCE * (1.0 + EVIDENCE_OF_IMAGE * len(group.rows))
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
@@ -586,7 +587,7 @@ def _without_weak_views(
     """Return cameras without those for which hardly an outline speaks, near no rough pose."""
     T, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for group, fit in zip(groups, fits, strict=True):
-        least = 0.7 * min_evidence(group)
+        least = WEAK * min_evidence(group)
         is_sure = fit is not None and fit.is_determined and fit.evidence >= least
         if group.hint is not None or T[group.views[0]] is None or is_sure:
             continue
@@ -619,7 +620,7 @@ def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outl
     for group, fit in zip(groups, fits, strict=True):
         if fit is not None and missing[group.rows].any():
             sigma = sideways_sigmas(search, group, fit)[group.rows]
-            near = np.minimum(WINDOW_PX / 1.5 + 3.0 * sigma, 40.0)
+            near = np.minimum(NEAR_PX + NEAR_SIGMAS * sigma, MAX_NEAR_PX)
             window[group.rows] = np.where(missing[group.rows], near, np.nan)
     return window
 

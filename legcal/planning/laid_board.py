@@ -80,6 +80,9 @@ class LaidBoard:
         hidden = (square < aside**2) & (depth > 0.0) & (depth < distance[..., None])
         B = bodies.B[:, : bodies.n_legs]
         hidden = hidden.any(axis=-1) | behind_plate(P[:, None], B, 0.0, surely=False)[:, 0]
+        nobody, beside = np.full(len(points), -1), np.full(len(points), self.board.side)
+        for k, placed in enumerate(bodies.occluders):
+            hidden[k] |= placed.hide(P[k], nobody, beside) >= 0
         return ~np.asarray(hidden.any(axis=1))
 
     def _narrowest(self, px: Array) -> float:

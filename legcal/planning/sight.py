@@ -1,9 +1,9 @@
 """Visibility prediction: the visible segment of every part of legs and arms in an image.
 
 A segment is visible if it is in the picture with a margin, in front of the camera, and not behind
-another leg or arm or a plate. The joints of base and platform span plates; joints on carriages and
-arms do not. Points of the axes are tested along rays, for many poses at once; outlines follow from
-eqs (3) and (5).
+another leg or arm, another solid of the model or a plate. The joints of base and platform span
+plates; joints on carriages and arms do not. Points of the axes are tested along rays, for many
+poses at once; outlines follow from eqs (3) and (5).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.model import Machine
+from legcal.machine.occluders import PlacedOccluders
 from legcal.machine.rods import ends_in_base, readings_of_rods
 from legcal.perception.placement import placed_arms
 from legcal.vision.camera import Camera
@@ -52,6 +53,7 @@ class Bodies:
     leg: IntArray  # (n,) of an arm the leg that has it as a part
     is_moved: BoolArray  # (n_legs,) whether a motor moves A
     size: float  # mean leg length of the machine [m]
+    occluders: Sequence[PlacedOccluders]  # what else hides, in each image
 
     @property
     def n_legs(self) -> int:
@@ -73,13 +75,15 @@ class Bodies:
             np.array([*range(len(legs)), *arms], dtype=np.intp),
             np.array([leg.actuator is not None for leg in legs], dtype=np.bool_),
             machine.size,
+            PlacedOccluders.at(machine.occluders, A, B) if machine.occluders else (),
         )
 
     def before(self, T_base_camera: RigidTransform) -> Bodies:
         """Transform to the frame of a camera."""
         T = T_base_camera.as_matrix()
         A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in (self.A, self.B))
-        return replace(self, A=A, B=B)
+        occluders = [placed.before(T) for placed in self.occluders]
+        return replace(self, A=A, B=B, occluders=occluders)
 
     @property
     def nearest(self) -> float:
@@ -170,6 +174,12 @@ def what_is_seen(
     largest_radius = np.zeros(len(bodies.leg))
     np.maximum.at(largest_radius, body, radius)
     is_visible &= ~_behind_others(P, body, radius, A, u, length, largest_radius)
+    own, beside = (
+        np.repeat(x, N_SAMPLES) for x in (np.where(body < bodies.n_legs, body, -1), radius)
+    )
+    for k, placed in enumerate(bodies.occluders):
+        hides = placed.hide(P[k].reshape(-1, 3), own, beside) >= 0
+        is_visible[k] &= ~hides.reshape(is_visible.shape[1:])
     thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
     is_visible &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)
     is_visible &= ~behind_plate(P, bodies.B[:, :n], thick)

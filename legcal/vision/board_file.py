@@ -337,7 +337,7 @@ def board_of(spec: str | Path | Board) -> Board:
     try:
         return parse_board({"kind": kind, **found}, Path(_OPTION)).board
     except DatasetError as error:
-        raise UsageError(error.problems) from error
+        raise UsageError(error.facts) from error
 
 
 def _chessboard(spec: str, x: int, y: int, words: list[str]) -> Board:

@@ -17,7 +17,7 @@ from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from legcal.errors import DatasetError
+from legcal.errors import BadValue, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
@@ -88,15 +88,14 @@ _BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
 _AGAIN = "copy it again or remove the row"
 _LEVELS = "8 or 16 bit grey levels or colours"
+NOWHERE = Place()
 
 
-class BadImage(ValueError):
-    """What is wrong with the bytes of an image file: found and needed, as parts of a sentence."""
+class BadImage(BadValue):
+    """What is wrong with the bytes of an image file."""
 
     def __init__(self, found: str, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
-        super().__init__(found)
-        self.needed = needed
-        self.remedy = remedy
+        super().__init__(found, needed, remedy)
 
 
 @dataclass(frozen=True)
@@ -107,14 +106,14 @@ class ImageSize:
     height: int
 
 
-def read_image(path: Path, camera: Camera, where: str = "") -> Grey:
+def read_image(path: Path, camera: Camera) -> Grey:
     """Read an image of 8 or 16 bits, grey or in colour, as grey levels."""
-    return np.asarray(decode_image(path, camera, where), dtype=np.float32)
+    return np.asarray(decode_image(path, camera), dtype=np.float32)
 
 
-def decode_image(path: Path, camera: Camera, where: str = "") -> NDArray[np.uint8] | Grey:
+def decode_image(path: Path, camera: Camera, named: Place = NOWHERE) -> NDArray[np.uint8] | Grey:
     """Read an image as grey levels: those of 8 bits as they are, which takes the least memory."""
-    content, problem = _complete_content(path, camera, where)
+    content, problem = _complete_content(path, camera, named)
     if problem:
         raise DatasetError(problem)
     pixels: NDArray[np.generic] | None
@@ -128,7 +127,7 @@ def decode_image(path: Path, camera: Camera, where: str = "") -> NDArray[np.uint
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
-        raise DatasetError(_problem(path, where, found, _LEVELS))
+        raise DatasetError(_problem(path, named, found, _LEVELS))
     if pixels.dtype == np.uint8 and pixels.ndim == 2:
         return np.asarray(pixels, dtype=np.uint8)
     scale = 255.0 / (2 ** _depth(pixels) - 1) if pixels.dtype == np.uint16 else 1.0
@@ -154,12 +153,14 @@ def _depth(pixels: NDArray[np.generic]) -> int:
     return _FULL if is_moved or used >= 2**_DEEP else _DEEP
 
 
-def inspect_image(path: Path, camera: Camera, where: str = "") -> tuple[ImageFacts, str | None]:
+def inspect_image(
+    path: Path, camera: Camera, named: Place = NOWHERE
+) -> tuple[ImageFacts, Problem | None]:
     """Return what an image file says of itself, and what keeps it from being used, if anything.
 
     The pixels are not decoded.
     """
-    content, problem = _complete_content(path, camera, where)
+    content, problem = _complete_content(path, camera, named)
     return read_facts(content), problem
 
 
@@ -280,23 +281,23 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
     return f" ({', '.join(causes)})" if causes else ""
 
 
-def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
+def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, Problem | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
     if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
-        return b"", _problem(path, where, found, _COMPLETE, "correct the path or remove the row")
+        return b"", _problem(path, named, found, _COMPLETE, "correct the path or remove the row")
     try:
         content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
     except OSError as error:
-        return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
+        return b"", _problem(path, named, f"'{error.strerror}'", "a readable file")
     except BadImage as error:
-        return b"", _problem(path, where, str(error), error.needed, error.remedy)
+        return b"", _problem(path, named, error.found, error.needed, error.remedy)
     needed = ImageSize(camera.width, camera.height)
     if size != needed:
         return b"", _problem(
             path,
-            where,
+            named,
             f"{size.width} x {size.height} px{likely_cause(size, needed, read_facts(content))}",
             f"{camera.width} x {camera.height} px as in its camera file",
             "use the original image, neither scaled, cropped nor rotated, or the calibration of "
@@ -305,10 +306,10 @@ def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, st
     return content, None
 
 
-def _problem(path: Path, where: str, found: str, needed: str, remedy: str = _AGAIN) -> str:
-    """Return the sentence for an image that cannot be used."""
-    prefix = f"{where}: " if where else ""
-    return f"{prefix}image {path} could not be read: found {found}, needed {needed}; {remedy}."
+def _problem(path: Path, named: Place, found: str, needed: str, remedy: str = _AGAIN) -> Problem:
+    """Return why an image cannot be used."""
+    what = f"image {path} could not be read"
+    return Problem(what, found, needed, remedy, named.file, named.row, name=str(path))
 
 
 def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:

@@ -47,14 +47,19 @@ def visible_segments(
     for link, radius, start, end in parts:
         cover = END_COVER * radius
         stretches = [(max(start, cover), min(end, length - cover))]
-        for _, thicker, first, last in parts:
-            if thicker > radius:
-                gap = END_COVER * thicker
-                stretches = [
-                    stretch
-                    for low, high in stretches
-                    for stretch in ((low, min(high, first - gap)), (max(low, last + gap), high))
-                ]
+        hiding = [
+            (END_COVER * thicker, first, last)
+            for _, thicker, first, last in parts
+            if thicker > radius
+        ]
+        inside = {c for one in cylinders if look_alike(one.radius, radius) for c in one.covers}
+        hiding += [(cover, *solid.span(length)) for solid in inside]
+        for gap, first, last in hiding:
+            stretches = [
+                stretch
+                for low, high in stretches
+                for stretch in ((low, min(high, first - gap)), (max(low, last + gap), high))
+            ]
         low, high = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
         if high > low and look_alike(radius, main[link].radius):
             segments.append(Segment(link, radius, low, high))

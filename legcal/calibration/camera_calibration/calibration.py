@@ -410,7 +410,7 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
         except OSError as error:
             found, needed = f"'{error.strerror}'", "a readable file"
         except BadImage as error:
-            found, needed = str(error), error.needed
+            found, needed = error.found, error.needed
         problems.append(
             f"{path}: the image could not be read: found {found}, needed {needed}; copy it again "
             "or leave it out."

@@ -26,7 +26,7 @@ from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.covariances import whitener
@@ -129,8 +129,13 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     if "angle_sigma" in table:
         if "qx" not in table:
             table.refuse_file(
-                f"{path}, header: the columns could not be used: found angle_sigma and no "
-                "quaternions, needed qx, qy, qz, qw beside it; add the columns."
+                Problem(
+                    "the columns could not be used",
+                    "angle_sigma and no quaternions",
+                    "qx, qy, qz, qw beside it",
+                    "add the columns",
+                    f"{path}, header",
+                )
             )
         table.need(["angle_sigma"], oriented)
     joints = [column.name for column in reading_columns(machine.legs)]
@@ -183,8 +188,8 @@ def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
     for i in np.flatnonzero(error > QUATERNION_TOLERANCE).tolist():
         hint = "; these look like angles in degrees" if norms[i] > 2.0 else ""
         found = f"a quaternion of norm {norms[i]:.6g}"
-        needed = f"1 within {QUATERNION_TOLERANCE:g}{hint}; check its four numbers"
-        table.refuse(i, found, needed, *_QUATERNION, what="orientation")
+        needed, remedy = f"1 within {QUATERNION_TOLERANCE:g}{hint}", "check its four numbers"
+        table.refuse(i, found, needed, *_QUATERNION, remedy=remedy, what="orientation")
     oriented = error <= QUATERNION_TOLERANCE
     if np.any(oriented):
         rotation[oriented] = Rotation.from_quat(quaternions[oriented]).as_matrix()
@@ -301,7 +306,7 @@ def tool_measurements(
     try:
         T = forward_kinematics_many(machine, poses.q)
     except (DidNotConverge, UsageError) as error:
-        raise type(error)([f"{name}: {problem}" for problem in error.problems]) from error
+        raise error.told(lambda problem: _of_table(problem, name)) from error
     matrices = np.array([pose.as_matrix() for pose in T])
     pairs = PosePairs(
         R=matrices[:, :3, :3],
@@ -395,6 +400,12 @@ def motions_by_readings(
         axis=2,
     )
     return _of_link(machine, poses, moved)
+
+
+def _of_table(problem: Problem, name: str) -> Problem:
+    """Return what is wrong with the poses of a table at a machine, which may name its file."""
+    what = f"{problem.file}: {problem.what}" if problem.file else problem.what
+    return replace(problem, what=what, file=name)
 
 
 def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Array | None:

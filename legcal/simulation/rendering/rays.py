@@ -21,7 +21,7 @@ Faces = NDArray[np.integer[Any]]
 _TILE = 64  # pixels after which the shifts of the lattice repeat
 _SPACING = 8  # [px] between the pixels at which distortion is undone
 
-LATERAL, CAP = 0, 1  # faces of a cylinder
+CAP = 1  # the face of a cylinder; 0 is its lateral surface
 _TINY = 1e-12
 
 NEAR = 1e-4  # [m] in front of the camera

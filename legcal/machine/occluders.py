@@ -1,0 +1,423 @@
+"""What of a model hides without being measured: boxes, spheres, cylinders off the axes of legs.
+
+Housings and motors of legs, carriages, brackets, towers: each is a convex solid on what carries it.
+Where the joints A and B of the legs are says where carriers are; a leg's own solids turn about it
+as its joint at one end has them. Where a leg may turn about itself, what they sweep stands for
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
+from legcal.geometry.rotations import nearest_rotation
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.bodies import Bodies
+from legcal.machine.cylinders import Half, VisualCylinder, halves_of_leg, is_measured
+from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
+from legcal.machine.urdf import Urdf, number_list, origins_of, parse_robot
+
+SIDES = 24  # of the prism around what is round
+THICKER = 1.01  # radii of a cylinder that what hides it reaches beyond, at least
+ALONG = 1e-6  # sine of the angle to a leg below which a revolute only turns the leg about itself
+EMPTY = 1e-9  # depth of a body [m] that is not worth a look
+
+_HELD = 1e3  # weight of directions that a carrier keeps, over that of joints that are off
+
+
+def _none() -> Array:
+    """Return no points (0, 3)."""
+    return np.zeros((0, 3))
+
+
+class VisualSolid(NamedTuple):
+    """A visual of the file as the corners of a convex solid."""
+
+    link: str
+    corners: Array  # (m, 3) in the link [m]
+    cylinder: VisualCylinder | None = None  # where it is one
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """A rigid body that the joints of some legs place: base, platform, carriage or arm."""
+
+    side: Literal["base", "platform"] = "base"  # whether joints A are on it or joints B
+    legs: tuple[int, ...] = ()  # without any it is the base itself
+    points: Array = field(default_factory=_none)  # (n, 3) those joints in its own frame [m]
+    fixed: Array = field(default_factory=_none)  # (m, 3) points that stay where they are [m]
+    # (k, 3) directions in its frame, and where they point in the base link whatever it does
+    held: Array = field(default_factory=_none)
+    towards: Array = field(default_factory=_none)
+
+    def poses(self, A: Array, B: Array) -> tuple[Array, Array]:
+        """Return R (k, 3, 3) and t (k, 3) [m] from it to the base link, by joints there."""
+        n = len(A)
+        if not self.legs:
+            return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+        joints = (A if self.side == "base" else B)[:, list(self.legs)]
+        there = np.concatenate([joints, np.broadcast_to(self.fixed, (n, *self.fixed.shape))], 1)
+        here = np.concatenate([self.points, self.fixed])
+        middle, at = here.mean(axis=0), there.mean(axis=1)
+        spread = here - middle
+        weight = _HELD * max(float(np.sum(spread**2)), 1e-6)
+        moment = np.swapaxes(there - at[:, None], 1, 2) @ spread
+        R = nearest_rotation(moment + weight * self.towards.T @ self.held)
+        return R, at - R @ middle
+
+
+class Roll(NamedTuple):
+    """How a leg is turned about itself: by a joint axis at one of its ends."""
+
+    carrier: Carrier  # in which the axis is fixed
+    axis: Array  # (3,)
+    is_outer: bool  # of a universal joint: the axis in the leg is across it
+
+
+@dataclass(frozen=True, eq=False)
+class LegHalf:
+    """Half of a leg: its frame has z from A to B, and its origin at A or at B."""
+
+    leg: int
+    side: Literal["base", "platform"]
+    roll: Roll | None  # None where the leg may turn about itself
+
+    def poses(self, A: Array, B: Array) -> tuple[Array, Array]:
+        """Return R (k, 3, 3) and t (k, 3) [m] from it to the base link, by joints there."""
+        AB = B[:, self.leg] - A[:, self.leg]
+        u = AB / np.linalg.norm(AB, axis=1, keepdims=True)
+        axis = np.eye(3)[np.argmin(np.abs(u), axis=1)]
+        if self.roll is not None:
+            axis = self.roll.carrier.poses(A, B)[0] @ self.roll.axis
+        R = frame_along(u, axis, is_outer=self.roll is None or self.roll.is_outer)
+        return R, (A if self.side == "base" else B)[:, self.leg]
+
+
+def frame_along(u: Array, axis: Array, *, is_outer: bool) -> Array:
+    """Return axes x, y, z in columns (..., 3, 3): z along u, x across it.
+
+    It is across the axis too, or as near to it as can be.
+    """
+    x = cross(axis, u) if is_outer else axis - np.sum(axis * u, axis=-1, keepdims=True) * u
+    x = x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
+    return np.stack([x, cross(u, x), u], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """A convex solid that hides what is inside and behind it."""
+
+    link: str
+    carrier: Carrier | LegHalf
+    corners: Array  # (m, 3) in the frame of its carrier [m]
+
+    @cached_property
+    def planes(self) -> Array:
+        """Planes (k, 4) of its faces: n x + d > 0 is outside."""
+        return planes_around(self.corners)
+
+    @property
+    def leg(self) -> int:
+        """The leg that it is on, -1 on none."""
+        return self.carrier.leg if isinstance(self.carrier, LegHalf) else -1
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is what a solid sweeps that may be anywhere around its leg."""
+        return isinstance(self.carrier, LegHalf) and self.carrier.roll is None
+
+
+def planes_around(corners: Array) -> Array:
+    """Return planes (k, 4) of the faces of the convex hull of points (m, 3), each once."""
+    planes = ConvexHull(corners).equations
+    return np.unique(np.round(planes, 12), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedOccluders:
+    """Occluders of a model where they are in a frame."""
+
+    occluders: tuple[Occluder, ...]
+    R: Array  # (n, 3, 3) of each
+    t: Array  # (n, 3) [m]
+
+    @classmethod
+    def none(cls) -> PlacedOccluders:
+        """Return no occluders."""
+        return cls((), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
+    @classmethod
+    def at(cls, occluders: Sequence[Occluder], A: Array, B: Array) -> list[PlacedOccluders]:
+        """Place occluders in the base link, for each of joints (k, n_legs, 3) there."""
+        if not occluders:
+            return [cls.none() for _ in A]
+        carriers = {id(o.carrier): o.carrier for o in occluders}
+        poses = {key: carrier.poses(A, B) for key, carrier in carriers.items()}
+        R, t = (np.stack([poses[id(o.carrier)][i] for o in occluders], axis=1) for i in (0, 1))
+        return [cls(tuple(occluders), *here) for here in zip(R, t, strict=True)]
+
+    def before(self, T_base_camera: Array) -> PlacedOccluders:
+        """Transform from the base link to the frame of a camera at T_base_camera (4, 4)."""
+        R = T_base_camera[:3, :3]
+        return replace(self, R=R.T @ self.R, t=(self.t - T_base_camera[:3, 3]) @ R)
+
+    def __len__(self) -> int:
+        return len(self.occluders)
+
+    def corners(self, i: int) -> Array:
+        """Return the corners of one of them (m, 3) [m]."""
+        return np.asarray(self.occluders[i].corners @ self.R[i].T + self.t[i])
+
+    def hide(self, points: Array, own: IntArray, margin: Array) -> IntArray:
+        """Return which of them hides each point (n, 3) from the origin, -1 where none does.
+
+        ``own`` is the leg to which each point belongs, -1 of none, and ``margin`` what others reach
+        beyond themselves where they are as far away as it [m].
+        """
+        front = np.full(len(points), -1, dtype=np.intp)
+        for i, occluder in enumerate(self.occluders):
+            is_own = own == occluder.leg if occluder.leg >= 0 else np.zeros(len(own), np.bool_)
+            if occluder.turns and np.all(is_own):
+                continue
+            reach = np.where(is_own, 0.0, margin)
+            hides = self._behind(i, points, reach)
+            if occluder.turns:
+                hides &= ~is_own
+            front[hides] = i
+        return front
+
+    def _behind(self, i: int, points: Array, reach: Array) -> BoolArray:
+        """Return which points (n, 3) are in one of them or behind it, seen from the origin."""
+        planes = self.occluders[i].planes
+        normal = planes[:, :3] @ self.R[i].T
+        outside = planes[:, 3] - normal @ self.t[i] - reach[:, None]  # of the origin, (n, k)
+        slope = points @ normal.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -outside / slope
+        enters = np.where(slope < 0.0, crossing, np.where(outside > 0.0, np.inf, -np.inf))
+        enters[slope > 0.0] = -np.inf
+        leaves = np.where(slope > 0.0, crossing, np.inf)
+        first, last = np.maximum(enters.max(axis=1), 0.0), leaves.min(axis=1)
+        return np.asarray((first < last) & (first < 1.0))
+
+
+def visual_solids(urdf: Urdf) -> list[VisualSolid]:
+    """Return the boxes, spheres and cylinders of a tree."""
+    shown = [
+        (link.get("name", ""), visual, shape)
+        for link in parse_robot(urdf.path, urdf.content).findall("link")
+        for visual in link.findall("visual")
+        for shape in visual.findall("geometry/*")
+    ]
+    solids = []
+    for (link, _, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
+        corners = _corners(str(shape.tag), shape.attrib)
+        if corners is not None:
+            cylinder = None
+            if shape.tag == "cylinder":
+                sizes = float(shape.get("radius", "")), float(shape.get("length", ""))
+                cylinder = VisualCylinder(link, T, *sizes)
+            solids.append(VisualSolid(link, matrix_applied(T, corners), cylinder))
+    return solids
+
+
+def _corners(tag: str, sizes: Mapping[str, str]) -> Array | None:
+    """Return the corners (m, 3) of a shape about its origin [m]; None of a flat or other one."""
+    names = {"box": ("size", 3), "sphere": ("radius", 1), "cylinder": ("radius", 1)}
+    if tag not in names:
+        return None
+    name, count = names[tag]
+    numbers = number_list(sizes.get(name, ""), count)
+    if numbers is None or min(numbers) <= EMPTY:
+        return None
+    if tag == "box":
+        signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
+        return np.asarray(signs * numbers)
+    if tag == "sphere":
+        height = np.cos(np.linspace(0.0, np.pi, SIDES // 2 + 1))
+        rings = [prism(numbers[0] * np.sqrt(1.0 - z**2), (numbers[0] * z,) * 2) for z in height]
+        return np.concatenate(rings)
+    length = number_list(sizes.get("length", ""), 1)
+    return None if length is None else prism(numbers[0], (-0.5 * length[0], 0.5 * length[0]))
+
+
+def prism(radius: float, heights: tuple[float, float]) -> Array:
+    """Return the corners (2 SIDES, 3) of the prism around a cylinder about z [m]."""
+    turn = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    reach = radius / np.cos(np.pi / SIDES)
+    circle = np.column_stack([reach * np.cos(turn), reach * np.sin(turn)])
+    return np.concatenate([np.column_stack([circle, np.full(SIDES, z)]) for z in heights])
+
+
+def occluders_of(
+    legs: Sequence[Leg],
+    shown: Sequence[VisualSolid],
+    bodies: Bodies,
+    ends: tuple[str, str],  # the links of base and platform
+    normals: tuple[Array, Array] | None,  # of a plane of motion, in these links
+) -> tuple[Occluder, ...]:
+    """Return what hides of the visuals of a file: all that is not measured and can be placed."""
+    base, platform = ends
+    places = _places(legs, bodies, base, platform, normals)
+    found = []
+    for solid in shown:
+        body = bodies.body_of[solid.link]
+        if body not in places:
+            continue
+        if solid.cylinder is not None and is_measured(legs, solid.cylinder, bodies):
+            continue
+        carrier, T = places[body]
+        corners = matrix_applied(matrix_product(T, bodies.T_body_link[solid.link]), solid.corners)
+        occluder = Occluder(solid.link, carrier, corners)
+        if occluder.turns:
+            radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
+            low, high = corners[:, 2].min(), corners[:, 2].max()
+            occluder = replace(occluder, corners=prism(radius, (float(low), float(high))))
+        try:
+            occluder.planes  # noqa: B018
+        except QhullError:  # flat
+            continue
+        found.append(occluder)
+    return tuple(found)
+
+
+def _places(
+    legs: Sequence[Leg],
+    bodies: Bodies,
+    base: str,
+    platform: str,
+    normals: tuple[Array, Array] | None,
+) -> dict[str, tuple[Carrier | LegHalf, Array]]:
+    """Return what each body is on, and the pose (4, 4) of the body in the frame of that."""
+    T_base, T_platform = (matrix_inverse(bodies.T_body_link[link]) for link in (base, platform))
+    free = [j for j, leg in enumerate(legs) if not leg.is_fixed_to_platform]
+    held = (_none(),) * 2 if normals is None else (normals[1][None], normals[0][None])
+    on_base = Carrier()
+    on_platform = Carrier(
+        "platform", tuple(free), np.array([legs[j].B for j in free]), _none(), *held
+    )
+    places: dict[str, tuple[Carrier | LegHalf, Array]] = {
+        bodies.body_of[base]: (on_base, T_base),
+        bodies.body_of[platform]: (on_platform, T_platform),
+    }
+    moved: dict[str, Carrier] = {}
+    for j, leg in enumerate(legs):
+        chain = leg.urdf_chain
+        carrier = on_base
+        if leg.actuator is not None:
+            actuator = leg.actuator
+            if actuator.joint not in moved:
+                on_it = [k for k, o in enumerate(legs) if o.actuator is not None
+                         and o.actuator.joint == actuator.joint]  # fmt: skip
+                kept = actuator.axis[None] if actuator.turns else np.eye(3)
+                fixed = actuator.point[None] if actuator.turns else _none()
+                joints = np.array([legs[k].A for k in on_it])
+                moved[actuator.joint] = Carrier("base", tuple(on_it), joints, fixed, kept, kept)
+            carrier = moved[actuator.joint]
+            pose = matrix_product(T_base, chain.poses[1])
+            places.setdefault(chain.bodies[0], (carrier, pose))
+        for body, half in halves_of_leg(leg, chain).items():
+            if body in places:
+                continue
+            k = chain.bodies.index(body) + 1
+            roll, axis = _roll(chain, k, carrier, on_platform, (T_base, T_platform))
+            places[body] = _on_leg(j, half, roll, chain.poses[k][:3, :3].T @ axis)
+    return places
+
+
+def _on_leg(leg: int, half: Half, roll: Roll | None, axis: Array) -> tuple[LegHalf, Array]:
+    """Return half of a leg and the pose (4, 4) in it of a body, with the axis in this body."""
+    side, origin, u = half
+    R = frame_along(u, axis, is_outer=roll is None or roll.is_outer)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R.T, -R.T @ origin
+    return LegHalf(leg, side, roll), T
+
+
+def _roll(
+    chain: LegChain,
+    k: int,  # of the body in the chain
+    on_base: Carrier,
+    on_platform: Carrier,
+    T_link_body: tuple[Array, Array],  # of the bodies of base and platform
+) -> tuple[Roll | None, Array]:
+    """Return what holds a body of a leg from turning about the leg, and that axis with all at zero.
+
+    The axis is in the frame of the base body.
+    """
+    before = range(0 if chain.actuator is None else 1, k)
+    T_platform = matrix_product(T_link_body[1], matrix_inverse(chain.poses[-1]))
+    for pivot, steps, carrier, T in (
+        (chain.base, before, on_base, T_link_body[0]),  # also of an actuator, at reading 0
+        (chain.platform, range(k, len(chain.steps)), on_platform, T_platform),
+    ):
+        if pivot.type not in (JointType.REVOLUTE, JointType.UNIVERSAL) or pivot.outer is None:
+            continue
+        if any(_turns_leg(chain, i) for i in steps):
+            continue
+        is_outer = pivot.type.inner_is_across
+        if is_outer and np.linalg.norm(cross(pivot.outer, chain.u)) < 1e-3:
+            continue
+        return Roll(carrier, T[:3, :3] @ pivot.outer, is_outer), pivot.outer
+    return None, np.eye(3)[np.argmin(np.abs(chain.u))]
+
+
+def _turns_leg(chain: LegChain, i: int) -> bool:
+    """Say whether a joint of a leg is a revolute about it, or a sphere."""
+    step = chain.steps[i]
+    if step.connection.type != "revolute":
+        return step.connection.type == "sphere"
+    axis = chain.poses[i][:3, :3] @ step.line(step.near)[1]
+    return bool(np.linalg.norm(cross(axis, chain.u)) < ALONG)
+
+
+def with_covers(legs: Sequence[Leg], occluders: Sequence[Occluder]) -> tuple[Leg, ...]:
+    """Return legs whose cylinders know which stretches of them are inside other solids."""
+    return tuple(
+        replace(leg, cylinders=tuple(_covered(c, j, occluders) for c in leg.cylinders))
+        for j, leg in enumerate(legs)
+    )
+
+
+def _covered(cylinder: Cylinder, leg: int, occluders: Sequence[Occluder]) -> Cylinder:
+    """Return a cylinder with the stretches of its axis that are inside solids of its leg."""
+    covers = []
+    for occluder in occluders:
+        if not isinstance(occluder.carrier, LegHalf) or occluder.leg != leg:
+            continue
+        reach = np.linalg.norm(occluder.corners[:, :2], axis=1).max()
+        normal, outside = occluder.planes[:, 2], occluder.planes[:, 3]
+        if reach < THICKER * cylinder.radius or np.any((np.abs(normal) < 1e-12) & (outside > 0.0)):
+            continue
+        ends = -outside / np.where(np.abs(normal) < 1e-12, np.nan, normal)
+        low = float(np.max(ends[normal < -1e-12]))
+        high = float(np.min(ends[normal > 1e-12]))
+        if low < high:
+            covers.append(Cover(occluder.carrier.side, low, high))
+    return replace(cylinder, covers=tuple(covers)) if covers else cylinder
+
+
+def reordered(occluders: Sequence[Occluder], order: Sequence[int]) -> tuple[Occluder, ...]:
+    """Return occluders of a machine whose legs come in another order."""
+    place = {j: k for k, j in enumerate(order)}
+    moved = dict[int, Carrier | LegHalf]()
+
+    def other(carrier: Carrier) -> Carrier:
+        return replace(carrier, legs=tuple(place[j] for j in carrier.legs))
+
+    for carrier in (one.carrier for one in occluders):
+        if isinstance(carrier, Carrier):
+            moved[id(carrier)] = other(carrier)
+            continue
+        roll = carrier.roll
+        roll = None if roll is None else roll._replace(carrier=other(roll.carrier))
+        moved[id(carrier)] = replace(carrier, leg=place[carrier.leg], roll=roll)
+    return tuple(replace(one, carrier=moved[id(one.carrier)]) for one in occluders)

@@ -1,0 +1,119 @@
+"""Solids of a model that are not measured: where they are, and what they hide of legs."""
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+import legcal
+from legcal.geometry.motions import look_at
+from legcal.machine.configurations import random_configurations
+from legcal.machine.leg import Cylinder
+from legcal.machine.model import Machine
+from legcal.machine.occluders import PlacedOccluders
+from legcal.machine.parameters import geometries
+from legcal.planning.sight import Bodies, what_is_seen
+from legcal.simulation.solids import PosedMachine, pose_machine, solids_of
+from legcal.simulation.visibility import legs_in_image
+from legcal.vision.camera import sample_camera
+from legcal.vision.visibility import visible_segments
+
+ROOT = Path(__file__).parents[1]
+HOUSING = '<visual><origin xyz="0.004 -0.003 -0.14"/><geometry><box size="0.03 0.03 0.2"/></geometry></visual>'  # noqa: E501
+MOTOR = '<visual><origin xyz="0.05 0 -0.2"/><geometry><cylinder radius="0.02" length="0.1"/></geometry></visual>'  # noqa: E501
+BRACKET = '<visual><origin xyz="0.1 0 0.03" rpy="0.3 0.2 0"/><geometry><box size="0.1 0.05 0.03"/></geometry></visual>'  # noqa: E501
+BALL = '<visual><origin xyz="0.1 0.1 0.05"/><geometry><sphere radius="0.03"/></geometry></visual>'
+
+
+@cache
+def with_solids(name: str) -> Machine:
+    """Return a shipped machine with solids on base, platform, and a stage of each leg."""
+    text = (ROOT / f"urdf/{name}.urdf").read_text()
+    for link in ("base", "platform"):
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{BRACKET}{BALL}</link>')
+    for j in range(1, 7):
+        stage = f'<link name="leg{j}_tube">'
+        text = text.replace(stage, f"{stage}{HOUSING}{MOTOR}")
+    with TemporaryDirectory() as folder:
+        root = Path(folder)
+        (root / "urdf").mkdir()
+        (root / "models").mkdir()
+        (root / f"urdf/{name}.urdf").write_text(text)
+        (root / f"models/{name}.yaml").write_text((ROOT / f"models/{name}.yaml").read_text())
+        return legcal.load_mechanism(root / f"models/{name}.yaml")
+
+
+def posed(machine: Machine, n: int) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
+    """Return a machine in poses: what of it is not measured as triangles, and as occluders."""
+    solids = [solid for solid in solids_of(machine) if solid.leg is None]
+    found = random_configurations(machine, n, 0)
+    poses = pose_machine(machine, solids, found)
+    A, B = (np.array([getattr(here, name) for here in poses]) for name in ("A", "B"))
+    return poses, PlacedOccluders.at(machine.occluders, A, B)
+
+
+@pytest.mark.parametrize(
+    "name", ["hexapod", "3-prs", "linear-delta", "delta", "servo-hexapod", "hexaglide"]
+)
+def test_hidden_is_what_rays_at_the_model_do_not_reach(name: str) -> None:
+    """Rays meet triangles of the visuals at the links' poses in Pinocchio, by another code."""
+    machine = with_solids(name)
+    size, rng = machine.size, np.random.default_rng(3)
+    share, n_hidden = list[float](), 0
+    for here, placed in zip(*posed(machine, 3), strict=True):
+        middle = 0.5 * (here.A.mean(axis=0) + here.B.mean(axis=0))
+        direction = rng.normal(size=3)
+        centre = middle + 4.0 * size * direction / np.linalg.norm(direction)
+        points = middle + size * rng.uniform(-1.0, 1.0, (4000, 3))
+        none = np.full(len(points), -1)
+        T = look_at(centre, middle)
+        seen = placed.before(T.as_matrix())
+        hidden = seen.hide(T.inv().apply(points), none, np.zeros(len(points))) >= 0
+        by_rays = here.hidden(centre, points, np.zeros(len(points)))
+        share.append(float(np.mean(hidden != by_rays)))
+        n_hidden += int(np.count_nonzero(by_rays))
+    assert n_hidden > 50
+    assert max(share) < 0.003  # polygons stand for circles, one around and one within
+
+
+def test_a_rod_is_not_looked_for_inside_the_housing_of_its_leg() -> None:
+    machine = with_solids("hexapod")
+    leg = machine.legs[0]
+    length = leg.length_at(0.5 * sum(leg.travel))
+    segments = visible_segments(leg.cylinders, length)
+    # from 0.14 - 0.1 to 0.14 + 0.1 from A inside it; the longer stretch begins at its end
+    assert segments
+    for segment in segments:
+        assert segment.start >= 0.24 + 2.0 * segment.radius - 1e-9
+    bare = [
+        Cylinder(c.link, c.radius, c.side, c.start, c.end)  # without what encloses it
+        for c in leg.cylinders
+    ]
+    assert visible_segments(bare, length)[0].start < 0.1
+
+
+def test_plans_see_of_legs_what_the_simulation_shows_of_them() -> None:
+    """Segments that a plan counts on are free for rays at the model."""
+    machine, camera = with_solids("hexapod"), sample_camera()
+    n, checked = 4, 0
+    found = random_configurations(machine, n, 1)
+    poses = pose_machine(machine, solids_of(machine), found)
+    in_frames = [machine.T_base_Rb.inv() * T * machine.T_platform_Re for T in found.poses]
+    bodies = Bodies.at(machine, geometries(machine), in_frames)
+    np.testing.assert_allclose(bodies.A[0], poses[0].A, atol=1e-9)
+    for place in ([1.0, 0.3, 0.3], [-0.5, 0.9, 0.2], [0.2, -1.0, 0.5]):
+        T = look_at(np.array(place), np.array([0.0, 0.0, 0.2]))
+        seen = what_is_seen(camera, T, bodies)
+        shown = [legs_in_image(machine.legs, here, camera, T, samples=400) for here in poses]
+        for image, leg, part, ends in zip(seen.image, seen.leg, seen.part, seen.ends, strict=True):
+            [stretch] = [s for s in shown[image][leg].stretches if s.part == part]
+            A, B = poses[image].A[leg], poses[image].B[leg]
+            u = (B - A) / np.linalg.norm(B - A)
+            axis = A + np.array([[stretch.start], [stretch.end]]) * u
+            first, last = camera.project(T.inv().apply(axis))
+            along = (ends.mean(axis=0) - first) @ (last - first) / np.sum((last - first) ** 2)
+            assert np.all((along > -0.03) & (along < 1.03))
+            checked += 1
+    assert checked > 20
