@@ -13,6 +13,8 @@ calibrated as it lies there or otherwise:
     jpeg60, jpeg85   none, with photographs saved again with that quality
     gamma      none, with the gamma of the camera left to be estimated
     radii      none, with the radii of the legs fixed
+    clicks     none, with landmarks.csv: the true joints in one picture of each view, as far as they
+               are inside, with 3 px of noise (seed 1); where these have the cameras is printed
 
 A line a calibration:
 
@@ -40,14 +42,17 @@ import cv2
 import numpy as np
 import yaml
 from real_cameras import normalised_square
+from scipy.spatial.transform import RigidTransform
 
-from legcal import LegcalError, calibrate, load_mechanism
+from legcal import LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.calibration.result import Calibration
-from legcal.geometry.motions import components
+from legcal.data.landmarks import LANDMARKS_NAME
+from legcal.geometry.motions import components, pose_distance
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
 
-VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii"
+VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii", "clicks"
+CLICK_PX = 3.0  # noise of clicks
 VISIBLE = 0.5  # share of a leg above which it ought to be used
 HEADER = (
     f"{'set':18}{'as':8}{'views':>6}{'legs':>6}{'used':>10}{'median':>8}{'90 %':>7}{'>1 px':>7}"
@@ -102,6 +107,8 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
             view.pop("T_base_camera", None)
             view.pop("legs", None)
         file.write_text(yaml.safe_dump(content, sort_keys=False))
+    if variant == "clicks":
+        click_joints(copy, folder.with_name(folder.name + "-truth"))
     if variant == "half":
         table = copy / content["measurements"]
         head, *rows = table.read_text().splitlines()
@@ -122,6 +129,32 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
             cv2.imwrite(str(again), picture, quality)
             text = text.replace(file.name, again.name)
         table.write_text(text)
+
+
+def click_joints(folder: Path, truth: Path) -> None:
+    """Write the landmarks of a dataset by its truth, and print how far off they are."""
+    true = json.loads((truth / "truth.json").read_text())
+    of_image = {Path(image["file"]).stem: image for image in true["images"]}
+    dataset, rng = load_dataset(folder, check_images=False), np.random.default_rng(1)
+    m, names = dataset.measurements, dataset.machine.leg_names
+    lines = ["view,image,joint,u,v,sigma"]
+    for v, view in enumerate(m.views):
+        image = m.image[int(np.flatnonzero(m.view == v)[0])]
+        for name, leg in zip(names, of_image[Path(image).stem]["legs"], strict=True):
+            for end, key in (("base", "A_cam"), ("platform", "B_cam")):
+                px = view.camera.project(np.array(leg[key])) + CLICK_PX * rng.normal(size=2)
+                if np.all((px >= 0.0) & (px <= [view.camera.width - 1, view.camera.height - 1])):
+                    lines.append(f"{view.name},{image},{name}.{end},{px[0]:.1f},{px[1]:.1f},")
+    (folder / LANDMARKS_NAME).write_text("\n".join(lines) + "\n")
+    of_clicks = load_dataset(folder, check_images=False).measurements.views
+    for view, camera in zip(of_clicks, true["cameras"], strict=True):
+        T = np.array(camera["T_cam_base"])
+        T[:3, 3] *= 1e-3
+        if view.T_base_camera is None:
+            continue
+        placed = dataset.machine.T_base_Rb.inv() * view.T_base_camera
+        far, turned = pose_distance(placed, RigidTransform.from_matrix(T).inv())
+        print(f"    {view.name}: clicks {1e3 * far:.1f} mm, {np.degrees(turned):.2f} deg off")
 
 
 def outcome(folder: Path, variant: str, overlays: Path | None, worst: int) -> Outcome:

@@ -21,6 +21,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import yaml
+from clicked_joints import camera_beside, seen_from, write_clicks
 from command_outcomes import run, words_of
 from dataset_folder import SERVOS, dataset_of_readings
 from machines import TRIPOD
@@ -854,6 +855,49 @@ def _tables() -> Iterable[Refusal]:
     )
 
 
+def clicks(*left_out: str) -> Edit:
+    """Click joints in the first picture of the first view."""
+
+    def edit(folder: Path) -> None:
+        (folder / "landmarks.csv").unlink(missing_ok=True)
+        seen = seen_from(folder, 0, camera_beside(folder, 0.7))
+        kept = {joint: px for joint, px in seen.items() if joint not in left_out}
+        write_clicks(folder, {0: kept}, "0.3")
+
+    return edit
+
+
+def _landmarks() -> Iterable[Refusal]:
+    """Joints clicked in pictures."""
+    c = "landmarks.csv"
+    rows: Rows = [
+        ("joint", cell(c, 3, joint="leg9.base"), ("row 3", "'leg9.base'", "leg1.base")),
+        ("leg", cell(c, 3, joint="leg1"), ("row 3", "'leg1'", "leg1.base")),
+        ("view", cell(c, 2, view="c8"), ("row 2", "'c8'")),
+        ("image", cell(c, 2, image="images/c2_1.png"), ("row 2", "column image", "c2_1.png")),
+        ("outside", cell(c, 2, u="470"), ("row 2", "column u", "470 px", "63.5 px")),
+        ("number", cell(c, 2, v="x"), ("row 2", "column v", "'x'")),
+        ("no-number", cell(c, 2, v=""), ("row 2", "column v", "an empty cell")),
+        ("sigma", cell(c, 2, sigma="0"), ("row 2", "column sigma", "0.01")),
+        ("sigma-nan", cell(c, 2, sigma="nan"), ("column sigma", "'nan'")),
+        ("twice", doubled(c), ("row 13", "row 1", "the same image and joint")),
+        ("column", header(c, "joint", "leg"), ("'joint'",)),
+        ("none", kept(c, 0), ("no row",)),
+        ("few", kept(c, 3), ("view c1", "3 clicks", "4 or more, better 6")),
+        ("wrong-joint", (clicks("leg4.platform"), cell(c, 1, joint="leg4.platform")),
+         ("the click on leg4.platform in images/c1_1.png", "perhaps it shows leg1.base")),
+        ("no-camera", (kept(c, 6), cell(c, 1, u="5"), cell(c, 3, u="60", v="40"),
+                       cell(c, 4, v="2"), cell(c, 6, v="3")), ("view c1", "no camera shows")),
+        ("all-at-once", (cell(c, 1, joint="leg"), cell(c, 2, u="x"), cell(c, 3, view="c9")),
+         ("'leg'", "'x'", "'c9'")),
+    ]  # fmt: skip
+    spoiled: Rows = [
+        (name, (clicks(), *(edits if isinstance(edits, tuple) else (edits,))), named)
+        for name, edits, named in rows
+    ]
+    yield from _spoiled("clicks", "calibrate {in} -o {out}", "plain", spoiled)
+
+
 def _overrides() -> Iterable[Refusal]:
     """Choices of parameters by options."""
     priors: list[tuple[str, str, tuple[str, ...]]] = [
@@ -1559,6 +1603,7 @@ REFUSALS: tuple[Refusal, ...] = (
     *_units(),
     *_cameras(),
     *_tables(),
+    *_landmarks(),
     *_overrides(),
     *_models(),
     *_outside(),

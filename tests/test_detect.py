@@ -2,7 +2,9 @@
 
 import base64
 import gzip
+import http.client
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from legcal.perception.overlays import (
     PartMarks,
     marks_of_image,
 )
+from legcal.viewer.click_server import TOKEN_HEADER, ClickServer
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -144,6 +147,44 @@ def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should
     assert len(lines) > 10
     assert np.nanmedian(off) < 2.0
     assert np.nanmin(signs) > 0.0  # the first end is nearer to the base
+
+
+def test_a_served_page_answers_its_own_browser_alone(
+    examined: Examination, found: Detection, folder: Path, tmp_path: Path
+) -> None:
+    shown = replace(found, dataset=replace(found.dataset, folder=tmp_path))
+    server = ClickServer(examined, shown, folder)
+    threading.Thread(target=server.run, daemon=True).start()
+
+    def ask(method: str, path: str, **said: str) -> tuple[int, bytes]:
+        at = http.client.HTTPConnection(server.address.host, server.address.port, timeout=60)
+        at.request(method, path, said.pop("body", None), said)
+        answer = at.getresponse()
+        return answer.status, answer.read()
+
+    try:
+        code, page = ask("GET", "/")
+        assert code == 200
+        assert server.token.encode() in page
+        picture = next(iter(found.photograph_files.values()))
+        assert ask("GET", f"/{picture}") == (200, (folder / picture).read_bytes())
+        for path in ("/detection.json", "/../detect.py", f"/x/../{picture}"):
+            assert ask("GET", path)[0] == 404
+        assert ask("GET", "/", Host="example.org")[0] == 404  # a name that leads here
+        table = "view,image,joint,u,v,sigma\nc1,images/p1_1.png,leg1.base,5,6,\n"
+        assert ask("POST", "/save", body=table)[0] == 403  # another page of the browser
+        known = {TOKEN_HEADER: server.token}
+        code, answer = ask("POST", "/clicks?image=0", body=table, **known)
+        assert (code, json.loads(answer)["legs"]) == (200, [])
+        assert "1 click" in json.loads(answer)["problems"][0]
+        code, answer = ask("POST", "/save", body="joint\nleg1\n", **known)
+        assert json.loads(answer)["problems"]
+        assert not (tmp_path / "landmarks.csv").exists()
+        ask("POST", "/save", body=table, **known)
+        (row,) = read_rows(tmp_path / "landmarks.csv")
+        assert (row["joint"], float(row["u"]), float(row["v"])) == ("leg1.base", 5.0, 6.0)
+    finally:
+        server.close()
 
 
 def test_the_written_table_is_read_as_what_was_found(

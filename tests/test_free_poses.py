@@ -19,10 +19,11 @@ import legcal
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.scale import naming_missing_lengths
+from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
-from legcal.geometry.motions import look_at
+from legcal.geometry.motions import look_at, pose_distance
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -168,8 +169,8 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
     return load_mechanism(without_motors(path, *motors))
 
 
-@pytest.mark.parametrize("n_motors", [0, 3])
-def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("n_motors", "by_clicks"), [(0, False), (3, False), (0, True)])
+def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
     machine = by_hand(n_motors, tmp_path)
     rng = np.random.default_rng(n_motors)
     true = [
@@ -217,6 +218,23 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         np.where(np.isin(every, machine.motors), q, np.nan),
         2e-6,
     )
+    clicked: dict[int, tuple[RigidTransform, ...]] = {}
+    if by_clicks:  # on all joints of each picture; cameras follow from those of the base
+        place = np.meshgrid(range(4), (0, 1), every, indexing="ij")
+        image, end, leg = (x.ravel() for x in place)
+        X = np.where(end[:, None] == 0, A[image, leg], B[image, leg])
+        shown = [
+            CAMERA.project(true[view[r]].inv().apply(x)) for r, x in zip(image, X, strict=True)
+        ]
+        px = np.array(shown) + 3.0 * rng.normal(size=(len(X), 2))
+        landmarks = Landmarks(image, leg, end, px, np.full(len(X), 3.0))
+        measurements, _ = place_by_landmarks(Path("a.csv"), machine, measurements, landmarks)
+        rough = [one.T_base_camera for one in measurements.views if one.T_base_camera is not None]
+        assert max(pose_distance(*both)[0] for both in zip(rough, true, strict=True)) < 0.04
+        clicked = platforms_by_landmarks(machine, measurements, landmarks)
+        assert [min(pose_distance(x, T[k])[0] for x in clicked[k]) < 0.05 for k in range(3)] == [
+            True
+        ] * 3
     search = Search(
         lambda row: np.zeros((960, 1280), dtype=np.uint8),
         measurements,
@@ -228,7 +246,7 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, tmp_path: Path) -> No
         machine.size,
         pairs,
     )
-    found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None)
+    found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None, clicked)
     off, off_at_home = [], []
     for row in range(4):
         X = np.concatenate([A[row], B[row]])
@@ -312,6 +330,16 @@ def test_without_a_rough_camera_pose_no_image_is_searched(
     (problem,) = refusal.value.problems
     assert problem.startswith("view c2: the images could not be searched")
     assert "write T_base_camera" in problem
+
+
+def test_a_page_to_click_on_is_written_where_no_image_can_be_searched(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = free_set(folder, monkeypatch, tmp_path)
+    found = legcal.doctor(path, output=tmp_path / "found")
+    said = [one.what for one in found.findings if one.check == "legs"]
+    assert any("view c2" in what and "landmarks.csv" in what for what in said)
+    assert "data-place" in (tmp_path / "found" / "index.html").read_text()
 
 
 def test_images_are_not_searched_where_neither_poses_nor_base_joints_are_known(

@@ -285,6 +285,30 @@ def test_what_cannot_become_a_dataset_is_refused_and_nothing_written(
     assert not (tmp_path / "dataset").exists()
 
 
+def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_rough_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table(own_folder(tmp_path, TWO[:3]))
+    (tmp_path / "camera_info.yaml").unlink()
+    assert init(monkeypatch, tmp_path) == 2  # nothing says what the lens is
+    assert "not one focal length in their EXIF data" in " ".join(capsys.readouterr().err.split())
+    photographs = sorted((tmp_path / "photos" / "a").iterdir())
+    for path in photographs:
+        path.write_bytes(jpeg(PICTURE, block=exif(make="Acme", model="One", focal35=26)))
+    assert init(monkeypatch, tmp_path) == 0
+    assert "only known by the focal length" in " ".join(capsys.readouterr().out.split())
+    camera = load_dataset(tmp_path / "dataset").measurements.views[0].camera
+    f = 26.0 * 80.0 / np.hypot(36.0, 24.0)  # of 64 x 48 px
+    np.testing.assert_allclose(camera.K, [[f, 0, 31.5], [0, f, 23.5], [0, 0, 1]])
+    assert camera.covariance is not None
+    sigma = np.sqrt(np.diagonal(camera.covariance))
+    assert sigma[0] == pytest.approx(0.04 * f, rel=0.01)
+    assert np.sqrt(camera.covariance[0, 0] - camera.covariance[0, 1]) < 0.01 * f  # square pixels
+    assert np.count_nonzero(sigma) >= 5  # the principal point and distortion
+    photographs[0].write_bytes(jpeg(PICTURE, block=exif(make="Acme", model="One", focal35=52)))
+    assert init(monkeypatch, tmp_path, "--force") == 2  # a zoom
+
+
 def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_photographs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

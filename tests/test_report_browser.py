@@ -3,6 +3,7 @@
 import csv
 import io
 import shutil
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,12 +14,15 @@ import numpy as np
 import pytest
 from browser import PATIENCE, chromium
 from browser import errors as _errors
+from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
 
 import legcal
 from legcal.calibration.detection import Detection
 from legcal.calibration.examination import Examination
 from legcal.data.reasons import Reason, Rejection
+from legcal.geometry.motions import pose_distance
+from legcal.viewer.click_server import ClickServer
 
 pytestmark = pytest.mark.system
 
@@ -347,3 +351,165 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     assert 1.0 < abs(off[0]) < 2.5  # across the line
     assert np.abs(calibration.residuals.offset[k]) == pytest.approx(np.abs(off), abs=0.3)
     assert _errors(browser) == []
+
+
+# Clicking joints on the page of ``legcal detect``.
+
+
+class Placer:
+    """The editor of clicks on joints, used as people do."""
+
+    def __init__(self, browser: Any) -> None:
+        self.browser = browser
+
+    def open(self, image: int) -> None:
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        button = self.browser.find_element("css selector", "[data-place]")
+        self.browser.execute_script("arguments[0].click()", button)
+        while self.shown() != image:
+            self.find("[name=next]").click()
+        shown = "return document.querySelector('#placer image').getBBox().width > 0"
+        WebDriverWait(self.browser, PATIENCE).until(lambda _: self.browser.execute_script(shown))
+
+    def shown(self) -> int:
+        return int(self.find("[name=image]").get_property("value"))
+
+    def find(self, selector: str) -> Any:
+        return self.browser.find_element("css selector", f"#placer {selector}")
+
+    def on_screen(self, px: Any) -> tuple[int, int]:
+        x, y = self.browser.execute_script(
+            "const matrix = document.querySelector('#placer .stage svg').getScreenCTM();"
+            "const { x, y } = new DOMPoint(...arguments[0]).matrixTransform(matrix);"
+            "return [x, y];",
+            [float(x) for x in px],
+        )
+        return round(x), round(y)
+
+    def click(self, px: Any) -> None:
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        actions = ActionChains(self.browser)
+        pointer: Any = actions.w3c_actions.pointer_action
+        pointer.move_to_location(*self.on_screen(px)).click()
+        actions.perform()
+
+    def drag(self, start: Any, end: Any) -> None:
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        actions = ActionChains(self.browser)
+        pointer: Any = actions.w3c_actions.pointer_action
+        pointer.move_to_location(*self.on_screen(start)).pointer_down()
+        pointer.move_to_location(*self.on_screen(end)).pointer_up()
+        actions.perform()
+
+    def choose(self, joint: str) -> None:
+        self.browser.find_element(
+            "xpath", f"//*[@id='placer']//li/button[starts-with(b, '{joint} ')]"
+        ).click()
+
+    def press_delete(self, joint: str) -> None:
+        self.choose(joint)
+        self.find("[name=remove]").click()
+
+    def until(self, script: str) -> Any:
+        """Wait for what a script returns."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        return WebDriverWait(self.browser, PATIENCE).until(
+            lambda _: self.browser.execute_script(script)
+        )
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the screen for one of the image."""
+        script = "return document.querySelector('#placer .stage svg').getScreenCTM().a"
+        return float(self.browser.execute_script(script))
+
+
+def _downloaded(path: Path) -> list[dict[str, str]]:
+    end = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return _rows(path.read_text("utf-8"))
+
+
+def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
+    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+) -> None:
+    folder, found = detection
+    browser.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
+    )
+    browser.get((folder.parent / "found" / "index.html").as_uri())
+    placer, row = Placer(browser), int(found.rows[0])
+    placer.open(0)
+    camera = found.T_base_camera[0]
+    assert camera is not None
+    seen = seen_from(folder, row, camera)
+    for joint in ("leg1.base", "leg2.base"):  # the next one is chosen by itself
+        placer.click(seen[joint])
+    placer.choose("leg4.base")
+    placer.click(seen["leg3.base"])  # by mistake
+    placer.drag(seen["leg3.base"], seen["leg4.base"])
+    for joint in ("leg1.platform", "leg3.platform", "leg5.platform", "leg6.platform"):
+        placer.choose(joint)
+        placer.click(seen[joint])
+    placer.press_delete("leg6.platform")
+    placer.find("[data-landmarks]").click()
+    table = _downloaded(tmp_path / "landmarks.csv")
+    clicked = {line["joint"]: np.array([float(line["u"]), float(line["v"])]) for line in table}
+    assert list(clicked) == ["leg1.base", "leg2.base", "leg4.base", "leg1.platform",
+                             "leg3.platform", "leg5.platform"]  # fmt: skip
+    scale = placer.scale
+    for joint, px in clicked.items():
+        assert px == pytest.approx(seen[joint], abs=1.5 / scale), joint
+    shutil.copytree(folder, tmp_path / "clicked")
+    shutil.copy(tmp_path / "landmarks.csv", tmp_path / "clicked")
+    placed = legcal.load_dataset(tmp_path / "clicked").measurements.views[0].T_base_camera
+    assert placed is not None
+    far, turned = pose_distance(placed, camera)
+    assert far < 0.03
+    assert turned < np.deg2rad(2.0)
+    assert _errors(browser) == []
+
+
+def test_a_served_page_draws_the_legs_and_saves_clicks(
+    examined: tuple[Path, Examination], browser: Any, tmp_path: Path
+) -> None:
+    folder, examination = examined
+    found = examination.detection
+    assert found is not None
+    shutil.copytree(folder, tmp_path / "set")
+    dataset = replace(found.dataset, folder=tmp_path / "set")
+    server = ClickServer(examination, replace(found, dataset=dataset), folder.parent / "found")
+    threading.Thread(target=server.run, daemon=True).start()
+    try:
+        browser.get(str(server.address))
+        placer, row = Placer(browser), int(found.rows[0])
+        placer.open(0)
+        camera = found.T_base_camera[0]
+        assert camera is not None
+        seen = seen_from(folder, row, camera)
+        for joint in (*(f"leg{k}.base" for k in range(1, 7)), "leg1.platform", "leg3.platform"):
+            placer.choose(joint)
+            placer.click(seen[joint])
+        lines = placer.until("return [...document.querySelectorAll('#placer .legs polyline')]"
+                             ".map((line) => line.getAttribute('points'))")  # fmt: skip
+        assert len(lines) >= 12
+        placer.choose("leg5.platform")
+        placer.click(seen["leg1.base"] + 30.0)
+        said = "return document.querySelector('#placer [role=status].warning')?.textContent"
+        assert "leg5.platform" in placer.until(said)
+        placer.find("[name=undo]").click()
+        placer.find("[name=save]").click()
+        placer.until("return document.querySelector('#placer [role=status]').textContent"
+                     ".includes('was saved')")  # fmt: skip
+        placed = legcal.load_dataset(tmp_path / "set").measurements.views[0].T_base_camera
+        assert placed is not None
+        assert pose_distance(placed, camera)[0] < 0.03
+        assert _errors(browser) == []
+    finally:
+        server.close()

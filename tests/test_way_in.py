@@ -13,7 +13,7 @@ from lxml import etree
 
 from legcal import load_mechanism
 from legcal.machine.model import Machine, readings_at
-from legcal.report.machine_picture import draw_machine
+from legcal.machine.picture import draw_machine
 
 BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
         (289.8, -77.6)]  # fmt: skip

@@ -347,6 +347,16 @@ def _agree(one: RigidTransform, other: RigidTransform, size: float, reach: float
     return far <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE
 
 
+def needs_rough_cameras(data: OrderedDataset) -> bool:
+    """Say whether images can be searched only near rough camera poses."""
+    hints = [view.T_base_camera for view in data.measurements.views]
+    on_base = data.dataset.board_on("base")
+    by_board = on_base is not None and (
+        on_base.T_link_board is not None or any(T is not None for T in hints)
+    )
+    return not data.machine.is_determined and not by_board
+
+
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
     """Return where the nominal model has the legs, with rough cameras, and what shows the board.
 
@@ -364,14 +374,10 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
             "cylinder along any leg, so that nothing of the legs is visible, needed one along each "
             "that images show; add them with their radii."
         )
-    hints = [view.T_base_camera for view in data.measurements.views]
-    on_base = data.dataset.board_on("base")
-    by_board = on_base is not None and (
-        on_base.T_link_board is not None or any(T is not None for T in hints)
-    )
     if not data.machine.is_determined and len(data.photographs.detect):
         require_standing_joints(data.machine)
-    if not data.machine.is_determined and not by_board:
+    if needs_rough_cameras(data):
+        hints = [view.T_base_camera for view in data.measurements.views]
         require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
     placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
     board = observe_board(data)

@@ -16,13 +16,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.board import rough_placement
+from legcal.calibration.board import needs_rough_cameras, rough_placement
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_causes import image_notes
 from legcal.data.image_tables import inverse
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import few_views
 from legcal.data.outlines import (
     Outlines,
@@ -39,10 +40,12 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.rods import measured_readings
 from legcal.perception.diagnostics import BEFORE_FIT, hint_notes, images_left_out
+from legcal.perception.free_poses import views_without_rough_camera
 from legcal.perception.photographs import (
     MeasuredImages,
     given_outlines,
     measure_photographs,
+    nominal_placement,
     place_and_measure,
 )
 from legcal.perception.placement import (
@@ -232,6 +235,42 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
     )
 
 
+def views_to_click(data: OrderedDataset) -> list[str]:
+    """Return the views that cannot be searched before clicks, or other rough poses, place them."""
+    if not needs_rough_cameras(data):
+        return []
+    m, rows = data.measurements, data.photographs.detect.tolist()
+    return views_without_rough_camera(m, rows, [view.T_base_camera for view in m.views])
+
+
+def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> Detection:
+    """Return the images of a dataset that cannot be searched, to be clicked, in file order."""
+    nominal = nominal_placement(data.machine, data.measurements, data.T_base_platform)
+    rows, legs = inverse(data.order.rows), inverse(data.order.legs)
+    why = (
+        "found no rough camera pose, needed one, since the motors do not determine the pose of the "
+        f"platform; click its joints at the base ({LANDMARKS_NAME})."
+    )
+    others = "found a rough camera pose here and none of other views, needed one of every view."
+    dataset = data.dataset
+    return Detection(
+        dataset=dataset,
+        outlines=no_outlines(),
+        A_base=nominal.A_base[rows][:, legs],
+        B_base=nominal.B_base[rows][:, legs],
+        cylinders=tuple(leg.cylinders for leg in dataset.machine.legs),
+        T_base_camera=tuple(view.T_base_camera for view in dataset.measurements.views),
+        rows=images,
+        unplaced={
+            view.name: f"view {view.name}: its images could not be searched: "
+            + (why if view.name in views else others)
+            for view in dataset.measurements.views
+        },
+        image_notes=(),
+        notes=dataset.notes,
+    )
+
+
 def _nominal_arms(data: OrderedDataset) -> dict[int, PlacedArm]:
     """Return the arms that are cylinders, where the model has them at the readings of each row."""
     legs, m = data.machine.legs, data.measurements
@@ -260,7 +299,13 @@ def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
     """Return what is to be said of the cameras and the images."""
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
-    notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
+    notes = hint_notes(
+        [view.name for view in views],
+        hints,
+        placement.T_base_camera,
+        BEFORE_FIT,
+        by_landmarks=data.measurements.clicked_views,
+    )
     return [*notes, *placement.notes, *image_notes(data.measurements, placement.barely)]
 
 

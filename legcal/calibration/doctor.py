@@ -18,7 +18,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from legcal.calibration.detection import Detection, detected, rows_with_image
+from legcal.calibration.detection import (
+    Detection,
+    detected,
+    rows_with_image,
+    unsearched,
+    views_to_click,
+)
 from legcal.calibration.detection_folder import (
     DETECTION,
     check_detection_destination,
@@ -505,6 +511,8 @@ def _searched(found: _Found, data: OrderedDataset) -> Detection | None:
     """Search the images for the legs; None if that is refused."""
     m = data.dataset.measurements
     rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
+    if found.refuses and (views := views_to_click(data)):  # on the page that is written
+        return unsearched(data, rows, views)
     try:
         return detected(data, rows)
     except (DatasetError, NotIdentifiable, NotVisible, DidNotConverge) as error:

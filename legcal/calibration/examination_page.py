@@ -8,23 +8,29 @@ such a one is placed there and dragged onto its edge.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import Detection, unique_names
 from legcal.calibration.examination import Examination, ViewCondition
 from legcal.calibration.summary import UNITS
 from legcal.data.dataset import OBSERVATIONS_NAME
+from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
 from legcal.data.measurements import row_names
 from legcal.data.outlines import format_observations
 from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
+from legcal.machine.picture import draw_machine, joint_letter
 from legcal.pages.document import (
     MAX_ROWS,
     Cell,
     Items,
+    LandmarkEditor,
     Number,
     OutlineEditor,
     Page,
@@ -45,6 +51,7 @@ DETECTION_PAGE = "index.html"
 # and where in that width their middle is the eye says to about half a pixel.
 SIGMA_BY_HAND = 0.5  # [px]
 MAX_BYTES = 8_300_000  # of the table and what is said of its images, in a page
+_ALONG = 12  # points of an edge, which lenses bend
 _OF_IMAGE = 250  # bytes in the page for each image
 _STATES = {"ok": "ok", "note": "ok", "warning": "look", "error": "wrong"}
 _HOW_TO_CORRECT = (
@@ -52,6 +59,12 @@ _HOW_TO_CORRECT = (
     "and copy it into the dataset, where legcal calibrate takes it. An end that is placed by hand "
     "has the standard deviation that you state. Nothing changes in the files beside this page."
 )
+_HOW_TO_PLACE = (
+    "Where the photographs do not place a camera, click the centres of joints in one picture of "
+    "its view; then download the table and copy it into the dataset, where every command begins at "
+    "the camera that follows. "
+)
+_NOT_SERVED = "To see the legs at the camera of the clicks, run legcal detect with --edit."
 _TOO_MANY = (
     "There are more outlines than a page should hold. To correct one, edit its row in "
     "observations.csv: set its verdict, or its line (a, b, c) and ends, and its source to edited; "
@@ -123,8 +136,8 @@ def _share(part: int | None, whole: int | None) -> Cell:
     return Number(part, f"{part}/{whole}")
 
 
-def examination_page(found: Examination, detection: Detection) -> str:
-    """Return the text of ``index.html``."""
+def examination_page(found: Examination, detection: Detection, token: str = "") -> str:
+    """Return the text of ``index.html``; one that is served is known by a token."""
     files, names = detection.overlay_files, row_names(detection.dataset.measurements)
     anchors = unique_names(f"view-{view.view}" for view in found.views)
     editor = _outline_editor(detection)
@@ -135,7 +148,16 @@ def examination_page(found: Examination, detection: Detection) -> str:
     sections = [
         Section("found", "What was found", blocks),
         Section("correct", "To correct an outline", correct),
+        Section(
+            "place",
+            "To place a camera",
+            [
+                Text([_HOW_TO_PLACE + _NOT_SERVED * (not token)]),
+                _landmark_editor(detection, token),
+            ],
+        ),
     ]
+    number_of = {row: k for k, row in enumerate(files)}
     place = {} if editor is None else {row: k for k, row in enumerate(files)}
     shown = _worst(detection)
     if len(shown) < len(files):
@@ -144,7 +166,13 @@ def examination_page(found: Examination, detection: Detection) -> str:
     for view, anchor in zip(found.views, anchors, strict=True):
         rows = [row for row in files if row in shown and detection.view_of(row) == view.view]
         pictures = [
-            Picture(files[row], *_summary(detection, names, row), place.get(row)) for row in rows
+            Picture(
+                files[row],
+                *_summary(detection, names, row),
+                place.get(row),
+                number_of[row] if view.problem else None,
+            )
+            for row in rows
         ]
         problem = [Text([view.problem])] if view.problem else []
         sections.append(Section(anchor, view.view, [*problem, Row(pictures)]))
@@ -218,6 +246,52 @@ def _outline_editor(detection: Detection) -> OutlineEditor | None:
     return found if size <= MAX_BYTES else None
 
 
+def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
+    """Return the editor of clicks on joints, with those that the dataset has."""
+    dataset = detection.dataset
+    measurements, machine = dataset.measurements, dataset.machine
+    names = row_names(measurements)
+    joints = joint_names(machine.leg_names)
+    number_of = {row: k for k, row in enumerate(detection.photograph_files)}
+    images = []
+    for row, file in detection.photograph_files.items():
+        view = measurements.views[int(measurements.view[row])]
+        images.append(
+            {
+                "view": view.name,
+                "image": names[row],
+                "label": f"{view.name}, {names[row]}",
+                "photograph": file,
+                "width": view.camera.width,
+                "height": view.camera.height,
+            }
+        )
+    clicks = []
+    if dataset.landmarks is not None:
+        place = {joint: i for i, joint in enumerate(joints.values())}
+        given = dataset.landmarks
+        for (row, leg, end), (u, v), sigma in zip(
+            given.row_keys(), given.px.tolist(), given.sigma_px.tolist(), strict=True
+        ):
+            if row in number_of:
+                stated = "" if sigma == SIGMA_PX else f"{sigma:g}"
+                clicks.append((number_of[row], place[leg, end], u, v, stated))
+    unplaced = [k for row, k in number_of.items() if detection.view_of(row) in detection.unplaced]
+    return LandmarkEditor(
+        file=LANDMARKS_NAME,
+        images=images,
+        joints=[
+            {"name": name, "label": f"{joint_letter(name.rpartition('.')[2])}{leg + 1}"}
+            for name, (leg, _) in joints.items()
+        ],
+        clicks=clicks,
+        drawing=Markup(draw_machine(machine, in_page=True)),
+        sigma=SIGMA_PX,
+        first=min(unplaced, default=0),
+        token=token,
+    )
+
+
 def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
     """Return both ends [px] of the outlines of an image that were expected and not found."""
     measurements, names = detection.dataset.measurements, detection.dataset.machine.leg_names
@@ -239,13 +313,33 @@ def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
     return expected
 
 
-def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int) -> Array | None:
-    """Return the ends (2, 2) of a predicted outline [px], the first nearer to the base."""
+def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int, n: int = 2) -> Array | None:
+    """Return points (n, 2) of a predicted outline [px], from its end nearer to the base."""
     for i, segment in enumerate(leg.segments):
         band = leg.bands[i]
         if segment.link == part and band is not None:
-            h, t = leg.outlines[i][edge - 1], np.array([0.0, band.length])
+            h, t = leg.outlines[i][edge - 1], np.linspace(0.0, band.length, n)
             xy = band.points(t, band.offsets(h, t))
-            rays = np.column_stack([xy, np.ones(2)])
+            rays = np.column_stack([xy[[0, -1]], np.ones(2)])
             return camera.distort(xy if cross(rays[1], rays[0]) @ h > 0.0 else xy[::-1])
     return None
+
+
+def edges_seen_from(
+    detection: Detection, row: int, T_base_camera: RigidTransform
+) -> list[dict[str, Any]]:
+    """Return where the edges of the legs of an image would be seen by a camera: points [px]."""
+    measurements, names = detection.dataset.measurements, detection.dataset.machine.leg_names
+    v = int(measurements.view[row])
+    cameras = list(detection.T_base_camera)
+    cameras[v] = T_base_camera
+    camera, found = measurements.views[v].camera, []
+    for leg in replace(detection, T_base_camera=tuple(cameras)).predicted(row):
+        edges = [
+            _ends(camera, leg, segment.link, edge, _ALONG)
+            for segment in leg.segments
+            for edge in (1, 2)
+        ]
+        shown = [np.round(edge, 2).tolist() for edge in edges if edge is not None]
+        found.append({"leg": names[leg.leg], "edges": shown})
+    return found

@@ -27,6 +27,7 @@ from legcal.data.image_tables import (
     measurements_at,
     reorder_measurements,
 )
+from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, few, row_names
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
@@ -86,7 +87,15 @@ class OrderedDataset:
             detect=np.sort(detect[shows]),
             keep=self.order.reorder(self.plan.keep),
             edge_pairs=self.edge_pairs,
+            clicked_poses=self._clicked_poses(),
         )
+
+    def _clicked_poses(self) -> dict[int, tuple[RigidTransform, ...]]:
+        """Return T_base_platform by clicks, by pose, where readings do not give it."""
+        if self.machine.is_determined or self.dataset.landmarks is None:
+            return {}
+        landmarks = self.order.reorder(self.dataset.landmarks)
+        return platforms_by_landmarks(self.machine, self.measurements, landmarks)
 
     @cached_property
     def fitted_legs(self) -> FittedLegs:

@@ -309,7 +309,12 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
         T if v in shown else None
         for v, T in enumerate(estimate.solution.cameras_in_base(fitted.machine.T_base_Rb))
     ]
-    hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
+    hints = hint_notes(
+        [view.name for view in views],
+        [view.T_base_camera for view in views],
+        cameras,
+        by_landmarks=fitted.measurements.clicked_views,
+    )
     return (*hints, *image_notes(fitted.measurements, estimate.outliers))
 
 

@@ -19,9 +19,13 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import few_views
+from legcal.geometry.motions import components
+from legcal.machine.rods import ends_at_poses
 from legcal.perception.diagnostics import far_off
 
 _DO_NOT_LOAD = "Do not load this into the controller"
+# Of half the clicks of a view from where a fit has their joints: hands are steadier
+MAX_CLICK_SIGMAS = 4.0
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
 
@@ -99,6 +103,17 @@ def _objection(
             "is wrong; look at them in the table of observations, and correct them or leave the "
             "leg out of the legs of that view."
         )
+    contradicted = [
+        f"{name} ({px:.0f} px)"
+        for name, (px, most) in click_distances(dataset, solution).items()
+        if px > most
+    ]
+    if contradicted:
+        return (
+            f"{_DO_NOT_LOAD}: {found}, but most clicks on joints in {few_views(contradicted)} are "
+            f"that far from where the fit has these joints, so that it is wrong or they are; look "
+            "at the outlines in these images, and at the clicks (legcal detect --edit)."
+        )
     if strayed := _strayed_cameras(dataset, solution):
         return (
             f"{_DO_NOT_LOAD}: {found}, but the fit has {strayed} far from the rough T_base_camera "
@@ -106,6 +121,29 @@ def _objection(
             "it again, or take images that show more legs."
         )
     return ""
+
+
+def click_distances(dataset: Dataset, solution: Solution) -> dict[str, tuple[float, float]]:
+    """Return how far clicks are from where a fit has their joints, and may be, by view [px].
+
+    Both are medians: a click in two may be on another joint.
+    """
+    if dataset.landmarks is None:
+        return {}
+    clicks, m = dataset.landmarks, dataset.measurements
+    A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    ends = np.stack([A, B], axis=2)[m.pose[clicks.row], clicks.leg, clicks.end]
+    view, found = m.view[clicks.row], dict[str, tuple[float, float]]()
+    for v in np.unique(view).tolist():
+        own = np.flatnonzero(view == v)
+        P = solution.T_camera_Rb[v].apply(ends[own])
+        off = np.full(len(own), np.inf)
+        ahead = P[:, 2] > 0.0
+        seen = solution.cameras[v].project(P[ahead])
+        off[ahead] = np.linalg.norm(seen - clicks.px[own][ahead], axis=1)
+        may_be = MAX_CLICK_SIGMAS * float(np.median(clicks.sigma_px[own]))
+        found[m.views[v].name] = float(np.median(off)), may_be
+    return found
 
 
 def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +24,10 @@ from legcal.cli.options import (
 )
 from legcal.errors import UsageError, printable
 from legcal.vision.distortion import DistortionModel
+
+if TYPE_CHECKING:
+    from legcal.calibration.detection import Detection
+    from legcal.calibration.examination import Examination
 
 
 def camera(
@@ -85,6 +90,17 @@ def detect(
             "found in it.",
         ),
     ],
+    edit: Annotated[
+        bool,
+        typer.Option(
+            "--edit",
+            help="Then serve the page to the browser of this machine: the legs are drawn at the "
+            "cameras that follow from clicks on joints, and these are saved into the dataset.",
+        ),
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The port of --edit; 0 for any that is free.")
+    ] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
@@ -95,14 +111,37 @@ def detect(
     Exit 1 if a camera could not be placed or no outline can be used.
     """
     from legcal.calibration import doctor as job
+    from legcal.data.dataset import load_dataset
     from legcal.report.doctor import examination_table
 
+    if edit:
+        from legcal.viewer.address import Address, check_address
+        from legcal.viewer.click_server import HOST
+
+        check_address(Address(HOST, port))
     found = job.doctor(
-        dataset, output=output, progress=not quiet, workers=image_workers(cluster, workers)
+        load_dataset(dataset, check_clicks=False) if edit else dataset,
+        output=output,
+        progress=not quiet,
+        workers=image_workers(cluster, workers),
     )
     show(as_json, found.document, lambda: examination_table(found, output))
+    if edit and found.detection is not None:
+        _serve_clicks(found, found.detection, output, port)
     if any(view.problem for view in found.views) or not found.n_used:
         raise typer.Exit(1)
+
+
+def _serve_clicks(found: Examination, detection: Detection, folder: Path, port: int) -> None:
+    """Serve the page of a detection until it is interrupted."""
+    from legcal.cli.view import open_browser
+    from legcal.viewer.click_server import ClickServer
+
+    server = ClickServer(found, detection, folder, port)
+    typer.echo(f"{server.address} takes clicks on joints; Ctrl-C ends it.", err=True)
+    open_browser(str(server.address))
+    with suppress(KeyboardInterrupt):  # the way to end it
+        server.run()
 
 
 def doctor(
@@ -230,8 +269,8 @@ def inspect(
     from legcal.machine.inspection import machine_document
     from legcal.machine.loader import load_mechanism
     from legcal.machine.model_writer import write_model
+    from legcal.machine.picture import MACHINE_PICTURE, draw_machine
     from legcal.report.machine import inspect_table
-    from legcal.report.machine_picture import MACHINE_PICTURE, draw_machine
 
     if picture is not None:
         if picture.suffix.lower() != ".svg":

@@ -38,7 +38,7 @@ def init(
         typer.Option(
             metavar="[VIEW=]FILE",
             help="The camera file of all views, or of one (repeat it); by default camera_info.yaml "
-            "beside the photographs.",
+            "beside the photographs, else a rough one by the focal length in their EXIF data.",
         ),
     ] = None,
     unit: Annotated[

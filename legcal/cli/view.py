@@ -48,14 +48,20 @@ def view(
     window = Window(open_source(source, dataset), address)
     name = printable(window.source.name)
     print_table(Text(f"{window.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
-    if browser and _has_screen():
-        import webbrowser
-
-        webbrowser.open(str(window.address))
+    if browser:
+        open_browser(str(window.address))
     try:
         window.run()
     except KeyboardInterrupt:  # the way to end it
         window.close()
+
+
+def open_browser(address: str) -> None:
+    """Open the browser at an address, where it can have windows."""
+    if _has_screen():
+        import webbrowser
+
+        webbrowser.open(address)
 
 
 def _has_screen() -> bool:

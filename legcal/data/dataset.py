@@ -22,7 +22,20 @@ from legcal.data.dataset_file import (
     read_dataset_file,
     view_problems,
 )
-from legcal.data.measurements import Measurements, View, few, few_views, read_measurements
+from legcal.data.landmarks import (
+    LANDMARKS_NAME,
+    Landmarks,
+    place_by_landmarks,
+    read_landmarks,
+)
+from legcal.data.measurements import (
+    Measurements,
+    View,
+    few,
+    few_views,
+    read_measurements,
+    unread_motors,
+)
 from legcal.data.outlines import Outlines, read_observations
 from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
@@ -73,6 +86,7 @@ class Dataset:
     overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
+    landmarks: Landmarks | None = None  # the rows of ``landmarks.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
     file_notes: tuple[str, ...] = ()  # those of the notes that come from these
@@ -234,7 +248,9 @@ def _encoder_sigmas(
     return min(linear, default=ENCODER_SIGMAS[0]), {name: known[name] for name in motors}
 
 
-def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
+def load_dataset(
+    folder: str | Path, *, check_images: bool = True, check_clicks: bool = True
+) -> Dataset:
     """Read a dataset and check everything in it that can be checked without decoding images.
 
     Parameters
@@ -244,6 +260,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     check_images : bool
         Also check that every image that must be read exists, is complete and has the size of
         its camera file.
+    check_clicks : bool
+        Refuse clicks in ``landmarks.csv`` that do not place the camera of their view. Without, such
+        a view starts as if it had none, and a note says why.
 
     Returns
     -------
@@ -270,7 +289,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
-    machine = load_mechanism(_mechanism_path(folder, entry.mechanism))
+    mechanism = _mechanism_path(folder, entry.mechanism)
+    machine = load_mechanism(mechanism)
     problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
     if problems:
         raise DatasetError(problems)
@@ -281,13 +301,28 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     table_path = folder / entry.measurements
     units = reading_units(yaml_path, machine.legs, entry.readings)
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
+    unread = unread_motors(table_path, machine.legs)
+    if unread:
+        _check_unread(table_path, machine, unread)
+        machine = load_mechanism(mechanism, without=unread)
+        by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
     rows, notes = read_measurements(
-        table_path, folder, views, machine.legs, sigma_q, by_joint, units
+        table_path, folder, views, machine.legs, sigma_q, by_joint, units, unread
     )
+    if unread:
+        notes = (*notes, _without_readings(table_path, machine, unread))
     measurements, origin, taken = expand_hand_held(yaml_path, rows, entry.views)
     if taken:
         raise DatasetError(taken)
     _refuse_two_tables(folder)
+    landmarks = None
+    of_clicks: list[str] = []
+    if os.path.exists(folder / LANDMARKS_NAME):
+        path = folder / LANDMARKS_NAME
+        landmarks = read_landmarks(path, machine.leg_names, measurements)
+        measurements, of_clicks = place_by_landmarks(
+            path, machine, measurements, landmarks, may_be_wrong=not check_clicks
+        )
     axes, left_out = read_given_axes(folder / AXES_NAME, machine.leg_names, measurements)
     dataset = Dataset(
         folder=folder,
@@ -297,11 +332,12 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         machine=machine,
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
-        notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
+        notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
+        landmarks=landmarks,
     )
     if hidden := _invisible(dataset):
         raise DatasetError(hidden)
@@ -311,6 +347,29 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     if unusable:
         raise DatasetError(_without_photographs(dataset) or [what for _, what in unusable])
     return dataset
+
+
+def _check_unread(path: Path, machine: Machine, unread: Sequence[str]) -> None:
+    """Refuse that motors which move joints at A are not read: nothing says where legs begin."""
+    moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
+    if moving:
+        columns = f"column{'s' * (len(moving) > 1)} {few(moving)}"
+        raise DatasetError(
+            f"{path}, {columns}: the readings could not be left open: found empty cells in all "
+            "rows of what moves joints at the base, needed its readings, since the images alone do "
+            "not say where the rods begin; record them."
+        )
+
+
+def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> str:
+    """Return a note on motors without readings."""
+    said = f"{path}: the readings of {few(unread)} are not known (empty cells): "
+    if machine.is_determined:
+        return said + "the others give the pose of the platform, and these legs are passive."
+    return (
+        f"{said}the pose of the platform is found in each image, and the offsets of these legs "
+        "stay as the model has them."
+    )
 
 
 def _without_photographs(dataset: Dataset) -> str:

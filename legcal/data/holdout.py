@@ -56,6 +56,7 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
         observations=None if observations is None else observations.at(rows),
         axes=None if axes is None else axes.at(rows),
         corners=None if corners is None else corners.at(rows),
+        landmarks=None if dataset.landmarks is None else dataset.landmarks.at(rows),
     )
 
 

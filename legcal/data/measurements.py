@@ -9,7 +9,7 @@ show name their rows by view and image, see :func:`row_names`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -26,7 +26,7 @@ from legcal.data.reading_units import (
     legs_with_readings,
     sigmas_of_legs,
 )
-from legcal.errors import Problem
+from legcal.errors import DatasetError, Problem
 from legcal.files.folder import path_problem
 from legcal.files.quantity import ANGLE, LENGTH
 from legcal.files.schema import closest, describe
@@ -47,6 +47,7 @@ HARDLY_MOVES, MAY_MOVE, SURELY_MOVES = 0.02, 0.2, 0.5
 WOULD_MOVE = 0.05  # what readings outside the travel would use of it in what they are taken for
 MIN_POSES = 5  # different ones, as an arm needs (6'): fewer are a check, and may be near each other
 USUAL_PULSES = (400.0, 2700.0)  # [us], of hobby servos
+_TEXTS = ("view", "image", "pose")  # columns
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
 
@@ -59,6 +60,7 @@ class View:
     T_base_camera: RigidTransform | None = None  # rough: good to 2 cm and 2 degrees
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
     hand_held: bool = False  # one image of a camera in the hand, which only the board can place
+    by_landmarks: bool = False  # whether the rough pose is that of clicks on joints
 
     def uses(self, leg: str) -> bool:
         """Say whether a leg, by its name, is to be used in this view."""
@@ -103,6 +105,11 @@ class Measurements:
     def n_poses(self) -> int:
         """Number of different platform poses."""
         return int(self.pose.max()) + 1 if len(self.pose) else 0
+
+    @property
+    def clicked_views(self) -> tuple[str, ...]:
+        """The views whose rough poses are those of clicks on joints."""
+        return tuple(view.name for view in self.views if view.by_landmarks)
 
     def sigma_of(self, legs: Sequence[Leg]) -> Array:
         """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
@@ -193,6 +200,23 @@ def reading_columns(
         )
         for leg in legs_with_readings(legs)
     ]
+
+
+def unread_motors(path: Path, legs: Sequence[Leg]) -> tuple[str, ...]:
+    """Return the motors whose readings a table leaves empty in all of its rows.
+
+    What else is wrong with the table is no concern of this.
+    """
+    motors = [str(leg.prismatic) for leg in legs_with_readings(legs)]
+    others = [Column(name, "text", blank=True, required=False) for name in _TEXTS]
+    columns = [Column(name, "text", blank=True, required=False) for name in motors]
+    try:
+        table = read_table(path, "table of measurements", "row", [*others, *columns])
+    except DatasetError:
+        return ()
+    return tuple(
+        name for name in motors if name in table and len(table) and not any(table.text(name))
+    )
 
 
 def readings_in(
@@ -480,16 +504,17 @@ def read_measurements(
     sigma_q: float,
     sigma_by_joint: Mapping[str, float] = MappingProxyType({}),
     units: Mapping[str, ReadingUnit] = MappingProxyType({}),
+    unread: Collection[str] = (),
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
 
-    Images are relative to ``folder``; whether they exist is not looked at. Raises DatasetError
-    with one sentence for each thing that is wrong.
+    Images are relative to ``folder``; whether they exist is not looked at. Columns of *unread*
+    motors, which are empty, are not those of a leg with a reading. Raises DatasetError with one
+    sentence for each thing that is wrong.
     """
     texts = [
-        Column("view", "text"),
-        Column("image", "text"),
-        Column("pose", "text", required=False),
+        *(Column(name, "text", required=name != "pose") for name in _TEXTS),
+        *(Column(name, "text", blank=True) for name in unread),
     ]
     table = read_table(
         path,

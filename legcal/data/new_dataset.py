@@ -13,14 +13,14 @@ import itertools
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
 
 from legcal.data.dataset_file import ENCODER_SIGMAS
-from legcal.data.measurements import few, reading_columns
+from legcal.data.measurements import few, few_views, reading_columns
 from legcal.data.photograph_matching import (
     Matching,
     Photograph,
@@ -37,14 +37,18 @@ from legcal.errors import DatasetError, UsageError
 from legcal.files.folder import OutputKind, check_path, result_folder
 from legcal.files.published import with_schema
 from legcal.files.quantity import LENGTH, parse_quantity
+from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
 from legcal.files.table import format_table
 from legcal.machine.files import DATASET_YAML, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_file import inspect_image
+from legcal.vision.exif_camera import FOCAL_SIGMA, camera_of_photographs, rough_camera_info
+from legcal.vision.image_facts import read_facts
+from legcal.vision.image_file import BadImage, image_size, inspect_image
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
 MEASUREMENTS = "measurements.csv"
@@ -118,6 +122,8 @@ class NewDataset:
         One standard deviation of a reading [m], by joint [m or rad] where a motor turns.
     notes : tuple of str
         What is odd, or was chosen.
+    made_cameras : mapping
+        Contents of camera files that are to be made, of what photographs say of their cameras.
     """
 
     machine: Machine
@@ -135,6 +141,7 @@ class NewDataset:
     cameras: Mapping[str, Path]
     encoder_sigma: float | dict[str, float]
     notes: tuple[str, ...]
+    made_cameras: Mapping[Path, str] = field(default_factory=dict)
 
     @property
     def joints(self) -> list[str]:
@@ -244,7 +251,7 @@ def plan_new_dataset(
     rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
-    cameras = _cameras(folder, matching, view_of, options.cameras)
+    cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
     sigma, sigma_notes = _sigmas(
         options.encoder_sigma, sheet.motors, found, MIN_SIGMA * machine.size
     )
@@ -268,9 +275,25 @@ def plan_new_dataset(
             *sheet.notes,
             *matching.notes,
             *sigma_notes,
+            *_made_notes(cameras, made),
             *([] if views_stated else _view_notes(pattern, matching, view_of)),
         ),
+        made_cameras={path: text for path, (_, text) in made.items()},
     )
+
+
+def _made_notes(
+    cameras: Mapping[str, Path], made: Mapping[Path, tuple[Camera, str]]
+) -> Iterator[str]:
+    """Yield that cameras are known by their focal length alone."""
+    for path, (camera, _) in made.items():
+        views = [view for view, own in cameras.items() if own == path]
+        yield (
+            f"The camera of {few_views(views)} is only known by the focal length in the EXIF data "
+            f"of its photographs, {camera.K[0, 0]:.0f} px, taken as good to "
+            f"{100 * FOCAL_SIGMA:.0f} %: calibrate estimates it with the machine; calibrate the "
+            "camera with legcal camera for a result that does not depend on it."
+        )
 
 
 def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str]) -> Iterator[str]:
@@ -303,6 +326,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
     check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
+    names |= {camera: camera.name for camera in new.made_cameras}
     own = [DATASET_YAML, MEASUREMENTS, *names.values()]
     linked = {
         new.place(photograph): photograph.path.resolve()
@@ -310,7 +334,12 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         if not photograph.path.resolve().is_relative_to(new.destination.resolve())
     }
     there = [name for name in [*own, *linked] if os.path.lexists(new.destination / name)]
-    contents = {names[camera]: camera.read_bytes() for camera in cameras}
+    contents = {
+        names[camera]: new.made_cameras[camera].encode()
+        if camera in new.made_cameras
+        else camera.read_bytes()
+        for camera in cameras
+    }
     if there and not force:
         raise UsageError(
             f"{new.destination}: the dataset could not be written: found {few(there)} already "
@@ -437,11 +466,16 @@ def _view(row: Row, photograph: Photograph) -> str:
 
 
 def _cameras(
-    folder: Path, matching: Matching, view_of: Sequence[str], given: Sequence[str]
-) -> dict[str, Path]:
+    folder: Path,
+    destination: Path,
+    matching: Matching,
+    view_of: Sequence[str],
+    given: Sequence[str],
+) -> tuple[dict[str, Path], dict[Path, tuple[Camera, str]]]:
     """Return the camera file of each view: as given, else beside its photographs or above them.
 
-    Photographs that do not fit it are refused.
+    Where there is none, one is made of what photographs say of their focal length: such cameras
+    with the contents of their files come second. Photographs that do not fit theirs are refused.
     """
     views = list(dict.fromkeys(view_of))
     bad = sorted(view for view in views if not is_name(view))
@@ -482,17 +516,32 @@ def _cameras(
         path = Path(text) if text else next((path for path in near if path.is_file()), None)
         if path is not None:
             found[view] = path
+    made = dict[Path, tuple[Camera, str]]()
+    for view in views:
+        own = [p.path for (_, p), name in zip(matching.pairs, view_of, strict=True) if name == view]
+        camera = None if view in found else _camera_by_exif(own)
+        if camera is not None:
+            text = rough_camera_info(camera, "exif")
+            path = next((path for path, (_, other) in made.items() if other == text), None)
+            if path is None:
+                path = destination / f"camera_exif{f'_{len(made) + 1}' * bool(made)}.yaml"
+                made[path] = camera, text
+            found[view] = path
     missing = [view for view in views if view not in found]
     if missing:
         problems.append(
             f"{folder}: the camera of view{'s' * (len(missing) > 1)} {few(missing)} could not be "
-            f"found: found no --camera and no {_CAMERA_NAMES[0]} beside the photographs, needed "
+            f"found: found no --camera, no {_CAMERA_NAMES[0]} beside the photographs and not one "
+            "focal length in their EXIF data, needed "
             "the file of its calibration; make it with: legcal camera BOARDS --board "
             "chessboard:9x6:25mm -o camera_info.yaml, and give --camera camera_info.yaml."
         )
     if problems:
         raise DatasetError(problems)
-    read = {path: read_camera(path) for path in dict.fromkeys(found.values())}
+    read = {
+        path: made[path][0] if path in made else read_camera(path)
+        for path in dict.fromkeys(found.values())
+    }
     unusable = [
         problem
         for (_, photograph), view in zip(matching.pairs, view_of, strict=True)
@@ -500,7 +549,17 @@ def _cameras(
     ]
     if unusable:
         raise DatasetError(unusable)
-    return found
+    return found, made
+
+
+def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:
+    """Return the camera of photographs by what they say of it; None where they say too little."""
+    contents = [read_bytes(path, MAX_IMAGE) for path in paths]
+    try:
+        size = image_size(contents[0])
+    except BadImage:
+        return None
+    return camera_of_photographs([read_facts(one) for one in contents], size.width, size.height)
 
 
 def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:

@@ -6,7 +6,7 @@ platform are classified as legs, and a closed pose is found; every check below n
 with the file.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +94,7 @@ _DEVIATION = {  # by [deg]
 }
 
 
-def load_mechanism(model: str | Path) -> Machine:
+def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machine:
     """Return the mechanism of a file, its legs found from geometry.
 
     Parameters
@@ -102,6 +102,8 @@ def load_mechanism(model: str | Path) -> Machine:
     model : str or Path
         A mechanism YAML, or a folder with ``robot.yaml``; a URDF with its YAML beside it (or in
         ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
+    without : collection of str
+        Sliders of legs that are taken for passive although ``name_mot`` has them.
 
     Raises
     ------
@@ -110,7 +112,11 @@ def load_mechanism(model: str | Path) -> Machine:
     OutOfClass
         If the mechanism is not one that the method covers.
     """
-    return _load(read_source(model))
+    source = read_source(model)
+    if without:
+        left = [name for name in source.file.name_mot if name not in without]
+        source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
+    return _load(source)
 
 
 def _load(source: Source) -> Machine:

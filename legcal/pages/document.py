@@ -158,6 +158,7 @@ class Picture:
     caption: str
     warning: str = ""  # what is said in red
     edit: int | None = None  # its place in the editor of outlines of the page
+    place: int | None = None  # its place in the editor of landmarks, if it is offered there
 
     @property
     def is_inside(self) -> bool:
@@ -189,6 +190,27 @@ class OutlineEditor:
         """The table, compressed, as a text."""
         data = gzip.compress(self.table.encode(), mtime=0)
         return Markup(base64.b64encode(data).decode())
+
+
+@dataclass(frozen=True)
+class LandmarkEditor:
+    """Joints that people click in photographs, and a table of them to download.
+
+    An image has ``view`` and ``image`` as the table names it, a ``label``, its ``photograph``
+    relative to the page, ``width`` and ``height`` [px]. A joint has its ``name`` in the table and
+    its ``label`` in the drawing, whose discs have the name in ``data-joint``. Clicks are numbers of
+    image and joint, u and v [px], and sigma as the table has it.
+    """
+
+    kind: ClassVar = "landmarks"
+    file: str  # the name of the table
+    images: Sequence[Mapping[str, Any]]
+    joints: Sequence[Mapping[str, str]]
+    clicks: Sequence[tuple[int, int, float, float, str]]
+    drawing: Markup  # of the machine
+    sigma: float  # of a click, unless people say otherwise [px]
+    first: int = 0  # the image that is shown first
+    token: str = ""  # what a server knows its page by; "" where the page is a file
 
 
 @dataclass(frozen=True)

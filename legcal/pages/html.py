@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from legcal.errors import printable
 from legcal.files.folder import OutputFile
-from legcal.pages.document import OutlineEditor, Page, Picture, Plot, Row
+from legcal.pages.document import LandmarkEditor, OutlineEditor, Page, Picture, Plot, Row
 from legcal.version import __version__
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ MARK = "legcal-page"  # the name by which a page of legcal is known
 PAGE = OutputFile(
     "the page", "page", "", "a new file or an earlier page of legcal", mark=MARK.encode()
 )
+
+_EDITORS = {OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
 
 
 def time_of_page() -> str:
@@ -47,11 +49,12 @@ def page_html(page: Page) -> str:
             version=__version__,
             style=_asset("page.css"),
             script=_asset("page.js"),
-            editor_script=(
-                _asset("editor.js")
-                if any(isinstance(block, OutlineEditor) for block in blocks)
-                else ""
-            ),
+            editor_scripts=[
+                _asset(name)
+                for kind, name in _EDITORS.items()
+                if any(isinstance(block, kind) for block in blocks)
+            ],
+            served=any(isinstance(block, LandmarkEditor) and block.token for block in blocks),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
             plotly=_plotly() if any(isinstance(block, Plot) for block in blocks) else "",
         )

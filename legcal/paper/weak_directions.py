@@ -51,6 +51,8 @@ def hold_at_nominal(
     nominal = problem.start[:n] if nominal is None else nominal
     information = _without_poses(problem.derivative_at_start(weighted=weighted), n)
     lengths = machine.offsets[np.isfinite(machine.offsets)]
+    if not len(lengths):  # a machine that is moved by hand
+        lengths = machine.parameters.offsets
     sigma_length = _SIGMA_LENGTH * float(np.mean(np.abs(lengths)))
     sigma = np.where(unknowns.is_angle, _SIGMA_AXIS, sigma_length)[wanted]
     in_it = np.zeros(len(problem.start), dtype=np.bool_)

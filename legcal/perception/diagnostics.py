@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, is_edited
 from legcal.data.reasons import USED, Reason, Rejection
@@ -524,18 +525,28 @@ def hint_notes(
     hints: Sequence[RigidTransform | None],
     cameras: Sequence[RigidTransform | None],
     reach: float = 1.0,
+    *,
+    by_landmarks: Collection[str] = (),
 ) -> list[str]:
     """Return notes on rough T_base_camera of views that the images contradict.
 
     ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
     many times farther than rough poses are they may be. Views that mean the same other thing have
-    one note.
+    one note. Those of some views, by their names, follow from clicks.
     """
     notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by what they mean
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not far_off(hint, T, reach):
             continue
         apart, angle = pose_distance(hint, T)
+        if name in by_landmarks:
+            notes.append(
+                f"view {name}: the images contradict its clicks: found the camera "
+                f"{1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg from where the images put "
+                "it, needed clicks on the joints that they name; check those of the view in "
+                f"{LANDMARKS_NAME}."
+            )
+            continue
         x, y, z = T.translation
         other = next(
             (

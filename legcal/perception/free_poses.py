@@ -15,12 +15,14 @@ can be measured at each of them decide.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import (
@@ -67,6 +69,7 @@ TRAVEL_SIGMA = 0.0125  # beyond the travel of a slider without a motor
 MODEL_COST, MODEL_WIDTH = 0.01, 5.0
 CAMERA_SIGMA = 0.03, 0.03  # of a rough pose: angle [rad], place as a part of the distance
 TURN_SIGMA, PLACE_SIGMA = 0.1, 0.1  # of a pose that its images do not determine [rad], leg lengths
+CLICKED_SIGMA, N_AROUND = (0.06, 0.03), 12  # of a pose by clicks, as before; poses around it
 MAX_STEP = 3.0  # of these, in one step
 ROUNDS = 2  # of a search in each image and a fit of all
 CHOICES, APART = 3, 0.12  # poses of an image that are kept, as far apart [leg lengths of joints]
@@ -101,14 +104,22 @@ class _Scene:
     drawn: Array  # (n_drawn, 3, 4) poses of the workspace
     targets: tuple[LegSegments, ...]  # what is to be seen at them
     images: Mapping[int, Sequence[_Image]]  # by pose
+    # (n, 3, 4) by pose: where clicks have the platform, and around; drawn ones are not tried then
+    clicked: Mapping[int, Array] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, machine: Machine, wanted: BoolArray, q: Array, images: Mapping[int, Sequence[_Image]]
+        cls,
+        machine: Machine,
+        wanted: BoolArray,
+        q: Array,
+        images: Mapping[int, Sequence[_Image]],
+        clicked: Mapping[int, Sequence[RigidTransform]],
     ) -> _Scene:
         """Return the scene of a machine and its images."""
         drawn = _drawn(machine)
-        return cls(machine, wanted, q, drawn, tuple(_targets(machine, drawn)), images)
+        around = {pose: _around(machine, every) for pose, every in clicked.items()}
+        return cls(machine, wanted, q, drawn, tuple(_targets(machine, drawn)), images, around)
 
     def pictures(
         self, targets: Sequence[LegSegments], of_pose: Sequence[int], cameras: Array
@@ -162,6 +173,16 @@ def _targets(machine: Machine, poses: Array) -> list[LegSegments]:
     return [leg_segments(A, at, cylinders, every) for at in B]
 
 
+def _around(machine: Machine, T_base_platform: Sequence[RigidTransform]) -> Array:
+    """Return rough poses and others around each of them (n, 3, 4), as far as they may be off."""
+    rng = np.random.default_rng(SEED)
+    unit = np.repeat([CLICKED_SIGMA[0], CLICKED_SIGMA[1] * machine.size], 3)
+    given = np.array([T.as_matrix()[:3] for T in T_base_platform])
+    others = np.repeat(given, N_AROUND, axis=0)
+    others = poses_after(others, unit * rng.normal(size=(len(others), 6)))
+    return np.concatenate([given, _constrained(machine, others, machine.size)[0]])
+
+
 def _drawn(machine: Machine) -> Array:
     """Return poses (n, 3, 4) of the workspace: inside the travel of all sliders, whatever they say.
 
@@ -203,8 +224,11 @@ def find_free_poses(
     hints: Sequence[RigidTransform | None],
     run: Run,
     progress: Callable[[int], None],
+    clicked: Mapping[int, Sequence[RigidTransform]] = MappingProxyType({}),
 ) -> FreePoses:
     """Find the platform poses that the images of rows show, and their cameras, near rough ones.
+
+    Where clicks have the platform at a pose, T_base_platform, it is looked for there alone.
 
     Raises
     ------
@@ -219,7 +243,7 @@ def find_free_poses(
         view = int(m.view[row])
         image = _Image(view, pairs, sensor_extent(m.views[view].camera))
         images.setdefault(int(m.pose[row]), []).append(image)
-    scene = _Scene.of(machine, search.wanted, m.q_of_poses, images)
+    scene = _Scene.of(machine, search.wanted, m.q_of_poses, images, clicked)
     rough = _cameras_of(hints)
     cameras, every = rough, dict[int, _Guesses]()
     for _ in range(ROUNDS):
@@ -248,23 +272,34 @@ def require_standing_joints(machine: Machine) -> None:
         )
 
 
+def views_without_rough_camera(
+    measurements: Measurements, rows: Sequence[int], cameras: Sequence[RigidTransform | None]
+) -> list[str]:
+    """Return the views of images without a rough camera pose, by their names."""
+    views = sorted({int(measurements.view[row]) for row in rows})
+    return [measurements.views[v].name for v in views if cameras[v] is None]
+
+
 def require_rough_cameras(
     measurements: Measurements, rows: Sequence[int], cameras: Sequence[RigidTransform | None]
 ) -> None:
     """Refuse views of images without a rough camera pose, where readings do not give the poses."""
-    views = sorted({int(measurements.view[row]) for row in rows})
-    missing = [measurements.views[v].name for v in views if cameras[v] is None]
+    missing = views_without_rough_camera(measurements, rows, cameras)
     if missing:
         raise NotIdentifiable(
             f"{few_views(missing)}: the images could not be searched: found no rough camera pose, "
             "needed one (2 cm, 2 deg), since the motors do not determine the pose of the platform; "
-            "write T_base_camera into dataset.yaml."
+            f"click its joints at the base ({LANDMARKS_NAME}), or write T_base_camera into "
+            "dataset.yaml."
         )
 
 
 def _searched(scene: _Scene, cameras: Array, k: int) -> _Guesses:
     """Return the poses at which the images of pose *k* show most legs, best first."""
     found, targets = _Guesses.before(cameras, scene.drawn), list(scene.targets)
+    if k in scene.clicked:
+        found = _Guesses.before(cameras, scene.clicked[k])
+        targets = _targets(scene.machine, found.poses)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
         score = _scores(scene, cameras, k, found, targets, tolerance)
         found = found.take(np.argsort(-score, kind="stable"))

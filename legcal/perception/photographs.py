@@ -84,6 +84,8 @@ class Photographs:
     keep: Outlines  # outlines to use as they are; edited ones win over detected ones
     # Edge pairs of rows that were searched, kept for who looks at the same images again
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
+    # T_base_platform by clicks, by pose, where readings do not give it
+    clicked_poses: FreePosesOf = field(default_factory=dict)
     still: dict[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
@@ -345,6 +347,7 @@ def _with_free_poses(
         nominal.T_base_camera,
         photographs.run,
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
+        photographs.clicked_poses,
     )
     nominal = replace(nominal, T_base_camera=found.T_base_camera)
     first = {pose: choices[0] for pose, choices in found.T_base_platform.items()}

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
@@ -439,7 +440,7 @@ def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bo
             "mirrored images by the originals, or check what may look the same: the order of the "
             "columns of readings, and the signs of y in the model."
         )
-    where = "near its T_base_camera or anywhere else" if hinted else "anywhere"
+    where = "near its rough pose or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:
         return (
             f"view {name}: its camera could not be placed: found no pair of edges in its images "
@@ -447,20 +448,21 @@ def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bo
             "sharp and neither black nor overexposed."
         )
     legs, n = float(placed.support[0].mean()), placed.expected[0].mean()
+    clicked = "" if hinted else f"; or click its joints ({LANDMARKS_NAME})"
     if not placed.is_enough:
         return (
             f"view {name}: its camera could not be placed: found no pose {where} at which its "
             f"images show the legs (at the best one {legs:.1f} of {n:.0f} legs an image), needed "
             f"{placed.needed:.1f}; check that the images belong to this machine and to their "
             "readings, that they are no mirror images, the camera file, and the legs of the view "
-            "if dataset.yaml names them."
+            f"if dataset.yaml names them{clicked}."
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
         return (
             f"view {name}: its camera could not be placed: found too few outlines at the pose "
             f"{where} at which its images show {legs:.1f} of {n:.0f} legs an image, needed more "
             "than other edges in the images make as well; add images at other readings, in "
-            "better light, or a rough T_base_camera."
+            f"better light, or clicks on its joints ({LANDMARKS_NAME})."
         )
     other = placed.pose(1)
     apart = placed.pose().inv() * other
@@ -469,5 +471,6 @@ def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bo
         f"the legs about as well ({legs:.1f} and {placed.support[1].mean():.1f} legs an image; "
         f"{1e3 * np.linalg.norm(apart.translation):.0f} mm and "
         f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart), needed one; add images at "
-        "readings that differ more between the legs, or a rough T_base_camera."
+        "readings that differ more between the legs, or clicks on its joints "
+        f"({LANDMARKS_NAME})."
     )

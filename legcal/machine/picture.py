@@ -37,8 +37,11 @@ MACHINE_PICTURE = OutputFile(
 )
 
 
-def draw_machine(machine: Machine) -> str:
-    """Return a machine as SVG: from above (x to the right, y up) and from the side (z up)."""
+def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
+    """Return a machine as SVG: from above (x to the right, y up) and from the side (z up).
+
+    Of a file these stand side by side; *in_page*, which is narrow, one stands below the other.
+    """
     sketch = sketch_of(machine)
     views = sketch.panels
     B = machine.home.apply(machine.B_platform)
@@ -47,11 +50,15 @@ def draw_machine(machine: Machine) -> str:
     points = np.concatenate([A, B, motors.standing.reshape(-1, 3), motors.moving.reshape(-1, 3)])
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
-    width, height = _SIDE * len(views), _HEAD + _SIDE + _LINE * (2 + (machine.n_legs + 3) // 4)
+    across, down = (1, len(views)) if in_page else (len(views), 1)
+    foot = _HEAD + _SIDE * down
+    width, height = _SIDE * across, foot + _LINE * (2 + (machine.n_legs + 3) // 4)
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}" '
-        f'viewBox="0 0 {width:g} {height:g}" font-family="sans-serif" font-size="12">',
-        _MARK.decode(),
+        f'<svg viewBox="0 0 {width:g} {height:g}" font-family="sans-serif" font-size="12"'
+        + f' xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}"'
+        * (not in_page)
+        + ">",
+        *([] if in_page else [_MARK.decode()]),
         '<rect width="100%" height="100%" fill="white"/>',
         _text((12, 20), f"{machine.name} at home", size=15),
     ]
@@ -59,13 +66,14 @@ def draw_machine(machine: Machine) -> str:
         ends = (panel.standing.reshape(-1, 2), panel.moving.reshape(-1, 2))
         both = np.concatenate([panel.A, panel.B, *ends])
         middle = 0.5 * (both.min(axis=0) + both.max(axis=0))
-        corner = np.array([_SIDE * (k + 0.5), _HEAD + 0.5 * _SIDE])
+        left, top = _SIDE * (k % across), _HEAD + _SIDE * (k // across)
+        corner = np.array([left, top]) + 0.5 * _SIDE
 
         def on_paper(points: Array, middle: Array = middle, at: Array = corner) -> Array:
             return np.asarray(at + scale * (points - middle) * [1.0, -1.0])
 
         A, B = on_paper(panel.A), on_paper(panel.B)
-        lines.append(_text((_SIDE * k + 12, _HEAD), panel.title))
+        lines.append(_text((left + 12, top), panel.title))
         if panel.is_plan:
             lines += [*_outline(on_paper(panel.rim), BASE_COLOUR), *_outline(B, PLATFORM_COLOUR)]
         for parts, thick in ((panel.standing, 2.0), (panel.moving, 6.0)):
@@ -75,12 +83,12 @@ def draw_machine(machine: Machine) -> str:
         for j, (a, b) in enumerate(zip(A, B, strict=True)):
             thick = 2.0 * scale * sketch.radii[j]
             lines.append(_line(a, b, LEG_COLOUR, max(thick, 1.5), opacity=0.7))
-        for letter, joints, colour in (("A", A, BASE_COLOUR), ("B", B, PLATFORM_COLOUR)):
-            lines += _joints(machine, letter, joints, colour, is_plan=panel.is_plan)
+        for end, joints, colour in (("base", A, BASE_COLOUR), ("platform", B, PLATFORM_COLOUR)):
+            lines += _joints(machine, end, joints, colour, is_plan=panel.is_plan)
         for frame, (origin, *arms) in panel.frames:
             tips = origin + _ARM / scale * np.array(arms)
             lines += _frame(frame, on_paper(np.vstack([origin, tips])))
-    lines += _legend(machine, scale)
+    lines += _legend(machine, scale, foot)
     return "\n".join([*lines, "</svg>"]) + "\n"
 
 
@@ -94,13 +102,17 @@ def _outline(joints: Array, colour: str) -> Iterator[str]:
 
 
 def _joints(
-    machine: Machine, letter: str, joints: Array, colour: str, *, is_plan: bool
+    machine: Machine, end: str, joints: Array, colour: str, *, is_plan: bool
 ) -> Iterator[str]:
-    """Yield discs with numbers, a ring around those that define the frames."""
+    """Yield discs with numbers and names, a ring around those that define the frames."""
     middle = joints.mean(axis=0)
-    sign = 1.0 if letter == "A" else -1.0  # numbers of the base outside or below
+    sign = 1.0 if end == "base" else -1.0  # numbers of the base outside or below
     for j, (x, y) in enumerate(joints):
-        yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>'
+        name = escape(printable(f"{machine.leg_names[j]}.{end}"))
+        yield (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}" data-joint="{name}">'
+            f"<title>{name}</title></circle>"
+        )
         if j in machine.frame_legs:
             yield (
                 f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="none" stroke="{colour}" '
@@ -109,7 +121,12 @@ def _joints(
         away = np.array([x, y]) - middle if is_plan else np.array([0.0, 1.0])
         away = away / max(float(np.linalg.norm(away)), 1e-9) * sign
         at = (x + 17.0 * away[0], y + 17.0 * away[1] + 4.0)
-        yield _text(at, f"{letter}{j + 1}", colour=colour, anchor="middle")
+        yield _text(at, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
+
+
+def joint_letter(end: str) -> str:
+    """Return the letter of joints at the base, A, or at the platform, B, before their numbers."""
+    return "A" if end == "base" else "B"
 
 
 def _frame(name: str, points: Array) -> Iterator[str]:
@@ -123,9 +140,8 @@ def _frame(name: str, points: Array) -> Iterator[str]:
         yield _text((at[0], at[1] - 2.0), letter, colour=colour, anchor="middle", size=11)
 
 
-def _legend(machine: Machine, scale: float) -> Iterator[str]:
+def _legend(machine: Machine, scale: float, y: float) -> Iterator[str]:
     """Yield a length to compare with, and which leg has which number."""
-    y = _HEAD + _SIDE
     step = _round_length(100.0 / scale)
     yield _line((12, y), (12 + step * scale, y), BASE_COLOUR, 2.0)
     yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")

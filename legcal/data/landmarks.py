@@ -1,0 +1,381 @@
+"""The table ``landmarks.csv``: joints that a person clicked in photographs, and cameras by them.
+
+One row a click: view and image, named as in ``observations.csv``; the joint, ``leg1.base`` or
+``leg1.platform``; its pixel in the photograph as it lies there; the standard deviation of that
+[px], 3 where the cell is empty. The nominal model says where the joints are at the readings of the
+image, so that four of them place the camera of the view: roughly, as a ``T_base_camera`` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.brief import brief
+from legcal.data.image_tables import ImageTable
+from legcal.data.measurements import (
+    Measurements,
+    find_rows,
+    places,
+    refuse_unknown_rows,
+    row_names,
+)
+from legcal.errors import DatasetError
+from legcal.files.schema import closest, describe
+from legcal.files.table import Column, format_table, read_table
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.kinematics import followed_poses
+from legcal.machine.model import B_at, Machine
+from legcal.vision.point_pose import (
+    MIN_POINTS,
+    TRUNCATION,
+    PointPose,
+    camera_poses_by_points,
+    on_a_line,
+)
+
+LANDMARKS_NAME = "landmarks.csv"
+SIGMA_PX = 3.0  # of a click, unless the table says otherwise
+SIGMA_RANGE = (0.01, 200.0)  # [px]: no click is better, and worse says nothing
+ENDS = ("base", "platform")
+COLUMNS = ("view", "image", "joint", "u", "v", "sigma")
+GOOD_NUMBER = 6  # of clicks in a view, which show that one is wrong
+# How far the nominal model may have a joint from where it is, one standard deviation [mean leg
+# lengths]: clicks need not fit it better
+MODEL_ERROR = 0.015
+# Of one pose over another one that shows the clicks alike: half a squared standard deviation
+MIN_LEAD = 4.5
+# What a rough pose may be off, three times over: angle, and part of the distance
+MAX_ANGLE, MAX_SHIFT = np.deg2rad(6.0), 0.06
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Landmarks(ImageTable):
+    """Joints clicked in images, one row a click."""
+
+    leg: IntArray  # (n,)
+    end: IntArray  # (n,) 0 at the base, 1 at the platform: index into ENDS
+    px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
+    sigma_px: Array  # (n,) of either coordinate
+
+    def row_keys(self) -> list[tuple[int, int, int]]:
+        """Return image row, leg and end of each click."""
+        return list(zip(self.row.tolist(), self.leg.tolist(), self.end.tolist(), strict=True))
+
+
+def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return leg and end of each joint, by the name that the table has for it."""
+    return {joint_name(leg, end): (j, end) for end in (0, 1) for j, leg in enumerate(leg_names)}
+
+
+def joint_name(leg: str, end: int) -> str:
+    """Return what the table calls a joint."""
+    return f"{leg}.{ENDS[end]}"
+
+
+def format_landmarks(
+    landmarks: Landmarks, measurements: Measurements, leg_names: Sequence[str]
+) -> str:
+    """Return the text of ``landmarks.csv``."""
+    names = places(measurements)
+    return format_table(
+        COLUMNS,
+        (
+            [*names[row], joint_name(leg_names[leg], end), *px, sigma]
+            for (row, leg, end), px, sigma in zip(
+                landmarks.row_keys(),
+                landmarks.px.tolist(),
+                landmarks.sigma_px.tolist(),
+                strict=True,
+            )
+        ),
+    )
+
+
+def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measurements) -> Landmarks:
+    """Return the table ``landmarks.csv`` in the order of the file.
+
+    Raises DatasetError with one sentence for each thing that is wrong.
+    """
+    least, most = SIGMA_RANGE
+    needed = f"a standard deviation from {least:g} to {most:g} px"
+    table = read_table(
+        path,
+        "table of landmarks",
+        "landmark",
+        [
+            *(Column(name, "text") for name in COLUMNS[:3]),
+            *(Column(name, what="pixel", unit="pixels") for name in COLUMNS[3:5]),
+            Column(COLUMNS[5], least=least, most=most, needed=needed, blank=True, required=False),
+        ],
+        needed="joints that are clicked in pictures; add them, or delete the file",
+    )
+    row = find_rows(table, measurements)
+    refuse_unknown_rows(table, row, measurements)
+    joints = joint_names(leg_names)
+    chosen = table.text("joint")
+    for i, name in enumerate(chosen):
+        if name not in joints:
+            remedy = f"a joint of the mechanism, as leg1.base; {closest(name, joints)}"
+            table.refuse(i, f"the unknown joint {describe(name)}", remedy, "joint")
+    px = table.numbers(("u", "v"))
+    cameras = [view.camera for view in measurements.views]
+    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[row]]
+    outside = (px < -0.5) | (px > size - 0.5)
+    for i, k in np.argwhere(outside & (row >= 0)[:, None]).tolist():
+        inside = f"-0.5 to {size[i, k] - 0.5:g} px, inside the picture; correct it"
+        table.refuse(i, f"{px[i, k]:g} px", inside, COLUMNS[3 + k])
+    table.once(
+        [
+            (image, name) if image >= 0 and name in joints else None
+            for image, name in zip(row.tolist(), chosen, strict=True)
+        ],
+        "the same image and joint",
+    )
+    table.check()
+    leg, end = np.array([joints[name] for name in chosen], dtype=np.intp).T
+    sigma = table.number("sigma") if "sigma" in table else np.full(len(table), np.nan)
+    return Landmarks(row, leg, end, px, np.where(np.isfinite(sigma), sigma, SIGMA_PX))
+
+
+def place_by_landmarks(
+    path: Path,
+    machine: Machine,
+    measurements: Measurements,
+    landmarks: Landmarks,
+    *,
+    may_be_wrong: bool = False,
+) -> tuple[Measurements, list[str]]:
+    """Return measurements whose views with clicks start from these, and notes on such views.
+
+    The clicks of a view win over its ``T_base_camera``. Where they *may_be_wrong*, what is wrong is
+    a note, and the view is left as it is.
+
+    Raises
+    ------
+    DatasetError
+        If a view has too few clicks to place its camera, or clicks contradict the others of their
+        view: with one sentence for each view or click.
+    """
+    views, problems, notes = list(measurements.views), list[str](), list[str]()
+    for v, found in cameras_by_landmarks(path, machine, measurements, landmarks).items():
+        problems += found.problems
+        notes += found.notes
+        if found.T_base_camera is not None and not found.problems:
+            views[v] = replace(views[v], T_base_camera=found.T_base_camera, by_landmarks=True)
+    if problems and not may_be_wrong:
+        raise DatasetError(problems)
+    return replace(measurements, views=tuple(views)), [*problems, *notes]
+
+
+@dataclass(frozen=True, eq=False)
+class ClickedCamera:
+    """The camera of a view by its clicks."""
+
+    # By all clicks, or, where some are wrong, by the others; None where they do not place it
+    T_base_camera: RigidTransform | None
+    problems: list[str]  # what is wrong with them
+    notes: list[str]  # what they leave open
+
+
+def cameras_by_landmarks(
+    path: Path, machine: Machine, measurements: Measurements, landmarks: Landmarks
+) -> dict[int, ClickedCamera]:
+    """Return the cameras of the views that have clicks, by their index."""
+    joints, has_place = joints_at_readings(machine, measurements, landmarks.row)
+    view_of, found = measurements.view[landmarks.row], dict[int, ClickedCamera]()
+    for v in np.unique(view_of).tolist():
+        own = landmarks.choose(view_of == v)
+        clicks = _Clicks(path, machine, measurements, v, own, joints, has_place)
+        pose, problems, notes = clicks.camera()
+        T = None if pose is None else pose.T_camera_base.inv()
+        found[v] = ClickedCamera(T, problems, notes)
+    return found
+
+
+def platforms_by_landmarks(
+    machine: Machine, measurements: Measurements, landmarks: Landmarks
+) -> dict[int, tuple[RigidTransform, ...]]:
+    """Return T_base_platform of poses whose images have clicks on the platform, likeliest first.
+
+    They are before the rough cameras of their views; images with fewer than four such clicks give
+    none.
+    """
+    found = dict[int, list[tuple[float, RigidTransform]]]()
+    B, on_platform = machine.B_platform, landmarks.end == 1
+    for row in np.unique(landmarks.row).tolist():
+        view = measurements.views[int(measurements.view[row])]
+        own = landmarks.choose((landmarks.row == row) & on_platform)
+        points = B[own.leg]
+        if view.T_base_camera is None or len(own) < MIN_POINTS or on_a_line(points):
+            continue
+        of_pose = found.setdefault(int(measurements.pose[row]), [])
+        for one in camera_poses_by_points(view.camera, points, own.px, own.sigma_px)[:2]:
+            of_pose.append((one.cost, view.T_base_camera * one.T_camera_base))
+    return {
+        pose: tuple(T for _, T in sorted(every, key=lambda one: one[0]))
+        for pose, every in found.items()
+        if every
+    }
+
+
+def joints_at_readings(
+    machine: Machine, measurements: Measurements, rows: IntArray
+) -> tuple[Mapping[int, Array], Mapping[int, BoolArray]]:
+    """Return the joints (n_legs, 2, 3) at the readings of rows in the base link [m].
+
+    And which of them (n_legs, 2) the readings place: those of the base alone where the motors do
+    not determine the pose of the platform, or the nominal model does not reach it.
+    """
+    joints, has_place = dict[int, Array](), dict[int, BoolArray]()
+    wanted = np.unique(measurements.pose[rows])
+    q = measurements.q_of_poses[wanted]
+    A = machine.A_at(np.nan_to_num(q))
+    stands = np.array([leg.actuator is None for leg in machine.legs]) | np.isfinite(q)
+    ends = np.zeros((len(wanted), machine.n_legs, 2, 3))
+    ends[:, :, 0] = A
+    placed = np.zeros((len(wanted), machine.n_legs, 2), dtype=np.bool_)
+    placed[:, :, 0] = stands
+    if machine.is_determined:
+        for k, (T, failure) in enumerate(followed_poses(machine, q, on_the_chain=False)):
+            ends[k, :, 1] = B_at(machine, T.as_matrix()[None])[0]
+            placed[k, :, 1] = failure is None
+    for row in np.unique(rows).tolist():
+        k = int(np.searchsorted(wanted, measurements.pose[row]))
+        joints[row], has_place[row] = ends[k], placed[k]
+    return joints, has_place
+
+
+@dataclass(frozen=True, eq=False)
+class _Clicks:
+    """The clicks of one view, and where the nominal model has their joints."""
+
+    path: Path
+    machine: Machine
+    measurements: Measurements
+    view: int
+    landmarks: Landmarks
+    joints: Mapping[int, Array]  # by row
+    has_place: Mapping[int, BoolArray]
+
+    @property
+    def name(self) -> str:
+        """The view."""
+        return self.measurements.views[self.view].name
+
+    def camera(self) -> tuple[PointPose | None, list[str], list[str]]:
+        """Return the likeliest pose of the camera, what is wrong with clicks, and notes."""
+        usable = np.array([self.has_place[r][j, e] for r, j, e in self.landmarks.row_keys()])
+        some = replace(self, landmarks=self.landmarks.choose(usable))
+        n, left_out = len(some.landmarks), len(usable) - int(usable.sum())
+        points = some.points
+        if n < MIN_POINTS or on_a_line(points):
+            return None, [self._too_few(n, left_out)], []
+        camera = self.measurements.views[self.view].camera
+        sigma = some.sigma(points)
+        poses = camera_poses_by_points(camera, points, some.landmarks.px, sigma)
+        if not poses:
+            return None, [self._too_few(n, left_out)], []
+        best = poses[0]
+        wrong = np.flatnonzero(best.off_px > TRUNCATION * sigma)
+        if 2 * len(wrong) > n or n - len(wrong) < MIN_POINTS:
+            return None, [some.disagreement(best)], []
+        if len(wrong):
+            return best, some.contradictions(best, wrong, sigma), []
+        return best, [], some.doubts(poses)
+
+    @property
+    def points(self) -> Array:
+        """The joints by the nominal model, (n, 3) in the base link [m]."""
+        every = [self.joints[row][leg, end] for row, leg, end in self.landmarks.row_keys()]
+        return np.array(every).reshape(-1, 3)
+
+    def sigma(self, points: Array) -> Array:
+        """Return how far clicks may be from where the model has their joints, (n,) [px].
+
+        Pixels a metre are those between most clicks that are far apart, as far as they are not seen
+        end on.
+        """
+        px = self.landmarks.px
+        i, j = np.triu_indices(len(points), 1)
+        apart = np.linalg.norm(points[i] - points[j], axis=1)
+        far = apart > 0.3 * apart.max()
+        scale = np.linalg.norm(px[i] - px[j], axis=1)[far] / apart[far]
+        of_model = MODEL_ERROR * self.machine.size * float(np.percentile(scale, 75.0))
+        return np.hypot(self.landmarks.sigma_px, of_model)
+
+    def _too_few(self, n: int, left_out: int) -> str:
+        """Say that clicks do not place the camera."""
+        found = f"{n} click{'s' * (n != 1)}" + " on one line" * (n >= MIN_POINTS)
+        if left_out:
+            found += f" on joints that the readings place, and {left_out} on others"
+        return (
+            f"{self.path}: view {self.name}: its camera could not be placed: found {found}, needed "
+            f"{MIN_POINTS} or more, better {GOOD_NUMBER}, that are not on one line; click more "
+            "joints in its pictures, or remove those of this view."
+        )
+
+    def disagreement(self, pose: PointPose) -> str:
+        """Say that clicks contradict each other, and not which of them are wrong."""
+        return (
+            f"{self.path}: view {self.name}: its camera could not be placed: found "
+            f"{len(self.landmarks)} clicks that no camera shows where they are (up to "
+            f"{pose.off_px.max():.0f} px off), needed clicks on the joints that they name; check "
+            "them, the readings of their images, the camera file and the model, or click more "
+            "joints."
+        )
+
+    def contradictions(self, pose: PointPose, wrong: IntArray, sigma: Array) -> list[str]:
+        """Return what to say of clicks that are far from where the others have them."""
+        names, said = row_names(self.measurements), list[str]()
+        for i in wrong.tolist():
+            row, leg, end = self.landmarks.row_keys()[i]
+            name = joint_name(self.machine.leg_names[leg], end)
+            other = self._other_joint(pose, i, TRUNCATION * float(sigma[i]))
+            perhaps = f"perhaps it shows {other}; " if other else ""
+            said.append(
+                f"{self.path}: the click on {name} in {names[row]} (view {self.name}) is "
+                f"{pose.off_px[i]:.0f} px from where the other clicks have it, needed at most "
+                f"{TRUNCATION * sigma[i]:.0f} px; {perhaps}correct or remove it."
+            )
+        return said
+
+    def _other_joint(self, pose: PointPose, i: int, most: float) -> str:
+        """Return the joint that a click shows by the other clicks; "" if it shows none."""
+        row = int(self.landmarks.row[i])
+        camera = self.measurements.views[self.view].camera
+        keys = [(j, e) for j, e in np.argwhere(self.has_place[row]).tolist()]
+        P = pose.T_camera_base.apply(np.array([self.joints[row][key] for key in keys]))
+        off = np.full(len(keys), np.inf)
+        ahead = P[:, 2] > 0.0
+        off[ahead] = np.linalg.norm(camera.project(P[ahead]) - self.landmarks.px[i], axis=1)
+        k = int(np.argmin(off))
+        if off[k] > min(most, 0.5 * float(pose.off_px[i])):
+            return ""
+        return joint_name(self.machine.leg_names[keys[k][0]], keys[k][1])
+
+    def doubts(self, poses: Sequence[PointPose]) -> list[str]:
+        """Return notes on what the clicks leave open of the camera."""
+        best = poses[0]
+        start = f"{self.path}: view {self.name}: its {len(self.landmarks)} clicks"
+        distance = float(np.linalg.norm(best.T_camera_base.translation))
+        if len(poses) > 1 and poses[1].cost - best.cost < MIN_LEAD:
+            other = best.T_camera_base * poses[1].T_camera_base.inv()
+            return [
+                f"{start} leave two cameras open, {1e3 * np.linalg.norm(other.translation):.0f} mm "
+                f"and {np.degrees(other.rotation.magnitude()):.0f} deg apart, and the likelier one "
+                "is where the search begins; click joints that are nearer or farther as well."
+            ]
+        turn, shift = (float(np.sqrt(np.trace(best.covariance[s, s])))
+                       for s in (slice(3), slice(3, 6)))  # fmt: skip
+        if turn <= MAX_ANGLE and shift <= MAX_SHIFT * distance:
+            return []
+        return [
+            f"{start} place the camera to {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} deg "
+            "only; click more joints, far from each other."
+        ]

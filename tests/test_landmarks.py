@@ -1,0 +1,171 @@
+"""Clicks on joints place cameras: of every kind of machine, before recognition begins."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clicked_joints import camera_beside, seen_from, write_clicks
+from dataset_folder import dataset_of_readings
+from hexapod_example import Run
+from refusal_table import GONE, cell, keyed
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration.result import Verdict
+from legcal.calibration.verdict import judge
+from legcal.data.dataset import load_dataset
+from legcal.data.landmarks import Landmarks
+from legcal.errors import DatasetError
+from legcal.geometry.motions import components, pose_distance
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import readings_at
+from legcal.machine.rods import ends_at_poses
+
+KINDS = ["hexapod", "3-rpr", "delta", "linear-delta", "servo-hexapod", "orthoglide"]
+ROOT = Path(__file__).parents[1]
+
+
+def without_motors(text: str) -> str:
+    """Return the text of the model of a hexapod that is moved by hand."""
+    motors = "".join(f"- leg{j}_prismatic\n" for j in range(1, 7))
+    assert f"name_mot:\n{motors}" in text
+    text = text.replace(f"name_mot:\n{motors}", "name_mot: []\n")
+    return text.replace("../urdf/", f"{ROOT}/urdf/")
+
+
+def dataset(folder: Path, model: str, n_rows: int = 2, **view: object) -> Path:
+    """Write a dataset of one view of a machine, at home and near it."""
+    machine = load_mechanism(model)
+    home = readings_at(machine, machine.home)[list(machine.motors)]
+    travel = np.array([machine.legs[j].travel for j in machine.motors])
+    width = np.where(np.isfinite(np.ptp(travel, axis=1)), np.ptp(travel, axis=1), 0.1)
+    away = np.random.default_rng(3).uniform(-0.05, 0.05, (n_rows, len(home)))
+    q = home + width * away
+    camera = str(ROOT / "examples/hexapod/camera_info.yaml")
+    sigma = {name: "0.1deg" if machine.legs[j].reads_angle else 1e-5
+             for name, j in zip(machine.motor_names, machine.motors, strict=True)}  # fmt: skip
+    entry = {"views": {"c1": {"camera": camera, **view}}, "encoder_sigma": sigma}
+    return dataset_of_readings(folder, q, entry, model, machine.motor_names)
+
+
+def off(folder: Path, true: RigidTransform) -> tuple[float, float]:
+    """Return how far the rough pose of the first view is from the truth [m], [rad]."""
+    placed = load_dataset(folder, check_images=False).measurements.views[0].T_base_camera
+    assert placed is not None
+    return pose_distance(placed, true)
+
+
+@pytest.mark.parametrize("model", KINDS)
+def test_clicks_place_the_camera_of_any_machine(model: str, tmp_path: Path) -> None:
+    folder = dataset(tmp_path, model)
+    true = camera_beside(folder, 0.7)
+    write_clicks(folder, {1: seen_from(folder, 1, true)})
+    far, turned = off(folder, true)
+    assert far < 1e-5
+    assert turned < 1e-5
+
+
+def test_noise_of_clicks_leaves_a_rough_pose_that_wins(tmp_path: Path) -> None:
+    rough = {"xyz": [0.0, 3.0, 0.3], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    folder = dataset(tmp_path, "hexapod", T_base_camera=rough)
+    for seed in range(4):
+        true = camera_beside(folder, 1.5 * seed)
+        rng = np.random.default_rng(seed)
+        clicks = {
+            row: {joint: px + 3.0 * rng.normal(size=2) for joint, px in seen.items()}
+            for row in range(2)
+            if (seen := seen_from(folder, row, true))
+        }
+        write_clicks(folder, clicks)
+        far, turned = off(folder, true)
+        assert 0.0 < far < 0.03
+        assert turned < np.deg2rad(2.0)
+        (folder / "landmarks.csv").unlink()
+
+
+def test_a_click_on_another_joint_is_named_with_its_distance(tmp_path: Path) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    true = camera_beside(folder, 0.7)
+    seen = seen_from(folder, 0, true)
+    shown, clicked = "leg5.base", "leg1.base"
+    clicks = {joint: px for joint, px in seen.items() if joint != shown}
+    clicks[clicked] = seen[shown]
+    write_clicks(folder, {0: clicks})
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(folder, check_images=False)
+    (what,) = refused.value.problems
+    apart = np.linalg.norm(seen[shown] - seen[clicked])
+    assert f"the click on {clicked} in 0.png (view c1) is {apart:.0f} px" in what
+    assert f"perhaps it shows {shown}" in what
+    opened = load_dataset(folder, check_images=False, check_clicks=False)  # as to correct them
+    assert what in opened.notes
+    assert opened.measurements.views[0].T_base_camera is None
+    assert opened.landmarks is not None
+    assert len(opened.landmarks) == len(clicks)
+
+
+@pytest.mark.parametrize("unknown", ["no motors", "all empty", "three empty"])
+def test_base_joints_place_the_camera_where_readings_give_no_pose(
+    unknown: str, tmp_path: Path
+) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    true = camera_beside(folder, 0.7)
+    seen = seen_from(folder, 0, true)
+    table, joints = folder / "measurements.csv", [f"leg{j}_prismatic" for j in range(1, 7)]
+    if unknown == "no motors":
+        model = folder / "by_hand.yaml"
+        model.write_text(without_motors((ROOT / "models/hexapod.yaml").read_text()))
+        table.write_text("view,image\nc1,0.png\n")
+        keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
+    else:
+        empty = joints if unknown == "all empty" else joints[3:]
+        cell("measurements.csv", None, **dict.fromkeys(empty, ""))(folder)
+    write_clicks(folder, {0: {j: px for j, px in seen.items() if j.endswith(".base")}})
+    far, turned = off(folder, true)
+    assert far < 1e-5
+    assert turned < 1e-5
+    loaded = load_dataset(folder, check_images=False)
+    assert not loaded.machine.is_determined
+    assert any("leg4_prismatic" in note for note in loaded.notes) == (unknown != "no motors")
+
+
+def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints(
+    tmp_path: Path,
+) -> None:
+    folder = dataset(tmp_path, "hexapod")
+    cell("measurements.csv", 2, leg1_prismatic="")(folder)
+    with pytest.raises(DatasetError, match=r"row 2 .*column leg1_prismatic.*an empty cell"):
+        load_dataset(folder, check_images=False)
+    folder = dataset(tmp_path, "linear-delta")
+    motor = load_mechanism("linear-delta").motor_names[0]
+    cell("measurements.csv", None, **{motor: ""})(folder)
+    with pytest.raises(DatasetError, match=rf"column {motor}.*moves joints at the base"):
+        load_dataset(folder, check_images=False)
+
+
+def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run) -> None:
+    calibration = example_run.calibration
+    dataset, solution = calibration.dataset, calibration.solution
+    m = dataset.measurements
+    rows = np.array([int(np.flatnonzero(m.view == v)[0]) for v in range(2)])
+    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(6), (0, 1), indexing="ij"))
+    A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    joints = np.stack([A, B], axis=2)[m.pose[row], leg, end]
+    seen = [
+        solution.cameras[v].project(solution.T_camera_Rb[v].apply(P))
+        for v, P in zip(m.view[row], joints, strict=True)
+    ]
+    noise = np.random.default_rng(1).normal(size=(len(row), 2))
+    clicks = Landmarks(row, leg, end, np.array(seen) + 3.0 * noise, np.full(len(row), 3.0))
+
+    def judged(clicks: Landmarks) -> Verdict:
+        with_clicks = replace(dataset, landmarks=clicks)
+        return judge(with_clicks, solution, calibration.steps, ()).verdict
+
+    assert judged(clicks) == calibration.verdict
+    assert calibration.verdict.trustworthy
+    away = np.where((row == rows[1])[:, None], clicks.px + np.array([30.0, 0.0]), clicks.px)
+    verdict = judged(replace(clicks, px=away))
+    assert not verdict.trustworthy
+    name = m.views[1].name
+    assert f"clicks on joints in view {name} (" in verdict.sentence
