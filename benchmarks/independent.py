@@ -125,6 +125,8 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
         for file in sorted((copy / "images").iterdir()):
             again = file.with_suffix(".jpg")
             picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            if picture is None:
+                raise SystemExit(f"{file} could not be read")
             file.unlink()
             cv2.imwrite(str(again), picture, quality)
             text = text.replace(file.name, again.name)

@@ -122,9 +122,8 @@ class _SearchNearFit:
                 if T is not None:
                     X = T.inv().apply(joints[k].reshape(-1, 3))
                     xy = X[:, :2] / np.where(X[:, 2:] > 0.0, X[:, 2:], np.nan)
-                    pixels[k] = (
-                        m.views[m.view[row]].camera.distort(xy).reshape(joints.shape[1:3] + (2,))
-                    )
+                    camera = m.views[m.view[row]].camera
+                    pixels[k] = camera.distort(xy).reshape(pixels.shape[1:])
             seen.append(pixels)
         away = np.linalg.norm(seen[1] - seen[0], axis=-1)
         return float(np.nanpercentile(away, 90.0)) if np.isfinite(away).any() else 0.0

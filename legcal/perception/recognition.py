@@ -99,7 +99,7 @@ def place_views(
         hint = groups[k].hint
         found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
     # Views that pairs do not place, by all edges along legs.
-    left = [k for k in unclear if (one := found[k]) is None or not one.is_convincing]
+    left = [k for k in unclear if (by_pairs := found[k]) is None or not by_pairs.is_convincing]
     of_left = [_ByEdges(groups[k], pictures, found[k]) for k in left]
     for k, one in zip(left, run(partial(_by_edges, search), of_left), strict=True):
         found[k] = one
