@@ -8,6 +8,7 @@ is, and whether it is a leg at all, is not known here.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -79,32 +80,40 @@ def reduction(camera: Camera, part: float) -> int:
     return int(np.clip(factor, 1, MAX_REDUCTION))
 
 
-def still_picture(pictures: Sequence[Grey]) -> Grey | None:
+class Still(NamedTuple):
+    """What stands still in reduced pictures of one view."""
+
+    picture: Grey
+    noise: float  # by which most pixels of pictures differ from it [grey levels]
+
+
+def still_picture(pictures: Sequence[Grey]) -> Still | None:
     """Return what stands still in reduced pictures of one view; None where the camera does not.
 
     Legs are somewhere else in most pictures.
     """
     if len(pictures) < MIN_STILL:
         return None
-    still = np.median(np.stack(pictures), axis=0).astype(np.float32)
+    middle = np.median(np.stack(pictures), axis=0).astype(np.float32)
+    away = [_middle(np.abs(one - middle)[::STRIDE, ::STRIDE]) for one in pictures]
+    still = Still(middle, float(np.median(away)))
     moving = [float(np.mean(_differs(one, still))) for one in pictures]
     return still if float(np.median(moving)) <= MAX_MOVING else None
 
 
-def _differs(picture: Grey, still: Grey) -> BoolArray:
+def _differs(picture: Grey, still: Still) -> BoolArray:
     """Return which pixels of a picture are not those of what stands still."""
-    away = np.abs(picture - still)
-    least = max(NOISE_FACTOR * _middle(away[::STRIDE, ::STRIDE]), DIFFERS * float(still.max()))
-    return np.asarray(away > least)
+    least = max(NOISE_FACTOR * still.noise, DIFFERS * float(still.picture.max()))
+    return np.asarray(np.abs(picture - still.picture) > least)
 
 
-def moving_pixels(picture: Grey, still: Grey) -> Image:
+def moving_pixels(picture: Grey, still: Still) -> Image:
     """Return 1 near pixels of a picture that are not those of what stands still, else 0."""
     size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
 
 
-def _moving(pieces: Array, picture: Grey, still: Grey) -> BoolArray:
+def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
     """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
     differs = moving_pixels(picture, still)
     share = np.linspace(0.0, 1.0, 12)[:, None]
@@ -114,7 +123,7 @@ def _moving(pieces: Array, picture: Grey, still: Grey) -> BoolArray:
 
 
 def find_segments(
-    grey: Grey, camera: Camera, factor: int | None = None, still: Grey | None = None
+    grey: Grey, camera: Camera, factor: int | None = None, still: Still | None = None
 ) -> EdgeSegments:
     """Return the straight edges of a picture, reduced by a factor, but of what stands still."""
     factor = reduction(camera, 1.0) if factor is None else factor
@@ -122,7 +131,7 @@ def find_segments(
 
 
 def segments_of_reduced(
-    small: Grey, camera: Camera, factor: int, still: Grey | None = None
+    small: Grey, camera: Camera, factor: int, still: Still | None = None
 ) -> EdgeSegments:
     """Return the straight edges of a reduced picture, but of what stands still."""
     pieces = _pieces(small)

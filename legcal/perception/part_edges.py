@@ -94,20 +94,24 @@ def find_pairs(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> list[Edg
     """Find both edges of parts; None where no two edges are convincing, nor one alone."""
     if not parts:
         return []
-    shift, score = _edge_lines(grey, camera, parts)
-    return _pairs(parts, shift.reshape(-1, 2, *shift.shape[1:]), score.reshape(-1, 2, MAX_LINES))
+    shift, merit, score = _edge_lines(grey, camera, parts)
+    of_parts = (x.reshape(-1, 2, MAX_LINES) for x in (merit, score))
+    return _pairs(parts, shift.reshape(-1, 2, *shift.shape[1:]), *of_parts)
 
 
-def _pairs(parts: Sequence[LegPart], shift: Array, score: Array) -> list[EdgePair | None]:
+def _pairs(
+    parts: Sequence[LegPart], shift: Array, merit: Array, score: Array
+) -> list[EdgePair | None]:
     """Return the two outlines of each part, of lines near them, best first.
 
-    Shifts of lines (n_parts, 2, n_lines, 2) [px] and their scores (n_parts, 2, n_lines), 0 of none.
+    Shifts of lines (n_parts, 2, n_lines, 2) [px], their merits (n_parts, 2, n_lines) among lines
+    beside them, and their scores, 0 of none.
     """
     predicted = np.array([part.predicted for part in parts])
-    i, j, together = _best_pairs(parts, predicted, shift, score)
+    i, j, together = _best_pairs(parts, predicted, shift, merit, score)
     guided = np.array([part.guided for part in parts])
-    alone = _alone(shift, score, np.where(guided, LONE_SCORE_GUIDED, LONE_SCORE))
-    best = score[..., 0]
+    alone = _alone(shift, merit, np.where(guided, LONE_SCORE_GUIDED, LONE_SCORE))
+    best = merit[..., 0]
     edge = np.argmax(np.where(alone, best, 0.0), axis=1)
     every = np.arange(len(parts))
     rivalled = (best[every, 1 - edge] >= LONE_SCORE) & ~guided
@@ -128,7 +132,7 @@ def _pairs(parts: Sequence[LegPart], shift: Array, score: Array) -> list[EdgePai
 
 
 def _best_pairs(
-    parts: Sequence[LegPart], predicted: Array, shift: Array, score: Array
+    parts: Sequence[LegPart], predicted: Array, shift: Array, merit: Array, score: Array
 ) -> tuple[IntArray, IntArray, BoolArray]:
     """Return which lines near both edges of each part are a pair, and whether it is convincing."""
     one, two = shift[:, 0, :, None], shift[:, 1, None]
@@ -136,7 +140,7 @@ def _best_pairs(
     window = np.array([part.window for part in parts])[:, None, None, None]
     mismatch = ((two - one) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width)) ** 2
     drift = ((0.5 / window) * (one + two)) ** 2
-    scores = score[:, 0, :, None], score[:, 1, None]
+    scores = merit[:, 0, :, None], merit[:, 1, None]
     value = scores[0] + scores[1] - 0.05 * (mismatch + drift).sum(axis=-1)
     good = (mismatch.max(axis=-1) <= 9.0) & (scores[0] > 0.0) & (scores[1] > 0.0)
     value[~good] = -np.inf
@@ -162,10 +166,10 @@ def block_positions(band: Band) -> Array:
     return np.asarray((np.arange(n) + 0.5) * (band.length / n))
 
 
-def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> tuple[Array, Array]:
-    """Return lines near both edges of each part, best first: shifts at both ends, and scores.
+def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[LegPart]) -> tuple[Array, Array, Array]:
+    """Return lines near both edges of each part, best first: shifts at both ends, merits, scores.
 
-    Shifts (2 n_parts, MAX_LINES, 2) [px] and scores (2 n_parts, MAX_LINES), 0 where there is none.
+    Shifts (2 n_parts, MAX_LINES, 2) [px]; merits and scores (2 n_parts, MAX_LINES), 0 of none.
     """
     halves = np.repeat([int(np.ceil(part.window)) for part in parts], 2)
     reach = int(halves.max()) + MARGIN
@@ -249,11 +253,11 @@ def _median(values: Samples, seen: BoolArray) -> float:
     return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
 
-def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array, Array]:
+def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array, Array, Array]:
     """Add the votes of patches along lines; return their separate maxima.
 
     Votes (n, 2 max(halves) + 1) of all blocks, those in the middle count; shifts (n_patches,
-    MAX_LINES, 2) and scores (n_patches, MAX_LINES), best first, 0 of none.
+    MAX_LINES, 2), merits and scores (n_patches, MAX_LINES), best first, 0 of none.
     """
     most, n = int(halves.max()), len(n_blocks)
     side, middle = 2 * (most + SEPARATION) + 1, most + SEPARATION
@@ -269,8 +273,9 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
             rows = np.concatenate([np.arange(first[e], first[e] + n_blocks[e]) for e in own])
             of_own = votes[rows, most - half : most + half + 1]
             score[own, inner, inner] = _added(of_own, n_blocks[own], halves[own], half)
-    _mark_down_inner(score)
-    flat, every = score.reshape(n, -1), np.arange(n)
+    merit = score.copy()
+    _mark_down_inner(merit)
+    flat, every = merit.reshape(n, -1), np.arange(n)
     around = np.arange(-SEPARATION, SEPARATION + 1)
     around = (around[:, None] * side + around).ravel()
     at, best = np.zeros((MAX_LINES, n), dtype=np.intp), np.zeros((MAX_LINES, n))
@@ -281,7 +286,8 @@ def _lines(votes: Samples, n_blocks: IntArray, halves: IntArray) -> tuple[Array,
     tilt, place = np.divmod(at.T, side)
     change, place = 0.5 * (tilt - middle), place - middle
     shifts = np.stack([place - change, place + change], axis=-1)
-    return np.where(best.T[..., None] > 0.0, shifts, 0.0), best.T
+    of_lines = np.where(best.T > 0.0, score.reshape(n, -1)[every[:, None], at.T], 0.0)
+    return np.where(best.T[..., None] > 0.0, shifts, 0.0), best.T, of_lines
 
 
 def _mark_down_inner(score: Samples) -> None:

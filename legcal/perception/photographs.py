@@ -26,7 +26,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.model import Machine, vectors_at
 from legcal.machine.rods import joints_at, measured_readings
-from legcal.perception.candidate_pairs import CandidatePairs, still_picture
+from legcal.perception.candidate_pairs import CandidatePairs, Still, still_picture
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     find_wrong_images,
@@ -55,7 +55,7 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
-DETECTOR_VERSION = 16  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 17  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -86,7 +86,7 @@ class Photographs:
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
-    still: dict[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
+    still: dict[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -528,7 +528,7 @@ def _inspect_images(
 
 def _still_pictures(
     measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
-) -> dict[int, Grey]:
+) -> dict[int, Still]:
     """Return what stands still in the reduced pictures of each view whose camera does."""
     of_view: dict[int, list[Grey]] = {}
     for row, picture in small.items():

@@ -24,6 +24,7 @@ from legcal.machine.occluders import LegHalf, Occluder
 from legcal.machine.rods import arms_at
 from legcal.perception.candidate_pairs import (
     CandidatePairs,
+    Still,
     find_candidate_pairs,
     find_segments,
     moving_pixels,
@@ -64,7 +65,7 @@ class Search:
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
     occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
-    still: Mapping[int, Grey] = field(default_factory=dict)  # of views, what moves in no picture
+    still: Mapping[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
 
     @property
     def n_legs(self) -> int:
