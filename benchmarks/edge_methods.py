@@ -8,7 +8,7 @@ from rendered_cylinders import Photographed, interpolated
 
 from legcal.geometry.types import Array
 from legcal.perception.profiles import Edge
-from legcal.perception.subpixel_edges import measure_edges
+from legcal.perception.subpixel_edges import LostEdge, measure_edges
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
 
@@ -32,7 +32,7 @@ def by_legcal(scene: Photographed, grey: Grey, start: Array) -> Ends:
     measured, _ = measure_edges(grey, scene.camera, edges)
     ends: Ends = []
     for edge, true in zip(measured, scene.v, strict=True):
-        if edge is None:
+        if isinstance(edge, LostEdge):
             ends.append(None)
             continue
         place = np.array([edge.line.first, edge.line.last])

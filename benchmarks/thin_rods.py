@@ -25,7 +25,7 @@ import numpy as np
 
 from legcal.geometry.types import Array
 from legcal.perception.profiles import Edge
-from legcal.perception.subpixel_edges import measure_edges
+from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
@@ -142,9 +142,10 @@ def errors(width: float, lens: str, seed: tuple[int, int]) -> Array:
         found.append(measure_edges(grey, camera, edges, blur=blur, near_fit=True)[0])
     rows = []
     for edge, v in enumerate(true):
-        one, out, inside = (lines[edge] for lines in found)
-        if one is None or abs(one.contrast) < MIN_CONTRAST or out is None or inside is None:
+        measured = [one for lines in found if isinstance(one := lines[edge], MeasuredEdge)]
+        if len(measured) < len(found) or abs(measured[0].contrast) < MIN_CONTRAST:
             continue
+        one, out, inside = measured
         error, low, high = (
             float(EPSILON[edge] * (line.v - v).mean()) for line in (one, out, inside)
         )

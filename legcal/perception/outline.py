@@ -19,7 +19,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.occluders import PlacedOccluders
 from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
 from legcal.perception.profiles import Edge
-from legcal.perception.subpixel_edges import MeasuredEdge, measure_edges
+from legcal.perception.subpixel_edges import LostEdge, MeasuredEdge, measure_edges
 from legcal.perception.tuning import CONTRAST, INLIER_SHARE, SCATTER_PX, WIDTH_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -312,7 +312,7 @@ def _beside(part: _Predicted, edges: Array, window: float) -> BoolArray:
 
 def _with_verdict(
     part: LegPart,
-    measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
+    measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
     *,
     near_fit: bool,
 ) -> PartLines:
@@ -321,7 +321,7 @@ def _with_verdict(
     judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
     lines: list[OutlineLine | None] = []
     for edge in measured:
-        if edge is None:
+        if isinstance(edge, LostEdge):
             lines.append(None)
             continue
         line = edge.line
@@ -355,7 +355,7 @@ def verdict(
     pair: EdgePair,
     predicted: Array,
     length: float,
-    measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
+    measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
     window: float | None = None,
     *,
     near_fit: bool = False,
@@ -376,7 +376,7 @@ def verdict(
         for edge, seen in zip(measured, pair.found, strict=True)
     ]
     one, two = measured
-    if one is not None and two is not None and not any(reasons):
+    if isinstance(one, MeasuredEdge) and isinstance(two, MeasuredEdge) and not any(reasons):
         by_width = _by_width(one, two, expected, near_fit=near_fit)
         reach = math.inf if near_fit else window
         if reach is None or not all(by_width.reasons):
@@ -384,7 +384,7 @@ def verdict(
         return _by_place((one, two), predicted, reach, by_width)
     confirmed = pair.suits(expected)
     stands = [
-        edge is not None
+        isinstance(edge, MeasuredEdge)
         and _is_clear_step(edge)
         and bool(confirmed or (may if window is None else _off(edge, at) <= LONE_OFFSET * window))
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
@@ -456,13 +456,13 @@ def _is_clear_step(edge: MeasuredEdge) -> bool:
     return edge.is_step and float(np.mean(edge.line.kept)) >= MIN_CLEAR_KEPT
 
 
-def _rejection(edge: MeasuredEdge | None, length: float, width: float) -> Rejection:
+def _rejection(edge: MeasuredEdge | LostEdge, length: float, width: float) -> Rejection:
     """Return why an edge cannot be trusted whatever its partner."""
-    if edge is None:
-        return Rejection(Reason.FAINT)
     step = (STEP_END - edge.clipped) * edge.blur
     if step < MIN_STEP:
         return Rejection(Reason.OVEREXPOSED, f"{max(step, 0.0):.1f}")
+    if isinstance(edge, LostEdge):
+        return Rejection(Reason.FAINT)
     line = edge.line
     visible = (line.last - line.first) * length
     if visible < least_length(width):

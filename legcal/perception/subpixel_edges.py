@@ -9,6 +9,7 @@ an outline that lie on its line are fitted together, and the blur to all outline
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,13 @@ class MeasuredEdge:
         return float(np.sqrt(np.diag(self.covariance).max()))
 
 
+class LostEdge(NamedTuple):
+    """An edge that no straight line fits."""
+
+    blur: float  # standard deviation of the blur of the image [px]
+    clipped: float = -math.inf  # depth to which the background saturates most blocks [blurs]
+
+
 def measure_edges(
     grey: Grey,
     camera: Camera,
@@ -58,10 +66,10 @@ def measure_edges(
     blur: float | None = None,
     *,
     near_fit: bool = False,
-) -> tuple[list[MeasuredEdge | None], float]:
+) -> tuple[list[MeasuredEdge | LostEdge], float]:
     """Fit the limb model and straight lines to all edges of an image; return its blur as well [px].
 
-    None for an edge that no straight line fits. Unless all blocks are fitted together in the end,
+    Unless all blocks are fitted together in the end,
     lines are good to a few hundredths of a pixel, in half the time. The blur may be known roughly.
     Near a fit it is that of other images, and edges are known to a few tenths of a pixel.
     """
@@ -72,7 +80,7 @@ def measure_edges(
         blur = first = float(np.clip(blur, *BLURS[:2]))
         blocks = Blocks.read(grey, camera, edges, v, first, FIRST_BLOCKS)
         if len(blocks.moved) == 0:
-            return [None] * len(edges), first
+            return [LostEdge(first)] * len(edges), first
         for n in n_rounds:
             blocks.fit(blur, 1)
             blur = blocks.estimate_blur(n)
@@ -84,7 +92,7 @@ def measure_edges(
         tried = blur
         blocks = Blocks.read(grey, camera, edges, v, tried, None if together else FIRST_BLOCKS)
         if len(blocks.moved) == 0:
-            return [None] * len(edges), tried
+            return [LostEdge(tried)] * len(edges), tried
         blocks.fit(tried, LAST_ROUNDS)
         if not together:
             break
@@ -104,9 +112,9 @@ def _measured(
     blocks: Blocks,
     blur: float,
     joint: PooledLines | None,
-) -> list[MeasuredEdge | None]:
+) -> list[MeasuredEdge | LostEdge]:
     """Return the lines of edges by their blocks, one by one or all together."""
-    found: list[MeasuredEdge | None] = []
+    found: list[MeasuredEdge | LostEdge] = []
     kept = blocks.kept()
     edge_of = blocks.edge[kept]
     bounds = np.searchsorted(edge_of, np.arange(len(edges) + 1)).tolist()
@@ -116,7 +124,9 @@ def _measured(
         zip(edges, v, blocks.lines, *typical, strict=True)
     ):
         if line is None:
-            found.append(None)
+            depths = (blocks.clipped - blocks.moved)[blocks.edge == i]
+            clipped = float(np.median(depths)) / blur if len(depths) else -math.inf
+            found.append(LostEdge(blur, clipped))
             continue
         is_step = sharp > MIN_CHI2_GAIN
         # How far shading moves an outline: its grey levels over the slope of the step.
