@@ -10,6 +10,8 @@ from legcal.perception.candidate_pairs import (
     EdgeSegments,
     find_candidate_pairs,
     find_segments,
+    segments_of_reduced,
+    still_picture,
 )
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
@@ -70,6 +72,33 @@ def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Arr
             assert np.linalg.norm(end - start) > 0.7 * min(seen, 0.47)
             left = np.array([end[1] - start[1], start[0] - end[0]])
             assert left @ (axis[:2] - start) > 0.0  # the bar is brighter
+
+
+def test_what_stands_still_in_the_pictures_of_a_view_is_no_edge_of_a_leg() -> None:
+    camera, still = _camera(), BARS[0]
+
+    def moving(x: float) -> list[Bar]:
+        ends = np.array([[0.0, -0.15, 0.8], [0.01, 0.13, 0.82]])
+        aside = [np.array([x + k, 0.0, 0.0]) for k in (0.0, 0.055, 0.11, 0.165)]
+        return [Bar(ends[0] + step, ends[1] + step, 0.008, 150.0) for step in aside]
+
+    moved = [moving(x) for x in (-0.02, -0.008, 0.005, 0.017, 0.03)]
+    pictures = [_picture(camera, [still, *bars]) for bars in moved]
+    background = still_picture(pictures)
+    assert background is not None
+
+    def offsets(found: EdgeSegments, bar: Bar) -> list[float]:
+        lines = [line / np.linalg.norm(line[:2]) for line in _lines(bar)]
+        nearest = [found.ends[_nearest(found, line)] @ line[:2] + line[2] for line in lines]
+        return [float(np.abs(offset).max() * F) for offset in nearest]
+
+    for picture, bars in zip(pictures, moved, strict=True):
+        every, found = (segments_of_reduced(picture, camera, 1, b) for b in (None, background))
+        assert max(offsets(every, still)) < 1.5
+        for bar in bars:
+            assert max(*offsets(every, bar), *offsets(found, bar)) < 1.5
+        assert min(offsets(found, still)) > 10.0
+    assert still_picture(pictures[:3]) is None  # of which legs stand still in most
 
 
 def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_seen() -> None:

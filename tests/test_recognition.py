@@ -6,6 +6,7 @@ Hypotheses of two pairs, scores and steps of poses, the search of a camera, and 
 from dataclasses import replace
 from typing import ClassVar
 
+import cv2
 import leg_pictures as lp
 import numpy as np
 import pytest
@@ -26,10 +27,12 @@ from legcal.perception.camera_search import (
     is_mirrored,
     may_be_mirrored,
     mirrored,
+    place_by_edges,
     place_camera,
     place_near,
 )
 from legcal.perception.candidate_pairs import find_candidate_pairs
+from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     CameraPoses,
     PairMatches,
@@ -368,6 +371,42 @@ def test_the_rough_pose_of_a_group_is_that_of_its_frame_whichever_view_has_it() 
         (group,) = group_views(measurements, np.arange(3), hints, joined)
         assert group.hint is not None
         np.testing.assert_allclose(group.hint.as_matrix(), MOTION.as_matrix(), atol=1e-12)
+
+
+def test_poses_are_moved_to_where_edges_run_along_legs_that_show_no_clean_pair() -> None:
+    rng = np.random.default_rng(5)
+    made, T_base_camera = lp.machine(6, rng), lp.camera(rng)
+    focal, size = 1.0 / lp.PIXEL, np.ptp(lp.CORNERS, axis=0) / lp.PIXEL
+    K = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
+    camera = Camera(K, int(size[0]), int(size[1]))
+    seen, drawn = [], []
+    for _ in range(5):
+        B = made.posed(lp.platform(rng))
+        targets = lp.pieces(made.A, B)
+        picture = np.full((camera.height, camera.width), 60.0, dtype=np.float32)
+        for edge in lp.edges(targets, T_base_camera).reshape(-1, 2, 2):
+            # One side of each edge lies in shadow: bright and dark edges pair at no width.
+            first, last = np.rint(camera.distort(edge)).astype(int).tolist()
+            cv2.line(picture, first, last, float(rng.uniform(90.0, 160.0)), 2)
+        drawn.append(picture + rng.normal(0.0, 3.0, picture.shape).astype(np.float32))
+        none = find_candidate_pairs(lp.segments(np.zeros((0, 2, 2))))
+        seen.append(Picture(none, targets, lp.CORNERS, lp.SIZE))
+    maps = EdgeMaps.of(drawn, [None] * 5, [camera] * 5, [1] * 5)
+    T = T_base_camera.inv()
+    turns = Rotation.from_rotvec(np.deg2rad(7.0) * np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1.0]]))
+    others = Rotation.random(20, rng=rng)
+    R = np.concatenate([(turns * T.rotation).as_matrix(), others.as_matrix()])
+    middle = np.array([0.0, 0.0, 0.2])
+    away = (1.08 * T.apply(middle)) - np.einsum("nij,j->ni", R, middle)
+    start = CameraPoses.rigid(R, away, 6)
+    assert not place_by_edges(seen, maps, 6, start.take(slice(0, 0))).is_convincing
+    placed = place_by_edges(seen, maps, 6, start)
+    off = T_base_camera.inv() * placed.pose()
+    assert np.degrees(off.rotation.magnitude()) < 3.0
+    assert np.linalg.norm(off.translation) < 0.05
+    assert not placed.is_convincing  # pairs have no say: outlines decide
+    other = place_by_edges(mirrored(seen), maps.mirrored(np.zeros(5)), 6, start)
+    assert other.along_edges < 0.85 * placed.along_edges
 
 
 def test_a_symmetric_machine_at_a_symmetric_reading_is_ambiguous_and_others_resolve_it() -> None:

@@ -216,22 +216,10 @@ def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str,
 def _outline_editor(detection: Detection) -> OutlineEditor | None:
     """Return the editor of outlines; None where the table is more than a page should hold."""
     measurements, machine = detection.dataset.measurements, detection.dataset.machine
-    names = row_names(measurements)
-    images = []
-    for row, file in detection.photograph_files.items():
-        view = measurements.views[int(measurements.view[row])]
-        images.append(
-            {
-                "view": view.name,
-                "image": names[row],
-                "label": f"{view.name}, {names[row]}",
-                "photograph": file,
-                "width": view.camera.width,
-                "height": view.camera.height,
-                "camera": int(measurements.view[row]),
-                "expected": _expected(detection, row),
-            }
-        )
+    images = [
+        image | {"camera": int(measurements.view[row]), "expected": _expected(detection, row)}
+        for row, image in _images(detection).items()
+    ]
     cameras = [
         {
             "K": view.camera.K.tolist(),
@@ -246,26 +234,28 @@ def _outline_editor(detection: Detection) -> OutlineEditor | None:
     return found if size <= MAX_BYTES else None
 
 
-def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
-    """Return the editor of clicks on joints, with those that the dataset has."""
-    dataset = detection.dataset
-    measurements, machine = dataset.measurements, dataset.machine
-    names = row_names(measurements)
-    joints = joint_names(machine.leg_names)
-    number_of = {row: k for k, row in enumerate(detection.photograph_files)}
-    images = []
+def _images(detection: Detection) -> dict[int, dict[str, Any]]:
+    """Return what editors need to know of the photographs, by row."""
+    measurements = detection.dataset.measurements
+    names, images = row_names(measurements), dict[int, dict[str, Any]]()
     for row, file in detection.photograph_files.items():
         view = measurements.views[int(measurements.view[row])]
-        images.append(
-            {
-                "view": view.name,
-                "image": names[row],
-                "label": f"{view.name}, {names[row]}",
-                "photograph": file,
-                "width": view.camera.width,
-                "height": view.camera.height,
-            }
-        )
+        images[row] = {
+            "view": view.name,
+            "image": names[row],
+            "label": f"{view.name}, {names[row]}",
+            "photograph": file,
+            "width": view.camera.width,
+            "height": view.camera.height,
+        }
+    return images
+
+
+def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
+    """Return the editor of clicks on joints, with those that the dataset has."""
+    dataset, machine = detection.dataset, detection.dataset.machine
+    joints = joint_names(machine.leg_names)
+    number_of = {row: k for k, row in enumerate(detection.photograph_files)}
     clicks = []
     if dataset.landmarks is not None:
         place = {joint: i for i, joint in enumerate(joints.values())}
@@ -279,7 +269,7 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
     unplaced = [k for row, k in number_of.items() if detection.view_of(row) in detection.unplaced]
     return LandmarkEditor(
         file=LANDMARKS_NAME,
-        images=images,
+        images=list(_images(detection).values()),
         joints=[
             {"name": name, "label": f"{joint_letter(name.rpartition('.')[2])}{leg + 1}"}
             for name, (leg, _) in joints.items()

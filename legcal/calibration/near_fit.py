@@ -25,6 +25,7 @@ from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.motions import components
+from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
@@ -37,7 +38,8 @@ from legcal.perception.photographs import (
 )
 from legcal.perception.placement import Placement, placed_arms
 
-MOVED_PX, MOST_ROUNDS = 1.0, 4  # of most joints between two fits, from where on near another round
+# Of joints between two fits, from where on outlines are measured again: this percentile of all
+MOVED_PX, MOST_JOINTS, MOST_ROUNDS = 1.0, 90.0, 4
 MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
 
 
@@ -104,29 +106,28 @@ class _SearchNearFit:
 
     def converged(self, near: Estimate) -> Estimate:
         """Measure near a fit and fit again, until outlines are where they were looked for."""
+        joints = self._joints(near)
         for _ in range(MOST_ROUNDS):
-            before, near = near, self.fitted(near, {})
-            if self._moved(before, near) <= MOVED_PX:
+            near, before = self.fitted(near, {}), joints
+            joints = self._joints(near)
+            away = np.linalg.norm(joints - before, axis=-1)
+            if not np.isfinite(away).any() or np.nanpercentile(away, MOST_JOINTS) <= MOVED_PX:
                 break
         return near
 
-    def _moved(self, before: Estimate, after: Estimate) -> float:
-        """Return how far joints move in photographs from one fit to another, in most [px]."""
-        m, rows, seen = self.data.measurements, self.photographs.detect, []
-        for near in (before, after):
-            _, placement = self.at(near, {})
-            joints = np.stack([placement.A_base, placement.B_base], axis=1)[rows]
-            pixels = np.full((len(rows), *joints.shape[1:3], 2), np.nan)
-            for k, row in enumerate(rows.tolist()):
-                T = placement.T_base_camera[m.view[row]]
-                if T is not None:
-                    X = T.inv().apply(joints[k].reshape(-1, 3))
-                    xy = X[:, :2] / np.where(X[:, 2:] > 0.0, X[:, 2:], np.nan)
-                    camera = m.views[m.view[row]].camera
-                    pixels[k] = camera.distort(xy).reshape(pixels.shape[1:])
-            seen.append(pixels)
-        away = np.linalg.norm(seen[1] - seen[0], axis=-1)
-        return float(np.nanpercentile(away, 90.0)) if np.isfinite(away).any() else 0.0
+    def _joints(self, near: Estimate) -> Array:
+        """Return where photographs show the joints of a fit, (n, 2 n_legs, 2) [px], or NaN."""
+        m, rows = self.data.measurements, self.photographs.detect
+        _, placement = self.at(near, {})
+        joints = np.concatenate([placement.A_base, placement.B_base], axis=1)[rows]
+        pixels = np.full((*joints.shape[:2], 2), np.nan)
+        for of_row, own, v in zip(pixels, joints, m.view[rows].tolist(), strict=True):
+            T = placement.T_base_camera[v]
+            if T is not None:
+                X = T.inv().apply(own)
+                ahead = X[:, 2] > 0.0
+                of_row[ahead] = m.views[v].camera.project(X[ahead])
+        return pixels
 
     def fitted(
         self, near: Estimate, gammas: Mapping[str, float], *, like: Outlines | None = None

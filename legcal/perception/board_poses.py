@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtri
 
 from legcal.data.corners import Corners
@@ -24,6 +24,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import BoardImages, adjust_board
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
+from legcal.vision.point_pose import closed_form_poses
 
 SAME_ANGLE, SIMILAR_ANGLE = 1e-3, np.deg2rad(3.0)  # between poses of one plane: of an image, a view
 MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA = 1.0, 5.0  # root mean square of corners of this board
@@ -50,21 +51,8 @@ def plane_poses(
     sigma_px: Array,  # (n,) standard deviations of either coordinate [px]
 ) -> list[PlanePose]:
     """Return the poses of a plane that explain where its points are seen, the better one first."""
-    middle = points.mean(axis=0)
     xy = camera.undistort(px)
-    n, turns, shifts, _ = cv2.solvePnPGeneric(
-        np.ascontiguousarray(points - middle),
-        np.ascontiguousarray(xy),
-        np.eye(3),
-        np.zeros(0),
-        flags=cv2.SOLVEPNP_IPPE,
-    )
-    starts = [
-        RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(w)))
-        * RigidTransform.from_translation(-middle)
-        for w, t in zip(turns[:n], shifts[:n], strict=True)
-        if np.all(np.isfinite(w)) and np.all(np.isfinite(t))
-    ]
+    starts = list(closed_form_poses(points, xy, cv2.SOLVEPNP_IPPE))
     refined = [_refine(camera, points, px, sigma_px, start) for start in starts]
     poses = _distinct([pose for pose in refined if pose is not None], SAME_ANGLE)
     return sorted(poses, key=lambda pose: pose.cost)

@@ -174,8 +174,7 @@ def place_camera(
     suggest poses, until one is clear. ``known`` are T_base_camera that are tried first; where most
     legs agree with one of them, nothing else is.
     """
-    merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
-    best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
+    best_first = sorted(pictures, key=lambda picture: -picture.pairs.best_merit)
     every = Pictures.of(pictures)
     best = _candidates(every, _near_known(every, known, n_legs))
     done = 0
@@ -244,8 +243,13 @@ def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
     middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
     turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
     further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
-    new = Rotation.from_rotvec(turns).as_matrix() @ R
-    return CameraPoses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
+    at = further[:, None] * (R @ middle + t)
+    return _turned_about(middle, at, Rotation.from_rotvec(turns).as_matrix() @ R, n_legs)
+
+
+def _turned_about(middle: Array, at: Array, R: Array, n_legs: int) -> CameraPoses:
+    """Return poses with rotations R (n, 3, 3) that have the middle of the machine at (n, 3) [m]."""
+    return CameraPoses.rigid(R, at - R @ middle, n_legs)
 
 
 def place_by_edges(
@@ -263,16 +267,13 @@ def place_by_edges(
     if len(poses) == 0:
         return _candidates(every, poses)
     coarse, rng = maps.halved(), np.random.default_rng(len(poses))
-    few = slice(0, N_SUGGESTING)
-    some, maps_of_some = every.take(few), maps.take(range(len(pictures))[few])
-    rough = maps_of_some.halved()
-    score = rough.blurred(EDGE_STEPS[0].blur).scores(some, poses)
+    few = slice(N_SUGGESTING)
+    score = coarse.take(few).blurred(EDGE_STEPS[0].blur).scores(every.take(few), poses)
     poses = poses.take(_best(score, N_MOVED))
     for step in EDGE_STEPS:
-        of_step, seen = (maps_of_some, some) if step.is_fine else (rough, some)
-        if step.all_pictures:
-            of_step, seen = (maps if step.is_fine else coarse), every
-        poses, score = _moved_to_edges(of_step.blurred(step.blur), seen, poses, step, rng)
+        some = slice(None) if step.all_pictures else few
+        of_step = (maps if step.is_fine else coarse).take(some).blurred(step.blur)
+        poses, score = _moved_to_edges(of_step, every.take(some), poses, step, rng)
         poses = poses.take(_distinct(poses, score, step.n_kept))
     found = match_pairs(every, poses, FITTING[-1])
     support, expected = (_by_legs(every, x).T for x in (found.exclusive_score, found.visible))
@@ -291,8 +292,7 @@ def _moved_to_edges(
     distance = np.linalg.norm(at, axis=1, keepdims=True)
     turns = Rotation.from_rotvec(np.deg2rad(step.turn) * rng.normal(size=(len(R), 3)))
     at = at + step.part * distance * rng.normal(size=at.shape) * np.array([0.5, 0.5, 1.0])
-    R = turns.as_matrix() @ R
-    around = CameraPoses.rigid(R, at - R @ middle, poses.shift.shape[1])
+    around = _turned_about(middle, at, turns.as_matrix() @ R, poses.shift.shape[1])
     tried = CameraPoses.joined([poses, around])
     score = maps.scores(pictures, tried)
     parent = np.concatenate([np.arange(n), np.repeat(np.arange(n), N_TRIED)])

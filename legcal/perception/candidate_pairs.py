@@ -23,10 +23,11 @@ from legcal.vision.image_file import Grey
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
 LEG_WIDTH = 8.0  # of the thinnest leg after that [reduced px]
-# Of what stands still in pictures of a view: so many pictures, in most of which at most this part
-# moves, that is, differs by several times what most pixels do and this part of the brightest light
-MIN_STILL, MAX_MOVING, NOISE_FACTOR, DIFFERS = 4, 0.5, 3.0, 0.02
+# What stands still in pictures of a view: by so many of them; what moves differs from it by several
+# times what most pixels do, and by this part of the brightest light
+MIN_STILL, NOISE_FACTOR, DIFFERS = 4, 3.0, 0.02
 NEAR_MOVING, MIN_MOVING = 2, 8  # pixels around such differences; pieces there, to leave out others
+N_ALONG, MOVING_SHARE = 12, 0.5  # points of a piece, and of which more must lie there
 MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
 MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
 MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
@@ -51,6 +52,7 @@ MIN_SLENDERNESS = 1.5  # length of a pair [widths]
 MIN_OVERLAP = 0.35  # of the edges of a pair, as a part of the longer one
 SAME_POLARITY = 0.5  # weight of a pair at both of whose edges the picture changes the same way
 MAX_PAIRS = 48  # pairs of a picture
+N_BEST = 8  # of these, by which pictures are compared
 MAX_PAIRS_OF_EDGE = 4  # pairs to which one edge belongs
 DUPLICATE = 0.35, 0.2  # of a pair that repeats another: distance, difference of widths [widths]
 
@@ -88,7 +90,7 @@ class Still(NamedTuple):
 
 
 def still_picture(pictures: Sequence[Grey]) -> Still | None:
-    """Return what stands still in reduced pictures of one view; None where the camera does not.
+    """Return what stands still in reduced pictures of one view; None where they are few.
 
     Legs are somewhere else in most pictures.
     """
@@ -96,9 +98,7 @@ def still_picture(pictures: Sequence[Grey]) -> Still | None:
         return None
     middle = np.median(np.stack(pictures), axis=0).astype(np.float32)
     away = [_middle(np.abs(one - middle)[::STRIDE, ::STRIDE]) for one in pictures]
-    still = Still(middle, float(np.median(away)))
-    moving = [float(np.mean(_differs(one, still))) for one in pictures]
-    return still if float(np.median(moving)) <= MAX_MOVING else None
+    return Still(middle, float(np.median(away)))
 
 
 def _differs(picture: Grey, still: Still) -> BoolArray:
@@ -116,18 +116,16 @@ def moving_pixels(picture: Grey, still: Still) -> Image:
 def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
     """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
     differs = moving_pixels(picture, still)
-    share = np.linspace(0.0, 1.0, 12)[:, None]
+    share = np.linspace(0.0, 1.0, N_ALONG)[:, None]
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
     x, y = np.rint(np.clip(along, 0, np.array(picture.shape[::-1]) - 1)).astype(np.intp).T
-    return np.asarray(differs[y, x].mean(axis=0) > 0.5)
+    return np.asarray(differs[y, x].mean(axis=0) > MOVING_SHARE)
 
 
-def find_segments(
-    grey: Grey, camera: Camera, factor: int | None = None, still: Still | None = None
-) -> EdgeSegments:
-    """Return the straight edges of a picture, reduced by a factor, but of what stands still."""
-    factor = reduction(camera, 1.0) if factor is None else factor
-    return segments_of_reduced(reduce(grey, factor), camera, factor, still)
+def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
+    """Return the straight edges of a picture, which is reduced if it is large."""
+    factor = reduction(camera, 1.0)
+    return segments_of_reduced(reduce(grey, factor), camera, factor)
 
 
 def segments_of_reduced(
@@ -139,7 +137,6 @@ def segments_of_reduced(
         moving = _moving(pieces, small, still)
         if np.count_nonzero(moving) >= MIN_MOVING:
             pieces = pieces[moving]
-    pieces = pieces[:MAX_PIECES]
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
     pixel = factor / focal
     if len(pieces) == 0:
@@ -393,6 +390,11 @@ class CandidatePairs:
     def __len__(self) -> int:
         """Return the number of pairs."""
         return len(self.middle)
+
+    @property
+    def best_merit(self) -> float:
+        """Merit of the best pairs together."""
+        return float(self.merit[:N_BEST].sum())
 
     @property
     def normal(self) -> Array:

@@ -59,10 +59,9 @@ class EdgeMaps:
         corner = np.array([corner for _, corner, _ in grids])
         return cls(maps, corner, np.array([cell for _, _, cell in grids]))
 
-    def take(self, chosen: Sequence[int]) -> EdgeMaps:
+    def take(self, chosen: slice) -> EdgeMaps:
         """Return those of some pictures."""
-        some = list(chosen)
-        return EdgeMaps(self.maps[some], self.corner[some], self.cell[some])
+        return EdgeMaps(self.maps[chosen], self.corner[chosen], self.cell[chosen])
 
     def mirrored(self, middle: Array) -> EdgeMaps:
         """Return maps with left and right exchanged about middles x (n_pictures,)."""

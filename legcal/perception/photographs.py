@@ -55,7 +55,7 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
-DETECTOR_VERSION = 17  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 18  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -522,14 +522,15 @@ def _inspect_images(
     defects = defects_of(measurements, exposures)
     photographs.still.update(_still_pictures(measurements, small, defects))
     pairs_of = partial(_pairs_of_reduced, photographs.search(nominal))
-    pairs = dict(zip(small, photographs.run(pairs_of, list(small.items())), strict=True))
+    seen_by = [(picture, int(measurements.view[row])) for row, picture in small.items()]
+    pairs = dict(zip(small, photographs.run(pairs_of, seen_by), strict=True))
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
 
 
 def _still_pictures(
     measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
 ) -> dict[int, Still]:
-    """Return what stands still in the reduced pictures of each view whose camera does."""
+    """Return what stands still in the reduced pictures of each view that has enough of them."""
     of_view: dict[int, list[Grey]] = {}
     for row, picture in small.items():
         if row not in defects:
@@ -538,9 +539,9 @@ def _still_pictures(
     return {view: picture for view, picture in still.items() if picture is not None}
 
 
-def _pairs_of_reduced(search: Search, reduced: tuple[int, Grey]) -> CandidatePairs:
-    """Return the candidate pairs of an image by its row and the reduced image."""
-    return search.pairs_of_reduced(*reduced)
+def _pairs_of_reduced(search: Search, seen_by: tuple[Grey, int]) -> CandidatePairs:
+    """Return the candidate pairs of a reduced image and the view of it."""
+    return search.pairs_of_reduced(*seen_by)
 
 
 def defects_of(

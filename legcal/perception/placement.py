@@ -26,7 +26,6 @@ from legcal.perception.candidate_pairs import (
     CandidatePairs,
     Still,
     find_candidate_pairs,
-    find_segments,
     moving_pixels,
     reduction,
     segments_of_reduced,
@@ -83,9 +82,7 @@ class Search:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
-        camera, still = self.measurements.views[view].camera, self.still.get(view)
-        factor = self.reduction(view)
-        return find_candidate_pairs(find_segments(self.load(row), camera, factor, still))
+        return self.pairs_of_reduced(reduce(self.load(row), self.reduction(view)), view)
 
     def reduction(self, view: int) -> int:
         """Return the factor by which the pictures of a view are reduced."""
@@ -104,11 +101,10 @@ class Search:
         ]
         return EdgeMaps.of(small, moving, cameras, factors)
 
-    def pairs_of_reduced(self, row: int, small: Grey) -> CandidatePairs:
-        """Return the edge pairs of an image that has been reduced."""
-        view = int(self.measurements.view[row])
-        camera, factor = self.measurements.views[view].camera, self.reduction(view)
-        segments = segments_of_reduced(small, camera, factor, self.still.get(view))
+    def pairs_of_reduced(self, small: Grey, view: int) -> CandidatePairs:
+        """Return the edge pairs of a reduced image as if the camera of a view had taken it."""
+        camera, still = self.measurements.views[view].camera, self.still.get(view)
+        segments = segments_of_reduced(small, camera, self.reduction(view), still)
         return find_candidate_pairs(segments)
 
     def own_pairs(self, row: int) -> CandidatePairs:
@@ -118,15 +114,13 @@ class Search:
     def targets(self, row: int, view: int) -> LegSegments:
         """Return the legs at the reading of a row that a view is stated to show."""
         legs = np.flatnonzero(self.wanted[view])
-        parts = self.cylinders
-        if self.occluders:
-            parts = [
-                (*own, *housings)
-                for own, housings in zip(
-                    parts, housings_of_legs(self.occluders, len(parts)), strict=True
-                )
-            ]
-        return leg_segments(self.A_base[row], self.B_base[row], parts, legs)
+        return leg_segments(self.A_base[row], self.B_base[row], self.shapes, legs)
+
+    @cached_property
+    def shapes(self) -> list[tuple[Cylinder, ...]]:
+        """What each leg is recognised by: its cylinders, and housings as such."""
+        housings = housings_of_legs(self.occluders, self.n_legs)
+        return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
         """Return what an image shows with what it should show by other cylinders."""

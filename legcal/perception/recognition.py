@@ -235,8 +235,7 @@ class _ByEdges(NamedTuple):
 def _by_edges(search: Search, task: _ByEdges) -> PoseCandidates:
     """Return the camera of a group by all edges along legs in a few of its pictures."""
     group, pictures, by_pairs, is_mirrored = task
-    merit = {row: float(pictures[row].pairs.merit[:8].sum()) for row in group.rows}
-    rows = sorted(group.rows, key=lambda row: -merit[row])[:SOME_PICTURES]
+    rows = sorted(group.rows, key=lambda row: -pictures[row].pairs.best_merit)[:SOME_PICTURES]
     known = CameraPoses.none(search.n_legs)
     if by_pairs is not None and len(by_pairs.poses):
         known = CameraPoses.rigid(by_pairs.poses.R, by_pairs.poses.t, search.n_legs)

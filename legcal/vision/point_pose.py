@@ -94,15 +94,22 @@ def _subsets(n: int) -> Iterator[IntArray]:
 
 def _closed_form(points: Array, xy: Array) -> Iterator[RigidTransform]:
     """Yield T_camera_points by SQPnP of points (n, 3) seen at (n, 2) of the sensor plane."""
-    if on_a_line(points):
-        return
+    if not on_a_line(points):
+        yield from closed_form_poses(points, xy, cv2.SOLVEPNP_SQPNP)
+
+
+def closed_form_poses(points: Array, xy: Array, method: int) -> Iterator[RigidTransform]:
+    """Yield T_camera_points by a method of OpenCV, of points (n, 3) seen at (n, 2).
+
+    The latter are of the sensor plane.
+    """
     middle = points.mean(axis=0)
     n, turns, shifts, _ = cv2.solvePnPGeneric(
         np.ascontiguousarray(points - middle),
         np.ascontiguousarray(xy),
         np.eye(3),
         np.zeros(0),
-        flags=cv2.SOLVEPNP_SQPNP,
+        flags=method,
     )
     for w, t in zip(turns[:n], shifts[:n], strict=True):
         if np.all(np.isfinite(w)) and np.all(np.isfinite(t)):

@@ -367,11 +367,7 @@
   dialog.addEventListener("cancel", (event) => { if (abandon()) event.preventDefault(); });
 
   const download = () => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([tableText()], { type: "text/csv" }));
-    link.download = file;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    downloadTable(file, tableText());
     saved = true;
     summary.textContent = `${edits.size} outline${edits.size === 1 ? " is" : "s are"} edited in the table that was downloaded.`;
     say(`${file} was downloaded: copy it into the dataset.`);

@@ -60,11 +60,7 @@
     quoted(images[image].view), quoted(images[image].image), quoted(joints[joint].name), one.u.toFixed(2), one.v.toFixed(2), one.sigma,
   ].join(","))].join("\n") + "\n";
   const download = () => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([tableText()], { type: "text/csv" }));
-    link.download = file;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    downloadTable(file, tableText());
     saved = true;
     say(`${file} was downloaded: copy it into the dataset.`);
     summarise("were downloaded");

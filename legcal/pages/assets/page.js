@@ -1,4 +1,12 @@
 "use strict";
+// Tables that editors make are saved by the browser.
+const downloadTable = (file, text) => {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+  link.download = file;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+};
 (() => {
   // Tables sort by a column: numbers by their exact value, texts as people count.
   const order = new Intl.Collator(undefined, { numeric: true }).compare;
