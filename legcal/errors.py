@@ -14,6 +14,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from legcal.causes import Cause
+
 MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
 MAX_SENTENCE = 4000  # characters of one problem
 MAX_MESSAGE = 16_000  # characters of all that are shown
@@ -42,7 +44,7 @@ class Problem:
     """
 
     what: str  # what could not be done: "the number could not be used"
-    found: str = ""
+    found: str | Cause = ""
     needed: str = ""
     remedy: str = ""
     file: str = ""
@@ -86,7 +88,7 @@ class Problem:
         """Return the facts that there are, as ``--json`` has them."""
         facts = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
-            key: printable(value) if isinstance(value, str) else value
+            key: printable(str(value)) if isinstance(value, str | Cause) else value
             for key, value in facts.items()
             if value not in ("", None, ())
         }
@@ -95,7 +97,7 @@ class Problem:
 class BadValue(ValueError):
     """A value cannot be used: what was found and what is needed; its reader knows where."""
 
-    def __init__(self, found: str, needed: str, remedy: str) -> None:
+    def __init__(self, found: str | Cause, needed: str, remedy: str) -> None:
         super().__init__(f"found {found}, needed {needed}; {remedy}.")
         self.found, self.needed, self.remedy = found, needed, remedy
 

@@ -26,6 +26,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
+from legcal.causes import Cause
 from legcal.errors import BadValue, DatasetError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
@@ -308,7 +309,7 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
     place = ".".join([*[prefix] * bool(prefix), *map(str, steps)]) or "the file"
     context = error.get("ctx", {})
 
-    def refused(found: str, needed: str, remedy: str, done: str = "read") -> Problem:
+    def refused(found: str | Cause, needed: str, remedy: str, done: str = "read") -> Problem:
         what = f"{place} could not be {done}"
         return Problem(what, found, needed, remedy, str(path), name=place)
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.causes import Cause
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
@@ -42,7 +43,7 @@ from legcal.machine.leg import main_cylinders
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
-from legcal.perception.placement import Group, Placement, Search
+from legcal.perception.placement import Group, NotPlaced, Placement, Search
 from legcal.perception.tuning import EVIDENCE, JOINT_ERROR, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
@@ -593,13 +594,13 @@ def _without_weak_views(
             continue
         names = [search.measurements.views[v].name for v in group.views]
         n, n_images = 0 if fit is None else int(fit.n_outlines.sum()), len(group.rows)
-        why = (
-            f"view {group_name(names)}: its camera could not be placed: found only {n} outlines "
-            f"that agree in its {n_images} image{'s' * (n_images != 1)}, needed more than other "
-            "edges give by chance; add images at other readings, in better light, or a rough "
-            "T_base_camera."
+        why = Cause(
+            "its camera could not be placed: found only {} outlines that agree in its {} image"
+            f"{'s' * (n_images != 1)}, needed more than other edges give by chance; add images at "
+            "other readings, in better light, or a rough T_base_camera.",
+            (n, n_images),
         )
-        unplaced |= dict.fromkeys(names, why)
+        unplaced |= dict.fromkeys(names, NotPlaced(group_name(names), why))
         for v in group.views:
             T[v] = None
     return replace(placement, T_base_camera=tuple(T), unplaced=unplaced)

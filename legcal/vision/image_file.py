@@ -17,6 +17,7 @@ from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
+from legcal.causes import Cause
 from legcal.errors import BadValue, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
@@ -94,7 +95,7 @@ NOWHERE = Place()
 class BadImage(BadValue):
     """What is wrong with the bytes of an image file."""
 
-    def __init__(self, found: str, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
+    def __init__(self, found: str | Cause, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
         super().__init__(found, needed, remedy)
 
 
@@ -195,7 +196,8 @@ def _size_read(form: str, read: Callable[[bytes], tuple[int, int]], content: byt
     except BadImage:
         raise
     except (*PILLOW_ERRORS, UserWarning) as error:
-        raise BadImage(f"a {form} file of {len(content)} bytes, damaged or cut off") from error
+        found = Cause("a {} file of {} bytes, damaged or cut off", (form, len(content)))
+        raise BadImage(found) from error
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
@@ -306,7 +308,9 @@ def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, 
     return content, None
 
 
-def _problem(path: Path, named: Place, found: str, needed: str, remedy: str = _AGAIN) -> Problem:
+def _problem(
+    path: Path, named: Place, found: str | Cause, needed: str, remedy: str = _AGAIN
+) -> Problem:
     """Return why an image cannot be used."""
     what = f"image {path} could not be read"
     return Problem(what, found, needed, remedy, named.file, named.row, name=str(path))
