@@ -21,7 +21,14 @@ from legcal.data.measurements import Measurements, few
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import Factor, Frames, Problem, Residuals, Variables, all_free
+from legcal.estimation.problem import (
+    EstimationProblem,
+    Factor,
+    Frames,
+    Residuals,
+    Variables,
+    all_free,
+)
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
@@ -193,7 +200,7 @@ class _Image:
         if held:
             factors.append(Factor("readings", differences, (of_readings,), m, 1))
         pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
-        problem = Problem[_State]((pose,), None, tuple(factors))
+        problem = EstimationProblem[_State]((pose,), None, tuple(factors))
         try:
             found = minimise(problem, _State(Frames.of([self.fitted_pose])), LOSS)
         except DidNotConverge:

@@ -1,7 +1,7 @@
 """Views fitted to their outlines, and guided matching of the legs that are missing.
 
 Edge pairs place a camera to some millimetres and leave out legs that have none; outlines are far
-better known. A group of views is one :class:`legcal.estimation.problem.Problem`:
+better known. A group of views is one :class:`legcal.estimation.problem.EstimationProblem`:
 
     pose        of the machine in the frame of the group, about the middle of its joints
     shift       of A and B of each leg against the model
@@ -25,11 +25,11 @@ from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
 from legcal.estimation.problem import (
+    EstimationProblem,
     Factor,
     Frames,
     GaussianPrior,
     Linearization,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -201,7 +201,9 @@ def fit_view(
     )
 
 
-def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Problem[_State]:
+def _problem(
+    group: Group, lines: "_Lines", start: _State, middle: Array
+) -> EstimationProblem[_State]:
     """Return the problem of a group; weights and sigmas of its priors are put on its rows later."""
     n_legs, every_item = len(start.shift), np.arange(lines.n_items)
     R, centre = start.pose.R[0], start.pose.t[0]
@@ -226,7 +228,7 @@ def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Pro
     every = slice(None)
     n = len(lines.leg)
     touches = ("pose", np.zeros(n, dtype=np.intp), every), ("shift", lines.leg, every)
-    return Problem(
+    return EstimationProblem(
         (pose, Variables("shift", all_free(n_legs, 6))),
         Variables("offset", all_free(lines.n_items, 3)),
         (
@@ -263,7 +265,7 @@ def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -
 
 
 def _normal_equations(
-    problem: Problem[_State],
+    problem: EstimationProblem[_State],
     state: _State,
     linear: Linearization,
     weight: Array,
