@@ -18,6 +18,7 @@ from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
     ENCODER_SIGMAS,
     ViewEntry,
+    entry_problem,
     find_dataset_file,
     read_dataset_file,
     view_problems,
@@ -455,11 +456,16 @@ def _mechanism_path(folder: Path, named: str) -> Path:
 
 def _leg_problems(
     path: Path, views: Mapping[str, ViewEntry], leg_names: Sequence[str]
-) -> list[str]:
+) -> list[Problem]:
     """Return the legs of views that the mechanism does not have."""
     return [
-        f"{path}: views.{name}.legs could not be used: found the unknown leg {describe(leg)}, "
-        f"needed legs of the mechanism; {closest(leg, leg_names)}"
+        entry_problem(
+            path,
+            f"views.{name}.legs",
+            f"the unknown leg {describe(leg)}",
+            "legs of the mechanism",
+            closest(leg, leg_names),
+        )
         for name, view in views.items()
         for leg in view.legs or ()
         if leg not in leg_names
@@ -631,11 +637,11 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
 
 def expand_hand_held(
     path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
-) -> tuple[Measurements, tuple[int, ...], list[str]]:
+) -> tuple[Measurements, tuple[int, ...], list[Problem]]:
     """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
     new: list[View] = []
     origin: list[int] = []
-    problems: list[str] = []
+    problems: list[Problem] = []
     index = np.zeros_like(measurements.view)
     for v, (name, entry) in enumerate(views.items()):
         rows = np.flatnonzero(measurements.view == v)
@@ -650,8 +656,13 @@ def expand_hand_held(
             origin.append(v)
         taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
         problems += [
-            f"{path}: views.{other} could not be used: found the name that an image of the "
-            f"hand-held view {name} gets, needed another; rename it."
+            entry_problem(
+                path,
+                f"views.{other}",
+                f"the name that an image of the hand-held view {name} gets",
+                "another",
+                "rename it",
+            )
             for other in taken
         ]
     return replace(measurements, views=tuple(new), view=index), tuple(origin), problems

@@ -18,7 +18,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from legcal.causes import Cause
-from legcal.errors import BadValue, DatasetError, Place, Problem
+from legcal.errors import BadValue, Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
@@ -287,7 +287,8 @@ def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, 
     """Return the bytes of an image file, and what is wrong with them if anything."""
     if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
-        return b"", _problem(path, named, found, _COMPLETE, "correct the path or remove the row")
+        remedy = "correct the path or remove the row"
+        return b"", _problem(path, named, found, _COMPLETE, remedy, Code.MISSING_FILE)
     try:
         content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
@@ -304,16 +305,22 @@ def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, 
             f"{camera.width} x {camera.height} px as in its camera file",
             "use the original image, neither scaled, cropped nor rotated, or the calibration of "
             "its size",
+            Code.WRONG_IMAGE_SIZE,
         )
     return content, None
 
 
 def _problem(
-    path: Path, named: Place, found: str | Cause, needed: str, remedy: str = _AGAIN
+    path: Path,
+    named: Place,
+    found: str | Cause,
+    needed: str,
+    remedy: str = _AGAIN,
+    code: Code = Code.UNREADABLE_FILE,
 ) -> Problem:
     """Return why an image cannot be used."""
     what = f"image {path} could not be read"
-    return Problem(what, found, needed, remedy, named.file, named.row, name=str(path))
+    return Problem(what, found, needed, remedy, *named, name=str(path), code=code)
 
 
 def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:
