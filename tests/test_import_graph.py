@@ -151,6 +151,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.problem",
         "joint_fit.variables",
         "link_joints",
+        "notes",
         "location.document",
         "location.locate",
         "location.urdf",
