@@ -259,9 +259,9 @@ def _compare(seed: int, moved: Array, dof: int = 200, significance: float = 0.05
     values = old + covariance @ (score / noise**2)
     found = difference(values, covariance, PRIOR, old, old_covariance)
     single = tuple(
-        Change(f"c{i}", (f"c{i}",), ("m",), ("",), np.eye(N)[:, i : i + 1]) for i in range(N)
+        Change("", f"c{i}", (f"c{i}",), ("m",), ("",), np.eye(N)[:, i : i + 1]) for i in range(N)
     )
-    pair = (Change("both", ("c0", "c1"), ("m", "m"), ("", ""), np.eye(N)[:, :2]),)
+    pair = (Change("", "both", ("c0", "c1"), ("m", "m"), ("", ""), np.eye(N)[:, :2]),)
     return judge_movement(found, dof, (single, pair), significance)
 
 
