@@ -87,8 +87,8 @@ class Detection:
         they were expected, and no outline of theirs is here but those that were given.
     image_notes : tuple of str
         What is odd about images, views and radii.
-    notes : tuple of str
-        These, and what else a reader should know.
+    leg_notes : tuple of str
+        What else a reader should know of the search for the legs.
     corners : Corners or None
         The corners of calibration boards in all images; None without a board.
     arms : mapping
@@ -104,9 +104,14 @@ class Detection:
     rows: IntArray
     unplaced: dict[str, NotPlaced]
     image_notes: tuple[str, ...]
-    notes: tuple[str, ...]
+    leg_notes: tuple[str, ...]
     corners: Corners | None = None
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know, also of the dataset."""
+        return (*self.dataset.notes, *self.image_notes, *self.leg_notes)
 
     def view_of(self, row: int) -> str:
         """Return the name of the view of a row."""
@@ -232,7 +237,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         rows=images,
         unplaced=unplaced,
         image_notes=tuple(image_notes),
-        notes=(*dataset.notes, *image_notes, *notes, *data.unreached_notes()),
+        leg_notes=(*notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),
     )
 
@@ -272,7 +277,7 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
             for view in dataset.measurements.views
         },
         image_notes=(),
-        notes=dataset.notes,
+        leg_notes=(),
     )
 
 

@@ -120,11 +120,10 @@ def doctor(
     dataset = source if isinstance(source, Dataset) else load_dataset(source, check_images=writes)
     if writes:
         rows_with_image(dataset)
-    of_tables = tuple(note for note in dataset.notes if note not in dataset.file_notes)
-    dataset, problems = inspect_files(replace(dataset, notes=of_tables))
+    dataset, problems = inspect_files(dataset)
     found, choices = _Found(dataset, writes), chosen_parameters(dataset, ())
     usable = _look_at_files(found, problems)
-    _look_at_readings(found, of_tables)
+    _look_at_readings(found, dataset.table_notes)
     _look_at_cameras(found, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         exposures = _look_at_photographs(found, usable, pool, report)
@@ -539,9 +538,8 @@ def _look_at_legs(
     odd = [one for one in seen.image_notes if one not in told]
     for what in notes_beside(found.diagnosis, odd, "legcal doctor"):
         found.add("legs", "note" if found.diagnosis else "warning", what)
-    for what in seen.notes:
-        if what not in (*seen.dataset.notes, *seen.image_notes):
-            found.add("legs", "note", what)
+    for what in seen.leg_notes:
+        found.add("legs", "note", what)
     for view in views:
         n_found, n_visible = view.legs_found or 0, view.legs_visible or 0
         if not view.problem and n_found < FEW_LEGS * n_visible:

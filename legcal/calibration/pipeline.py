@@ -48,7 +48,14 @@ from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few_views
 from legcal.data.outlines import reject_unused_legs
 from legcal.data.overrides import Override, overrides_of_call
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.errors import (
+    DatasetError,
+    DidNotConverge,
+    NotIdentifiable,
+    NotVisible,
+    Problem,
+    UsageError,
+)
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
@@ -224,9 +231,10 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
         if not (diagnosis or notes):
             raise
-        likeliest = [one.sentence for one in diagnosis]
-        beside = notes_beside(diagnosis, error.problems, "legcal calibrate")
-        refusal = type(error)([*likeliest, *beside, *notes])
+        refused: Sequence[str | Problem] = error.facts
+        if diagnosis:
+            refused = notes_beside(diagnosis, error.problems, "legcal calibrate")
+        refusal = type(error)([*(one.sentence for one in diagnosis), *refused, *notes])
         refusal.diagnosis = tuple(one.document().document() for one in diagnosis)
         raise refusal from error
 

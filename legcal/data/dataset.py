@@ -82,7 +82,7 @@ class Dataset:
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the rows of ``observations.csv`` if there is one
-    notes: tuple[str, ...] = ()  # what is odd but allowed
+    table_notes: tuple[str, ...] = ()  # what is odd but allowed: in tables and the dataset file
     axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
     overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
@@ -90,7 +90,12 @@ class Dataset:
     landmarks: Landmarks | None = None  # the rows of ``landmarks.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
-    file_notes: tuple[str, ...] = ()  # those of the notes that come from these
+    file_notes: tuple[str, ...] = ()  # what is odd in these
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is odd but allowed."""
+        return (*self.table_notes, *self.file_notes)
 
     def board_on(self, link: Link) -> FixedBoard | None:
         """Return the calibration board on a link, None if it has none."""
@@ -333,7 +338,7 @@ def load_dataset(
         machine=machine,
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
-        notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
+        table_notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
@@ -388,11 +393,8 @@ def _without_photographs(dataset: Dataset) -> str:
 def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
     """Return a dataset with what its images say of themselves, and what is wrong with rows."""
     facts, problems = inspect_rows(dataset)
-    of_files = [
-        one.what for one in notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
-    ]
-    notes = (*dataset.notes, *of_files)
-    return replace(dataset, notes=notes, facts=facts, file_notes=tuple(of_files)), problems
+    found = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
+    return replace(dataset, facts=facts, file_notes=tuple(one.what for one in found)), problems
 
 
 def _invisible(dataset: Dataset) -> list[str]:
