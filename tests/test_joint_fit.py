@@ -266,7 +266,11 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
             Choices(priors={"leg2.base_axis.1": Prior(0.0, 1e-3)}),
             marks=pytest.mark.slow,
         ),
-        ("tricept", Choices(free=frozenset({"leg1.radius.leg1_rod"}))),
+        pytest.param(
+            "tricept",
+            Choices(free=frozenset({"leg1.radius.leg1_rod"})),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             "hexapod-rod",
             Choices(priors={"leg6.length": Prior(0.4, 1e-4)}),

@@ -73,7 +73,7 @@ def small_search() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def drawn_once() -> Iterator[None]:
     """Draw the candidate poses of equal requests once."""
-    drawn: dict[str, Any] = {}
+    drawn: dict[str, tuple[Configurations, Any]] = {}
 
     def candidate_poses(
         machine: Machine, legs: Any, setting: Setting, n: int, rng: Any, progress: Any
