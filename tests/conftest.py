@@ -44,7 +44,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     def scope_of(nodeid: str) -> str:
         file = nodeid.partition("::")[0]
-        if "test_recorded_sessions" in file:
+        if "test_recorded_sessions" in file and "example" not in nodeid:
             return nodeid
         return "example" if _is_about_the_example(config.rootpath / file) else file
 

@@ -14,6 +14,7 @@ from csv_rows import read_rows, write_rows
 from numpy.typing import NDArray
 
 from legcal.calibration.result import Calibration
+from legcal.calibration.result_folder import write_result
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod"
@@ -34,6 +35,10 @@ class Run:
     output: Path
     calibration: Calibration
     stages: tuple[str, ...]
+
+    def written_again(self, *_: Any, output: Path, beside: Any, **__: Any) -> Calibration:
+        """Write the result into another folder, as if it were calibrated again, and return it."""
+        return write_result(self.calibration, output, beside=beside)
 
 
 # Copies with spoiled images

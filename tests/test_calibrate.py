@@ -79,9 +79,9 @@ def _simulated(
 
 @pytest.fixture(scope="module")
 def planar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
-    """Outlines of a planar machine in three views, and their calibration."""
+    """Outlines of a planar machine in three views, and their calibration, with ``result``."""
     folder = _simulated(tmp_path_factory.mktemp("planar"), views=3).folder
-    return folder, calibrate(folder)
+    return folder, calibrate(folder, output=folder.parent / "result")
 
 
 @pytest.fixture(scope="module")
@@ -217,35 +217,40 @@ def test_a_contradicted_camera_counts_in_the_verdict(
         ),
     ],
 )
-def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
-    made = simulated(tmp_path / "set", model, poses=8, views=3)
-    out = tmp_path / "out"
-    found = calibrate(made.folder, output=out)
+def test_fit_and_steps_come_nearer_to_the_truth(
+    model: str, planar: tuple[Path, Calibration], tmp_path: Path
+) -> None:
+    folder, found = planar
+    if model != PLANAR:
+        folder = simulated(tmp_path / "set", model, poses=8, views=3).folder
+        found = calibrate(folder, output=tmp_path / "result")
+    out, nominal = folder.parent / "result", found.dataset.machine
+    (truth,) = (folder / "truth/models").glob("*.yaml")
     assert found.verdict.trustworthy
     assert found.steps.failure == ""
     assert found.steps.legs is not None
     T, q = found.solution.T_Rb_Re, found.dataset.measurements.q
-    true, nominal, staged, fitted = (
-        poses_at_readings(made.nominal, legs, q, T)
+    true, uncalibrated, staged, fitted = (
+        poses_at_readings(nominal, legs, q, T)
         for legs in (
-            geometries(load_mechanism(made.truth_path)),
-            geometries(made.nominal),
+            geometries(load_mechanism(truth)),
+            geometries(nominal),
             found.steps.legs,
             found.solution.legs,
         )
     )
     before, by_steps, by_fit = (
-        pose_differences(poses, true)[0].mean() for poses in (nominal, staged, fitted)
+        pose_differences(poses, true)[0].mean() for poses in (uncalibrated, staged, fitted)
     )
     assert before > 1e-3
     assert found.platform is not None
     assert by_fit < 3.0 * found.platform.sigma.mean_displacement < 0.2 * before
     assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
     twists = {n: s for n, s in found.solution.estimates.status.items() if n.endswith(".twist")}
-    assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
+    assert bool(twists) == any(leg.twist is not None for leg in geometries(nominal))
     assert "fixed" not in twists.values()
     assert not [note for note in found.notes if "no model of the four steps" in note]
-    apart = evaluate(out / "staged.yaml", out / "calibrated.yaml", dataset=made.folder)
+    apart = evaluate(out / "staged.yaml", out / "calibrated.yaml", dataset=folder)
     from_fit: Any = found.result.stages.staged
     assert apart.displacement.mean() == pytest.approx(from_fit.from_fit.dX_m, abs=1e-7)
     assert apart.rotation.mean() == pytest.approx(from_fit.from_fit.dE_rad, abs=1e-6)

@@ -117,6 +117,7 @@ def test_a_board_that_is_bent_and_printed_too_wide_gives_the_same_camera() -> No
     assert found.adjusted.residual.std() < 1.05 * NOISE_PX
 
 
+@pytest.mark.slow
 def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
     squares = []
     for seed in range(4):
@@ -193,7 +194,7 @@ def corrected(seen: BoardImages) -> BoardImages:
             (shifted(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "beside that of the others"),
             (stretched(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "along y than those"),
         ],
-        lambda others, why: why.startswith(("moved", "another", "beside")),
+        lambda others, why: why.startswith("beside"),
         "system",
     ),
 )

@@ -96,7 +96,7 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
     [
         pytest.param("3-upu", 1e-3, marks=pytest.mark.slow),
         pytest.param("3-upu-tilted", 2e-3, marks=pytest.mark.slow),
-        ("tricept", 2e-3),
+        pytest.param("tricept", 2e-3, marks=pytest.mark.slow),  # in test_recorded_sessions.py: RPS
     ],
 )
 def test_a_calibrated_machine_with_axes_has_not_moved(

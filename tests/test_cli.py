@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 from command_line import run
 from hexapod_example import Run, copy_of_the_example
+from simulated import simulated
 
 from legcal.errors import Code, DatasetError, ModelError, NotVisible, Problem
+from legcal.simulation.settings import ParameterErrors
 
 
 @pytest.mark.parametrize(
@@ -76,20 +78,9 @@ def test_calibrate_prints_one_screen_and_all_parameters_with_verbose(
 
 
 def test_a_model_that_was_right_already_is_not_called_an_improvement(
-    example_run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = copy_of_the_example(tmp_path / "again")
-    for name in ("observations.csv", ".legcal-cache.json"):
-        (folder / name).unlink(missing_ok=True)
-    (folder / "observations.csv").write_text((example_run.folder / "observations.csv").read_text())
-    entry = (folder / "dataset.yaml").read_text()
-    calibrated = example_run.output / "calibrated.yaml"
-    (folder / "dataset.yaml").write_text(
-        entry.replace("mechanism: models/hexapod.yaml", f"mechanism: {calibrated}")
-    )
+    folder = simulated(tmp_path / "set", "3-rpr", errors=ParameterErrors()).folder
     assert run(monkeypatch, "calibrate", folder, "-o", tmp_path / "out") == 1
     assert "Do not load this into the controller" in " ".join(capsys.readouterr().out.split())
 
@@ -252,7 +243,7 @@ def test_a_number_of_processes_beside_a_cluster_is_refused(
 def test_progress_is_shown_unless_somebody_wants_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "2"]
+    words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "1"]
     assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
     shown = capsys.readouterr()
     assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0

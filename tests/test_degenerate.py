@@ -190,6 +190,7 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
     assert calibration.solution.estimates.status["leg6.base.z"] == "estimated"
 
 
+@pytest.mark.slow  # test_joint_fit.py and test_recorded_sessions.py see such platforms
 def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path: Path) -> None:
     made_set = simulated(tmp_path / "set", "3-upu", poses=6, seed=1)
     calibration = calibrate(made_set.folder, output=tmp_path / "out")

@@ -58,7 +58,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def examined(rendered: RepeatedImages, folder: Path) -> Examination:
-    return doctor(rendered.path, output=folder)
+    before = sorted(rendered.path.rglob("*"))
+    found = doctor(rendered.path, output=folder)
+    assert sorted(rendered.path.rglob("*")) == before
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -80,16 +83,15 @@ def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
 
 
 def test_folder_json_and_summary_tell_the_same(
-    rendered: RepeatedImages,
-    tmp_path: Path,
+    examined: Examination,
+    folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    before = sorted(rendered.path.rglob("*"))
-    out = tmp_path / "out"
-    assert run(monkeypatch, "detect", rendered.path, "-o", out, "--json") == 1  # c2 shows no leg
+    out = folder
+    monkeypatch.setattr("legcal.calibration.doctor.doctor", lambda *_, **__: examined)
+    assert run(monkeypatch, "detect", "dataset", "-o", out, "--json") == 1  # c2 shows no leg
     document = json.loads(capsys.readouterr().out)
-    assert sorted(rendered.path.rglob("*")) == before
     rows = read_rows(out / "observations.csv")
     assert document["outlines"] == len(rows)
     assert document["used"] == sum(row["verdict"] == "used" for row in rows) > 20

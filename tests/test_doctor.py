@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,7 @@ from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg, undecodable_png
 from simulated import simulated
 
-from legcal import SimulationSettings, doctor, simulate
+from legcal import doctor
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.examination import CHECKS, Examination, Finding
 from legcal.simulation.settings import Level
@@ -126,7 +125,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
         0.9, "exchange their headers",
     )  # fmt: skip
     monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: (mistake,))
-    session = made(tmp_path)
+    session = spoiled(tmp_path / "set", 2, ("c1", "c3"))
     session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
     name = session.change("c1", 0, lambda picture: 0 * picture)
     folder = session.write()
@@ -150,15 +149,12 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
 def test_datasets_without_photographs_are_judged_by_what_they_have(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = SimulationSettings(level=Level.AXES, views=3, poses=6)
-    simulate("hexapod", tmp_path / "axes", settings)
+    simulated(tmp_path / "axes", "hexapod", level=Level.AXES, views=3, poses=6)
     assert run(monkeypatch, "doctor", tmp_path / "axes") == 0
     shown = capsys.readouterr().out
     assert "Nothing stands against calibrating" in shown
     assert "legcal calibrate" in shown
-    simulate(
-        "hexapod", tmp_path / "outlines", replace(settings, level=Level.OUTLINES, views=1, poses=3)
-    )
+    simulated(tmp_path / "outlines", "hexapod", views=1)
     assert [one.name for one in doctor(tmp_path / "outlines").checks][-1] == "mistakes"
     (tmp_path / "axes" / "measurements.csv").unlink()
     assert run(monkeypatch, "doctor", tmp_path / "axes", "--json") == 2

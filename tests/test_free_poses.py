@@ -169,7 +169,10 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
     return load_mechanism(without_motors(path, *motors))
 
 
-@pytest.mark.parametrize(("n_motors", "by_clicks"), [(0, False), (3, False), (0, True)])
+@pytest.mark.parametrize(
+    ("n_motors", "by_clicks"),
+    [pytest.param(0, False, marks=pytest.mark.slow), (3, False), (0, True)],
+)
 def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
     machine = by_hand(n_motors, tmp_path)
     rng = np.random.default_rng(n_motors)

@@ -75,7 +75,7 @@ def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut
     return compare_held_out(posterior, truth.measurements, outlines, truth.poses)
 
 
-@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar", "hexaglide"]))
+@pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar"]))
 def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     truth = _truth(name)
     found = _compared(truth, truth.posterior, truth.outlines)
@@ -196,7 +196,7 @@ def _ratios(session: HexapodSession, level: float) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(ratios), axis=0)))
 
 
-@pytest.mark.parametrize("level", thinned([0.0, 0.05, 0.15], [0.0, 0.15]))
+@pytest.mark.parametrize("level", thinned([0.0, 0.05, 0.15], [0.15]))
 def test_images_are_as_far_off_as_is_expected(session: HexapodSession, level: float) -> None:
     pixels, displacement, rotation = _ratios(session, level)
     assert pixels == pytest.approx(1.0, abs=0.1)

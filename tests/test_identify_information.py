@@ -46,7 +46,7 @@ from legcal.machine.parameters import geometries, moved_legs, parametrize
 from legcal.machine.rods import arms_at
 from legcal.vision.cylinder import outlines_of_axis
 
-FAST = settings(deadline=None, max_examples=8)
+FAST = settings(deadline=None, max_examples=4)
 SEEDS = st.integers(0, 2**32 - 1)
 TYPES = [f"{base}{platform}" for base, platform in product("RUS", "RUS")]
 STEP = 1e-6

@@ -101,9 +101,10 @@ def fit_of_everything(session: MachineSession, *, known_radii: bool) -> Solution
     return refine(legs, session.measurements, session.outlines, session.start, choices=choices)
 
 
-def far_session(name: str) -> MachineSession:
+def far_session(name: str, n_poses: int = 6) -> MachineSession:
     """Return a session that starts 3 mm and 1 deg away, the cameras 1 cm and 2 deg."""
-    return machine_session(name, camera_shift=0.01, camera_turn=float(np.deg2rad(2.0)))
+    turn = float(np.deg2rad(2.0))
+    return machine_session(name, camera_shift=0.01, camera_turn=turn, n_poses=n_poses)
 
 
 def starts_far_away(session: MachineSession) -> bool:
@@ -152,7 +153,7 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
 
 @pytest.mark.parametrize("px", thinned([0.5, 20.0], [20.0]))
 def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px: float) -> None:
-    session, rng = far_session("delta-round-arms"), np.random.default_rng(5)
+    session, rng = far_session("delta-round-arms", n_poses=3), np.random.default_rng(5)
     seen, legs = session.outlines, session.legs
     bent = np.array(seen.part) == "arm2_link"
     offsets = px * bent[:, None] * rng.choice([-1.0, 1.0], (len(seen), 2))
@@ -265,7 +266,11 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
             Choices(priors={"leg2.base_axis.1": Prior(0.0, 1e-3)}),
             marks=pytest.mark.slow,
         ),
-        ("tricept", Choices(free=frozenset({"leg1.radius.leg1_rod"}))),
+        pytest.param(
+            "tricept",
+            Choices(free=frozenset({"leg1.radius.leg1_rod"})),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             "hexapod-rod",
             Choices(priors={"leg6.length": Prior(0.4, 1e-4)}),
@@ -546,7 +551,8 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     assert found.radii == {}
 
 
-@pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("coplanar", [False, True])
 def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> None:
     session, n = axes_session(coplanar=coplanar), 40
     problem = build_fit(session.legs, session.measurements, no_outlines(), axes=session.axes)

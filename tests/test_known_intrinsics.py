@@ -10,6 +10,7 @@ import pytest
 import yaml
 from fit_sessions import LENS, MachineSession, machine_session, with_camera
 from simulated import simulated
+from thinned import thinned
 
 from legcal import calibrate, check
 from legcal.calibration.documents import Result
@@ -155,10 +156,17 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
 
 @pytest.mark.parametrize(
     ("name", "error", "said"),
-    [
-        ("f", 0.01, ("focal length of c1", "given 1302.9 px", "same focus and zoom")),
-        ("cx", 25.0, ("principal point of c1", "given (543.0, 380.0) px", "same focus and zoom")),
-    ],
+    thinned(
+        [
+            ("f", 0.01, ("focal length of c1", "given 1302.9 px", "same focus and zoom")),
+            (
+                "cx",
+                25.0,
+                ("principal point of c1", "given (543.0, 380.0) px", "same focus and zoom"),
+            ),
+        ],
+        lambda name, *_: name == "cx",
+    ),
 )
 def test_a_camera_that_contradicts_its_covariance_is_named(
     name: str, error: float, said: tuple[str, ...]
@@ -185,7 +193,7 @@ def state_covariance(folder: Path) -> Path:
 
 
 def test_a_camera_file_with_a_covariance_is_used_from_calibration_to_check(tmp_path: Path) -> None:
-    folder = simulated(tmp_path / "set", "3-rpr", poses=8).folder
+    folder = simulated(tmp_path / "set", "3-rpr", poses=5).folder
     found = calibrate(state_covariance(folder), output=tmp_path / "out")
     assert not any("exact" in note for note in found.notes)
     document = Result.read(tmp_path / "out/result.json")

@@ -112,7 +112,11 @@ def test_positions_alone_find_all_but_the_orientation_of_the_tool() -> None:
 
 @pytest.mark.parametrize(
     ("name", "fixed"),
-    [("hexapod", []), pytest.param("3-upu", [6, 7, 8]), ("3-rpr", [8])],
+    [
+        pytest.param("hexapod", [], marks=pytest.mark.slow),  # the next ones hold what is open
+        ("3-upu", [6, 7, 8]),
+        pytest.param("3-rpr", [8], marks=pytest.mark.slow),
+    ],
 )
 def test_exact_poses_give_exact_frames_where_the_open_part_is_fixed_at_its_truth(
     name: str, fixed: list[int]

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 from outside_machines import missing, scaled
 from thinned import thinned
 
-from legcal.errors import UsageError
+from legcal.errors import OutOfClass, UsageError
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
@@ -162,12 +162,11 @@ def _plain(description: str, folder: Path) -> Machine:
 
 
 def _usual(description: str, name: str) -> bool:
-    """Say whether a machine is tried in a layout: all layouts, two or three machines each."""
+    """Say whether a machine is tried in a layout: all layouts, one or two machines each."""
     if name == "every leg otherwise":
         return True
     return description in OF_EACH_KIND and (
-        (OF_EACH_KIND.index(description) + list(LAYOUTS).index(name)) % 2 == 0
-        or name.startswith("carried")
+        (OF_EACH_KIND.index(description) + list(LAYOUTS).index(name)) % len(OF_EACH_KIND) == 0
     )
 
 
@@ -190,7 +189,7 @@ BORNE = [("6-UPS", 0, {}), ("3-RPR, tilted plane", 1, {}), ("3-UPU", 2, {"cut": 
 
 
 @pytest.mark.parametrize(
-    ("description", "leg", "others"), thinned(BORNE, lambda name, leg, others: leg in (1, 3))
+    ("description", "leg", "others"), thinned(BORNE, lambda name, leg, others: leg == 3)
 )
 def test_a_platform_that_is_the_child_of_a_last_joint_changes_nothing(
     description: str, leg: int, others: dict[str, Any], tmp_path: Path
@@ -229,7 +228,7 @@ LEGS = st.tuples(
 
 
 @settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     legs=st.lists(LEGS, min_size=3, max_size=6),
@@ -241,7 +240,10 @@ def test_any_legs_in_any_layout_are_found_as_drawn(
 ) -> None:
     types, kinds = [leg[0] for leg in legs], [leg[1] for leg in legs]
     description, layout = of_types(types, kinds, seed), Layout(tuple(layouts))
-    machine = load_mechanism(write_machine(tmp_path, description, layout))
+    try:
+        machine = load_mechanism(write_machine(tmp_path, description, layout))
+    except OutOfClass:  # drawn almost, or wrongly, overconstrained
+        reject()
     _check(machine, description, layout)
 
 

@@ -154,7 +154,7 @@ def random_tables(draw: st.DrawFn) -> dict[str, Any]:
 
 
 @settings(
-    max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(random_tables())
 def test_a_random_table_comes_back_from_its_files(tmp_path: Path, table: dict[str, Any]) -> None:

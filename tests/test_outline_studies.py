@@ -179,7 +179,7 @@ def test_a_bias_of_half_a_sigma_is_told_by_its_parameter_and_a_failed_run_is_cou
 # Designs, their bound and sessions
 
 
-@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-upu-tilted", "3-rpr"]))
+@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"]))
 def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     design, bound, session = _design(machine), _bound(machine), _session(machine)
     solution = one_fit(session, NOISE.radius_sigma)
@@ -200,6 +200,7 @@ def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(start - truth)
 
 
+@pytest.mark.slow
 def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> None:
     design, relative = design_of("delta", 3, 6, Noise().sigma_px), 0.02
     bound = bound_of(design, Noise().sigma_q, relative)
@@ -280,6 +281,7 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_study_of_the_bound_has_a_row_for_every_parameter(output: Path) -> None:
     document = json.loads((output / "bound" / "study.json").read_bytes())
     (found,) = document["machines"]
@@ -294,6 +296,7 @@ def test_the_study_of_the_bound_has_a_row_for_every_parameter(output: Path) -> N
     assert all(words in told for words in ("each/bound", "3 runs are too few", "at the bound"))
 
 
+@pytest.mark.slow
 def test_the_study_of_classes_compares_nominal_model_steps_and_fit(output: Path) -> None:
     document = json.loads((output / "classes" / "study.json").read_bytes())
     (found,) = document["machines"]
@@ -311,6 +314,7 @@ def test_the_study_of_classes_compares_nominal_model_steps_and_fit(output: Path)
     assert all("2 runs are too few" in text for text in (page, told))
 
 
+@pytest.mark.slow
 def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -23,9 +23,11 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
+from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import Cylinder
 from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
@@ -33,6 +35,7 @@ from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Pre
 from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
+from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
 from legcal.planning.session import write_session
 from legcal.simulation.dataset import simulate
@@ -64,6 +67,26 @@ def small_search() -> Iterator[None]:
         patch.setattr(planner, "POSES_EACH", 2)
         patch.setattr(planner, "ROUNDS", 1)
         patch.setattr(camera_places, "_N_AZIMUTHS", 6)
+        yield
+
+
+@pytest.fixture(scope="module")
+def drawn_once() -> Iterator[None]:
+    """Draw the candidate poses of equal requests once."""
+    drawn: dict[str, tuple[Configurations, Any]] = {}
+
+    def candidate_poses(
+        machine: Machine, legs: Any, setting: Setting, n: int, rng: Any, progress: Any
+    ) -> Configurations:
+        key = f"{machine.yaml_path} {setting} {n} {rng.bit_generator.state}"
+        if key not in drawn:
+            poses = draw_poses(machine, legs, setting, n, rng, progress)
+            drawn[key] = poses, rng.bit_generator.state
+        poses, rng.bit_generator.state = drawn[key]
+        return poses
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "candidate_poses", candidate_poses)
         yield
 
 
@@ -162,7 +185,7 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
-@pytest.mark.usefixtures("answered_signals")
+@pytest.mark.usefixtures("answered_signals", "drawn_once")
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
     tmp_path: Path,
@@ -320,6 +343,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
 ]
 
 
+@pytest.mark.usefixtures("drawn_once")
 @pytest.mark.parametrize(("asked", "error", "named"), REFUSED, ids=lambda x: str(x)[:40])
 def test_what_cannot_be_planned_is_refused(
     asked: dict[str, Any], error: type[legcal.LegcalError], named: str
@@ -403,6 +427,7 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
     np.testing.assert_allclose(searched.machine, left.machine, rtol=0.01, atol=1e-5)
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     def refused(error: type[legcal.LegcalError], named: str, **asked: Any) -> None:
         of: dict[str, Any] = {"model": "3-rpr", "images": 4, "cameras": 1, "setting": FEW}

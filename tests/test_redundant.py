@@ -174,6 +174,7 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
         given_poses(machine, path)
 
 
+@pytest.mark.slow  # test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm sees it in fits
 def test_a_wrong_reading_is_told_from_errors_of_the_model_or_motors_that_explain_it_are() -> None:
     rng = np.random.default_rng(8)
     for name, most_alike in {"4-RPR": 4, "4-UPS + 2-SPS + RPS": 1}.items():

@@ -16,7 +16,6 @@ from lxml import html
 
 import legcal
 from legcal.calibration.fit_overlays import with_overlays
-from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.workspace_errors import platform_map
 from legcal.errors import OutOfResources, UsageError
@@ -179,20 +178,11 @@ def test_a_report_is_not_written_over_another_file(example_run: Run, tmp_path: P
     assert legcal.write_report(example_run.calibration, tmp_path).exists()
 
 
-def _writing(calibration: Calibration) -> Any:
-    """Return a calibration of no time, which writes its result."""
-
-    def calibrate(*_: Any, output: Path, beside: Any, **__: Any) -> Calibration:
-        return write_result(calibration, output, beside=beside)
-
-    return calibrate
-
-
 def test_calibrate_writes_the_report_unless_it_should_not(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", _writing(example_run.calibration))
+    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", example_run.written_again)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
     assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
     page = (out / "report.html").read_bytes()
@@ -226,7 +216,7 @@ def test_a_page_that_fails_loses_nothing_else(
     out = Path(shutil.copytree(example_run.output, tmp_path / "out"))
     assert (out / "report.html").exists()
     words = ("calibrate", example_run.folder, "-o", out)
-    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", _writing(example_run.calibration))
+    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", example_run.written_again)
     monkeypatch.setattr("legcal.report.page.calibration_page.verdict_of", fails)
     assert run(monkeypatch, *words, "--json") == 0
     printed = capsys.readouterr()

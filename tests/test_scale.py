@@ -1,15 +1,19 @@
 """Machines of all sizes are calibrated alike: nothing but files is counted in metres."""
 
+from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 import pytest
 from scaled import scaled_dataset
 from simulated import simulated
 from six_photographs import FOLDER
+from thinned import thinned
 
 from legcal import calibrate, load_dataset
 from legcal.calibration.board import rough_placement
+from legcal.calibration.documents import Result
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
@@ -17,6 +21,13 @@ from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
+
+
+@cache
+def _usual(model: str) -> tuple[Path, Result]:
+    folder = Path(mkdtemp()) / "usual"
+    simulated(folder, model, poses=5)
+    return folder, calibrate(folder).result
 
 
 def _recognised(folder: Path) -> tuple[Outlines, Array]:
@@ -40,13 +51,13 @@ def test_photographs_show_the_same_legs_of_a_machine_of_any_size(tmp_path: Path)
         np.testing.assert_allclose(there, cameras, atol=1e-6)
 
 
-@pytest.mark.parametrize(("model", "size"), [("hexapod", 0.03), ("3-upu", 30.0)])
+@pytest.mark.parametrize("size", [0.03, 30.0])
+@pytest.mark.parametrize("model", thinned(["hexapod", "3-upu", "3-rpr"], ["3-rpr"]))
 def test_a_machine_of_any_size_is_known_as_well_for_its_size(
     model: str, size: float, tmp_path: Path
 ) -> None:
-    simulated(tmp_path / "usual", model, poses=5)
-    usual = calibrate(tmp_path / "usual").result
-    found = calibrate(scaled_dataset(tmp_path / "usual", tmp_path / "scaled", size)).result
+    folder, usual = _usual(model)
+    found = calibrate(scaled_dataset(folder, tmp_path / "scaled", size)).result
     assert found.observations == usual.observations
     for one, other in zip(found.parameters, usual.parameters, strict=True):
         unit = size if one.unit == "m" else 1.0

@@ -1,6 +1,7 @@
 """Effects of errors in what counts as known are those of fits with them; focal lengths too."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from fit_sessions import (
     noisy_readings,
     with_camera,
 )
+from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
@@ -44,6 +46,11 @@ def _fit(
     return refine(session.legs, *data, disturbed_start(session), choices=choices)
 
 
+@pytest.fixture(scope="module")
+def fit(session: HexapodSession) -> Solution:
+    return _fit(session)
+
+
 def _steps(found: Solution) -> dict[str, Array]:
     return {s.what: s.steps[:, 0] for s in found.sensitivities}
 
@@ -60,19 +67,18 @@ def _assert_moved(found: Solution, mistaken: Solution, what: str) -> None:
     ("what", "changes"),
     [
         (FOCAL, {"fx": 12.9, "fy": 12.8}),
-        ("a principal point 0.1 px further right", {"cx": 0.1}),
         ("a principal point 0.1 px further down", {"cy": 0.1}),
     ],
 )
 def test_a_wrong_camera_moves_the_fit_as_predicted(
-    session: HexapodSession, what: str, changes: dict[str, float]
+    session: HexapodSession, fit: Solution, what: str, changes: dict[str, float]
 ) -> None:
     camera = {"fx": 1290.0, "fy": 1280.0, "cx": 518.0, "cy": 380.0}
     wrong = {name: camera[name] + PART * step for name, step in changes.items()}
-    _assert_moved(_fit(session), _fit(session, camera=with_intrinsics(LENS, wrong)), what)
+    _assert_moved(fit, _fit(session, camera=with_intrinsics(LENS, wrong)), what)
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", thinned([False, True], [True]))
 def test_wrong_radii_move_the_fit_as_predicted(session: HexapodSession, stated: bool) -> None:
     def choices(radius: float) -> Choices:
         if stated:
@@ -100,7 +106,7 @@ def _assert_moved_to(was: Array, moved: Array, expected: Array) -> None:
     np.testing.assert_allclose(moved, expected, atol=0.03 * largest)
 
 
-@pytest.mark.parametrize("name", ["3-rpr", "tricept"])
+@pytest.mark.parametrize("name", thinned(["3-rpr", "tricept"], ["tricept"]))
 def test_legs_on_constraints_move_as_predicted(name: str) -> None:
     session = machine_session(name)
     camera = session.measurements.views[0].camera
@@ -114,7 +120,7 @@ def test_legs_on_constraints_move_as_predicted(name: str) -> None:
     _assert_moved_to(*map(session.legs.vector, (found.legs, mistaken.legs, predicted)))
 
 
-@pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
+@pytest.mark.parametrize("model", thinned(["3-upu-tilted", "tricept"], ["3-upu-tilted"]))
 def test_a_wrong_twist_moves_the_fit_as_predicted(model: str) -> None:
     session = machine_session(model)
     data = (session.legs, *session.noisy(0), session.start)
@@ -147,11 +153,18 @@ def fitted(
     return refine(session.legs, measurements, outlines, disturbed_start(session), choices=choices)
 
 
+@cache
+def fitted_rightly(camera: Camera) -> Solution:
+    return fitted(irregular_hexapod(12, camera=camera), 0, 1.0)
+
+
 def notes_on_focal_lengths(solution: Solution) -> list[str]:
     return [note for note in solution.notes if "focal length" in note]
 
 
-@pytest.mark.parametrize(("camera", "factor"), [(PINHOLE, 0.99), (LENS, 1.01)])
+@pytest.mark.parametrize(
+    ("camera", "factor"), thinned([(PINHOLE, 0.99), (LENS, 1.01)], lambda camera, _: camera is LENS)
+)
 def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
     solution = fitted(irregular_hexapod(12, camera=camera), 0, factor)
     (note,) = notes_on_focal_lengths(solution)
@@ -181,25 +194,32 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
 
 @pytest.mark.parametrize(
     ("camera", "wrong", "start", "words"),
-    [
-        (LENS, {"k1": 0.0}, "The distortion of c1", "had not been removed"),
-        (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been removed"),
-        (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
-        (LENS, {"cx": 524.0, "cy": 394.0}, "The principal point of c1", "given (524.0, 394.0) px"),
-    ],
+    thinned(
+        [
+            (LENS, {"k1": 0.0}, "The distortion of c1", "had not been removed"),
+            (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been removed"),
+            (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
+            (
+                LENS,
+                {"cx": 524.0, "cy": 394.0},
+                "The principal point of c1",
+                "given (524.0, 394.0) px",
+            ),
+        ],
+        lambda _, wrong, *__: wrong in ({"k1": -0.1}, {"cx": 539.0}),
+    ),
 )
 def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     camera: Camera, wrong: dict[str, float], start: str, words: str
 ) -> None:
     """As where board and machine are corrected for the lens, or cropped, differently."""
-    session = irregular_hexapod(12, camera=camera)
-    solution = fitted(session, 0, 1.0, frozenset(), **wrong)
+    solution = fitted(irregular_hexapod(12, camera=camera), 0, 1.0, frozenset(), **wrong)
     (note,) = (note for note in solution.notes if "does not agree" in note)
     assert note.startswith(start)
     assert words in note
     assert solution.camera_doubts.views == ("c1",)
     (effect,) = (s for s in solution.sensitivities if s.what == FITTED_CAMERA)
-    right = fitted(session, 0, 1.0)
+    right = fitted_rightly(camera)
     assert not [note for note in right.notes if "does not agree" in note]
     assert right.camera_doubts.views == ()
     names = right.kinematic.parametrization.names

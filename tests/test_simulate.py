@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from simulated import files_of, settings, small_camera
+from simulated import files_of, settings, simulated, small_camera
 
 import legcal
 from legcal.data.dataset import load_dataset
@@ -51,7 +51,7 @@ def truth_of(folder: Path) -> dict[str, Any]:
 def made(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
     folder = tmp_path_factory.mktemp("simulated") / "outlines"
     wide = Spread(1e-4, Distribution.UNIFORM)
-    return simulate("hexapod", folder, settings(poses=8, views=3, readings=wide))
+    return simulated(folder, "hexapod", poses=8, views=3, readings=wide)
 
 
 def test_the_dataset_has_the_nominal_model_and_the_truth_beside_it(made: SimulatedDataset) -> None:
@@ -202,6 +202,7 @@ def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_python_of_the_description_of_simulated_datasets_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,7 +30,7 @@ def session() -> MachineSession:
 
 @pytest.fixture(scope="module")
 def noisy() -> MachineSession:
-    exact = machine_session("hexapod", n_poses=10)
+    exact = machine_session("hexapod", n_poses=6)
     measurements, outlines = exact.noisy(4)
     return replace(exact, measurements=measurements, outlines=outlines)
 

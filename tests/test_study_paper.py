@@ -135,6 +135,7 @@ OF_BOUND = {  # least and most root mean squared error over the bound
 }
 
 
+@pytest.mark.slow
 def test_every_estimator_has_a_row_for_either_machine_measured_by_the_bound_of_its_runs(
     result: tuple[StudyResult, Path],
 ) -> None:
@@ -156,6 +157,7 @@ def test_every_estimator_has_a_row_for_either_machine_measured_by_the_bound_of_i
     assert json.loads((result[1] / "study.json").read_bytes()) == document
 
 
+@pytest.mark.slow
 def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bound(
     result: tuple[StudyResult, Path],
 ) -> None:
