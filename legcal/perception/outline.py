@@ -17,9 +17,16 @@ from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.occluders import PlacedOccluders
-from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
+from legcal.perception.limb_search import limb_shifts
+from legcal.perception.part_edges import (
+    WIDTH_TOLERANCE,
+    EdgePair,
+    LegPart,
+    block_positions,
+    find_pairs,
+)
 from legcal.perception.profiles import Edge
-from legcal.perception.subpixel_edges import LostEdge, MeasuredEdge, measure_edges
+from legcal.perception.subpixel_edges import FIRST_BLUR, LostEdge, MeasuredEdge, measure_edges
 from legcal.perception.tuning import CONTRAST, INLIER_SHARE, SCATTER_PX, WIDTH_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -125,6 +132,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             for pair in [part.near if near else part.edges.v]
             for v, epsilon in zip(pair, EPSILON, strict=True)
         ]
+        edges = _at_limbs(search, parts, edges)
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near
         )
@@ -132,6 +140,24 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             of_leg = near and part.leg.leg < search.n_legs
             found.append(_with_verdict(part, (one, two), near_fit=of_leg))
     return outline_table(search, found), blur
+
+
+def _at_limbs(search: ImageSearch, parts: Sequence[LegPart], edges: list[Edge]) -> list[Edge]:
+    """Return edges with those of polished parts at their limbs, not at stripes beside these."""
+    polished = [i for i, one in enumerate(edges[::2]) if one.polished]
+    if not polished:
+        return edges
+    own = [edge for i in polished for edge in edges[2 * i : 2 * i + 2]]
+    apart = np.array([np.mean(two.v - one.v) for one, two in zip(own[::2], own[1::2], strict=True)])
+    width = np.array([np.mean(parts[i].predicted[1] - parts[i].predicted[0]) for i in polished])
+    sigma = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+    blur = FIRST_BLUR if search.blur is None else search.blur
+    inside = limb_shifts(search.grey, search.camera, own, blur, apart - width, sigma)
+    edges = list(edges)
+    for k, shift in enumerate(inside.tolist()):
+        i = 2 * polished[k // 2] + k % 2
+        edges[i] = replace(edges[i], v=edges[i].v + edges[i].epsilon * shift)
+    return edges
 
 
 def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:

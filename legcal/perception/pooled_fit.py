@@ -105,9 +105,7 @@ def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> Poole
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
-        return PooledLines(
-            np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing, nothing
-        )
+        return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing, nothing)
     at = pool.first_amplitudes(
         _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, np.log(blur)))
     )
@@ -305,7 +303,15 @@ class _Pool:
             },
             **{
                 name: getattr(self, name)[edges]
-                for name in ("half_width", "finish", "contrast", "noise", "noise_ratio", "seen", "at_line")
+                for name in (
+                    "half_width",
+                    "finish",
+                    "contrast",
+                    "noise",
+                    "noise_ratio",
+                    "seen",
+                    "at_line",
+                )
             },
         )
 
@@ -337,7 +343,9 @@ class _Pool:
         self.look(at)
         values, one = self.functions[0], np.ones((len(self.edge), 1))
         of_edge = values @ self._of_edges(self.products, one)[:, 0] @ values.swapaxes(1, 2)
-        of_edge += _diagonal(self.noise[:, None] / (COMMON[self.finish] * self.contrast[:, None]) ** 2 + 1e-9)
+        of_edge += _diagonal(
+            self.noise[:, None] / (COMMON[self.finish] * self.contrast[:, None]) ** 2 + 1e-9
+        )
         target = values @ self._of_edges(self.with_light, one)[:, 0, :, None]
         amplitude = np.zeros_like(at.amplitude)
         amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
