@@ -21,8 +21,6 @@ from legcal.perception.limb import (
     MATTE,
     N_AMPLITUDES,
     N_POWERS,
-    POLISHED,
-    POLISHED_SIGMA,
     powers,
     profile_functions,
     simple_functions,
@@ -352,36 +350,42 @@ def rod_edges(moved: float) -> list[Edge]:
     ]
 
 
-def rod_picture(stripe: float, noise: float = 2.0) -> Samples:
+def rod_picture(stripe: float, noise: float = 4.0) -> Samples:
     """Return a rod as dark as most of the background, with a bright stripe inside each limb [px].
 
-    Bright bands of the background, a third of its length, end at the limbs.
+    Bright bands of the background, half of its length, end at the limbs.
     """
     y, x = np.indices((300, 400)).astype(float)
     inside = ROD - np.abs(x - 200.0)
-    background = 40.0 + 60.0 * (np.sin(y / 9.0) > 0.5)
-    step, rise, fall = (ndtr((inside - at) / 0.5) for at in (0.0, stripe, stripe + 4.0))
-    grey = background + (40.0 - background) * step + 40.0 * (rise - fall)
+    background = 40.0 + 60.0 * (np.sin(y / 9.0) > 0.0)
+    step = ndtr(inside / 0.5)
+    reflected = 40.0 * np.exp(-(((inside - stripe) / 1.5) ** 2))
+    grey = background + (40.0 + reflected - background) * step
     grey += noise * np.random.default_rng(0).standard_normal(grey.shape)
     return np.asarray(grey, dtype=np.float32)
 
 
-@pytest.mark.parametrize("start", [0.0, 2.5], ids=["from the limbs", "from the stripes"])
+@pytest.mark.parametrize("start", [0.0, 2.5], ids=["from the limbs", "from inside"])
 def test_limbs_are_where_the_background_ends_not_where_stripes_begin(start: float) -> None:
     edges, width = rod_edges(start), 2.0 * start
-    found = limb_shifts(rod_picture(2.5), UPRIGHT, edges, 0.5, np.array([-width]), np.array([2.0]))
+    found = limb_shifts(rod_picture(4.0), UPRIGHT, edges, 0.5, np.array([-width]), np.array([2.0]))
     np.testing.assert_allclose(found, -start, atol=0.5)
 
 
 def test_lone_steps_are_limbs_whatever_their_width_should_be() -> None:
     found = limb_shifts(
-        rod_picture(0.0), UPRIGHT, rod_edges(1.5), 0.5, np.array([0.0]), np.array([2.0])
+        rod_picture(-9.0), UPRIGHT, rod_edges(1.5), 0.5, np.array([0.0]), np.array([2.0])
     )
     np.testing.assert_allclose(found, -1.5, atol=0.5)
 
 
 def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:
-    (of_matte,) = fit_pooled(
-        outline(BRIGHT, (0.0, 0.0), 0.5, noise=1.0), np.ones(40), 0.5, DEPTH
-    ).polish
-    assert of_matte < 0.0
+    r = np.linspace(0.0, 0.7, 50)
+    stripe = 20.0 + 100.0 * np.exp(-(((r - 0.35) / 0.12) ** 2))
+    of_r = np.polynomial.polynomial.polyfit(r, stripe, 4)
+    polish = [
+        float(fit_pooled(outline(light, (0.0, 0.0), 0.5, 1.0), np.ones(40), 0.5, DEPTH).polish[0])
+        for light in (BRIGHT, DARK, amplitudes(20.0, 0.0, *of_r))
+    ]
+    assert max(polish[:2]) < -1.0
+    assert polish[2] > 4.0
