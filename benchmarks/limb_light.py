@@ -7,7 +7,7 @@ a highlight: Lambert's law, darker towards the limb or not, and lobes about half
 and camera (Blinn), exponents 5 to 200. The light along the depth is fitted by powers of r up to
 r^4, less the background, which has the mean light of another such surface. Prints the principal
 directions of these coefficients in units of the contrast, their median sizes as standard
-deviations, and what the powers leave: the first two are ``SURFACES`` and ``SURFACE_SIGMA`` of
+deviations, and what the powers leave: the first two are ``MATTE`` and ``MATTE_SIGMA`` of
 ``legcal.perception.limb``.
 """
 
@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.perception.limb import SURFACE_SIGMA, SURFACES
+from legcal.perception.limb import MATTE, MATTE_SIGMA
 
 LAMPS, IN_FRONT = 2, 0.8
 EXPONENTS, GLOSS, EVEN, DARKENING = (5.0, 200.0), (0.0, 1.0), (0.02, 0.5), 0.6
@@ -68,15 +68,13 @@ def main() -> None:
     seen = contrast > LEAST_CONTRAST * np.median(contrast)
     coefficients, left = (x[seen] / contrast[seen, None] for x in (coefficients, left))
     _, vector = np.linalg.eigh(coefficients.T @ coefficients)
-    vector *= np.sign(np.sum(vector * SURFACES.T, axis=0))
+    vector *= np.sign(np.sum(vector * MATTE.T, axis=0))
     size = np.median(np.abs(coefficients @ vector), axis=0) / MEDIAN_SIZE
     print("principal directions, by r^0 to r^4", np.round(vector.T, 3), sep="\n")
     print("standard deviations", np.round(size, 2))
     print(f"left by the powers: {np.sqrt(np.mean(left**2)):.3f} of the contrast")
-    turned = np.abs(vector.T - SURFACES).max()
-    print(
-        f"constants differ by {turned:.3f}, sizes by {np.abs(size / SURFACE_SIGMA - 1).max():.3f}"
-    )
+    turned = np.abs(vector.T - MATTE).max()
+    print(f"constants differ by {turned:.3f}, sizes by {np.abs(size / MATTE_SIGMA - 1).max():.3f}")
 
 
 if __name__ == "__main__":

@@ -18,13 +18,14 @@ from legcal.perception.blocks import (
 )
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
+    MATTE,
     N_AMPLITUDES,
     N_POWERS,
-    SURFACES,
     powers,
     profile_functions,
     simple_functions,
 )
+from legcal.perception.limb_search import limb_shifts
 from legcal.perception.pixel_sums import PixelBins, PixelSums, even_weights, noise_ratios
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import Edge, Profiles, read_profiles
@@ -215,7 +216,7 @@ HALF_WIDTH, DEPTH = 15.0, 3.5
 
 def amplitudes(background: float, slope: float, *of_r: float) -> Array:
     """Return the amplitudes of a profile with a surface of so much of r^0 to r^4."""
-    surface = np.linalg.solve(SURFACES.T, np.array(of_r) - [background, 0.0, 0.0, 0.0, 0.0])
+    surface = np.linalg.solve(MATTE.T, np.array(of_r) - [background, 0.0, 0.0, 0.0, 0.0])
     return np.array([background, slope, *surface])
 
 
@@ -330,3 +331,61 @@ def test_outlines_know_how_far_they_move_with_gamma(
     assert abs(moved) > 0.05
     assert (moved > 0.0) == (amplitude is BRIGHT)
     assert here.by_gamma[0] == pytest.approx(moved, rel=tolerance)
+
+
+# Limbs and stripes.
+
+ROD = 15.0  # half-width [px]
+UPRIGHT = Camera(np.array([[500.0, 0.0, 200.0], [0.0, 500.0, 150.0], [0.0, 0.0, 1.0]]), 400, 300)
+
+
+def rod_edges(moved: float) -> list[Edge]:
+    """Return both edges of an upright rod in the middle of the image, moved inside [px]."""
+    along, normal = np.array([0.0, 1.0]), np.array([1.0, 0.0])
+    band = Band(np.array([0.0, -0.2]), along, normal, 500.0, 200.0)
+    free = np.zeros(10, dtype=np.bool_)
+    return [
+        Edge(band, epsilon * (moved - ROD) * np.ones(2), epsilon, ROD, free)
+        for epsilon in (1.0, -1.0)
+    ]
+
+
+def rod_picture(stripe: float, noise: float = 4.0) -> Samples:
+    """Return a rod as dark as most of the background, with a bright stripe inside each limb [px].
+
+    Bright bands of the background, half of its length, end at the limbs.
+    """
+    y, x = np.indices((300, 400)).astype(float)
+    inside = ROD - np.abs(x - 200.0)
+    background = 40.0 + 60.0 * (np.sin(y / 9.0) > 0.0)
+    step = ndtr(inside / 0.5)
+    reflected = 40.0 * np.exp(-(((inside - stripe) / 1.5) ** 2))
+    grey = background + (40.0 + reflected - background) * step
+    grey += noise * np.random.default_rng(0).standard_normal(grey.shape)
+    return np.asarray(grey, dtype=np.float32)
+
+
+@pytest.mark.parametrize("start", [0.0, 2.5], ids=["from the limbs", "from inside"])
+def test_limbs_are_where_the_background_ends_not_where_stripes_begin(start: float) -> None:
+    edges, width = rod_edges(start), 2.0 * start
+    found = limb_shifts(rod_picture(4.0), UPRIGHT, edges, 0.5, np.array([-width]), np.array([2.0]))
+    np.testing.assert_allclose(found, -start, atol=0.5)
+
+
+def test_lone_steps_are_limbs_whatever_their_width_should_be() -> None:
+    found = limb_shifts(
+        rod_picture(-9.0), UPRIGHT, rod_edges(1.5), 0.5, np.array([0.0]), np.array([2.0])
+    )
+    np.testing.assert_allclose(found, -1.5, atol=0.5)
+
+
+def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:
+    r = np.linspace(0.0, 0.7, 50)
+    stripe = 20.0 + 100.0 * np.exp(-(((r - 0.35) / 0.12) ** 2))
+    of_r = np.polynomial.polynomial.polyfit(r, stripe, 4)
+    polish = [
+        float(fit_pooled(outline(light, (0.0, 0.0), 0.5, 1.0), np.ones(40), 0.5, DEPTH).polish[0])
+        for light in (BRIGHT, DARK, amplitudes(20.0, 0.0, *of_r))
+    ]
+    assert max(polish[:2]) < -1.0
+    assert polish[2] > 4.0

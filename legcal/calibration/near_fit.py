@@ -29,7 +29,7 @@ from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import used_as_before
+from legcal.perception.outline import polished_parts, used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
@@ -187,7 +187,8 @@ def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredIm
         )
     )
     arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
-    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms)
+    polished = polished_parts(solution.outlines)
+    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms, polished)
 
 
 def shown_near(estimate: Estimate, placement: Placement) -> Placement:

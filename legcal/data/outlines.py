@@ -36,6 +36,7 @@ from legcal.vision.camera import Camera
 
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera
+MEASURED = (*QUALITY, *ENCODING, "polish")
 MAX_OFF = 0.5  # of the outlines off their lines, from which on the table is wrong, not they
 MIN_NEAR = 0.9  # of the outlines near their lines, if the table is taken otherwise
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
@@ -69,6 +70,7 @@ OUTLINE_COLUMNS = (
     Column("gamma", least=math.ulp(0.0), needed="a number above 0", blank=True, required=False,
            group="gamma", remedy=_LEAVE),
     Column("by_gamma", blank=True, required=False, group="gamma", remedy=_LEAVE),
+    Column("polish", blank=True, required=False, remedy=_LEAVE),
     DETAIL_COLUMN,
 )  # fmt: skip
 
@@ -96,6 +98,7 @@ class Outlines(ImageTable):
     residual: Array  # (n,) robust standard deviation of the edge about it [px]
     gamma: Array  # (n,) of the camera, with which it was measured
     by_gamma: Array  # (n,) shift inwards with log gamma [px]
+    polish: Array  # (n,) log likelihood ratio of a polished surface over a matte one
 
     def row_keys(self) -> list[tuple[int, int, str, int]]:
         """Return image row, leg, part and edge of each outline."""
@@ -110,7 +113,7 @@ class Outlines(ImageTable):
 
 def unmeasured(n: int) -> dict[str, Array]:
     """Return what is known of how well n outlines were seen that nobody measured: nothing."""
-    return {name: np.full(n, np.nan) for name in (*QUALITY, *ENCODING)}
+    return {name: np.full(n, np.nan) for name in MEASURED}
 
 
 def through_cameras(
@@ -229,7 +232,7 @@ def format_observations(
             outlines.covariance.reshape(-1, 4)[:, [0, 1, 3]],
         ]
     ).tolist()
-    measured = np.array([getattr(outlines, name) for name in (*QUALITY, *ENCODING)]).T.tolist()
+    measured = np.array([getattr(outlines, name) for name in MEASURED]).T.tolist()
     rows = (
         [
             *names[row],
@@ -295,7 +298,7 @@ def read_observations(
     inexact = ~(np.abs(norm - 1.0) <= UNIT_EXACT)
     with np.errstate(invalid="ignore"):
         numbers[inexact, :3] /= norm[inexact, None]
-    measured = [np.where(edited, np.nan, table.number(name)) for name in (*QUALITY, *ENCODING)]
+    measured = [np.where(edited, np.nan, table.number(name)) for name in MEASURED]
     outlines = Outlines(
         row,
         leg,

@@ -68,6 +68,7 @@ class Blocks:
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
     half_width: Array  # (n_edges,)
+    finish: IntArray  # (n_edges,) of surfaces: 0 matte, 1 polished
     level: Array  # (n_edges,) mean light of each edge
     clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
     moved: Array  # (n,) [px]
@@ -89,6 +90,7 @@ class Blocks:
         gain: Array | None = None,
         clipped: Samples | None = None,
         window: Samples | None = None,
+        finish: IntArray | None = None,
     ) -> "Blocks":
         """Return blocks of pixels that have not been fitted."""
         n, n_edges = len(d), len(bounds) - 1
@@ -106,6 +108,7 @@ class Blocks:
             bounds,
             position,
             half_width,
+            np.zeros(n_edges, dtype=np.intp) if finish is None else finish,
             level,
             np.full(n, -np.inf, dtype=np.float32) if clipped is None else clipped,
             np.zeros(n),
@@ -149,6 +152,7 @@ class Blocks:
             read.gain,
             read.clipped,
             read.window,
+            np.array([edge.polished for edge in edges], dtype=np.intp),
         )
 
     @property

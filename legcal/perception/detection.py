@@ -88,6 +88,7 @@ def _of_image(
         near_fit=not np.isnan(known),
         arms=tuple(arms),
         occluders=occluders,
+        polished=placement.polished,
     )
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}

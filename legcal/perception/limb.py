@@ -14,10 +14,12 @@ hundred up to rho = 0.8. All blocks of an outline are fitted together with seven
     its slope       outside, by the depth that is looked at
     five surfaces   inside, less the background: sums of 1, r, ..., r^4
 
-How much of each there may be is known from cylinders under lamps anywhere, matte to glossy: their
-five surfaces are the principal directions of what such cylinders send (``SURFACES``), and sizes are
-those of the median cylinder (``SURFACE_SIGMA``). Single blocks are fitted with five functions that
-most limbs are made of (:func:`simple_functions`).
+How much of each there may be depends on the finish. Matte to glossy cylinders under lamps anywhere
+have five surfaces in the principal directions of what they send (``SURFACES``), with the sizes of
+the median cylinder (``SURFACE_SIGMA``). A polished cylinder reflects its surroundings besides, at
+the limb those close behind it and 90 degrees away where r = 0.7: stripes, taken as a random process
+of r that forgets itself over ``REFLECTION_LENGTH``. Single blocks are fitted with five functions
+that most limbs are made of (:func:`simple_functions`).
 """
 
 from functools import cache
@@ -25,7 +27,7 @@ from functools import cache
 import numpy as np
 from scipy.special import gamma, ndtr, pbdv
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 
 # Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers of max(z, 0) or their products by z.
 ONE, Z, GAUSS, Z_GAUSS, STEP, MINUS_HALF, Z_MINUS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
@@ -73,8 +75,8 @@ def powers(z: Array) -> tuple[Array, Array]:
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
 N_AMPLITUDES = 7
 # Rows: the principal directions of r^0 to r^4, and standard deviations of these, in contrasts, by
-# benchmarks/limb_light.py.
-SURFACES = np.array(
+# benchmarks/limb_light.py; matte ones and polished ones.
+MATTE = np.array(
     [
         [-0.400, -0.363, -0.506, -0.500, -0.450],
         [-0.632, -0.520, 0.136, 0.369, 0.419],
@@ -83,7 +85,34 @@ SURFACES = np.array(
         [0.000, 0.077, -0.423, 0.780, -0.454],
     ]
 )
-SURFACE_SIGMA = np.array([0.59, 0.98, 1.13, 0.95, 7.26])
+MATTE_SIGMA = np.array([0.59, 0.98, 1.13, 0.95, 7.26])
+# Of what polished surfaces reflect besides: standard deviation in contrasts, over which r it
+# forgets itself, and the largest r, which is that of the depth that is looked at.
+REFLECTION, REFLECTION_LENGTH, REFLECTION_REACH = 0.3, 0.4, 0.7
+
+
+def _reflections() -> Array:
+    """Return the covariance (5, 5) of r^0 to r^4 by what polished surfaces reflect, in contrasts.
+
+    The powers are fitted to the process by least squares over the depth.
+    """
+    r = np.linspace(0.0, REFLECTION_REACH, 200)
+    process = REFLECTION**2 * np.exp(-np.abs(r[:, None] - r) / REFLECTION_LENGTH)
+    weight = np.sqrt(r / np.sqrt(1.0 - r**2) + 0.05)  # depth by r, and not nothing at the limb
+    fitted = np.linalg.pinv(weight[:, None] * r[:, None] ** np.arange(5)) * weight
+    return np.asarray(fitted @ process @ fitted.T)
+
+
+def _principal(covariance: Array) -> tuple[Array, Array]:
+    """Return principal directions (5, 5), as rows, and their standard deviations (5,)."""
+    variance, directions = np.linalg.eigh(covariance)
+    return directions.T, np.sqrt(variance)
+
+
+_MATTE = MATTE.T @ (MATTE_SIGMA**2 * MATTE.T).T
+POLISHED, POLISHED_SIGMA = _principal(_MATTE + _reflections())
+SURFACES = np.stack([MATTE, POLISHED])  # by finish: 0 matte, 1 polished
+SURFACE_SIGMA = np.stack([MATTE_SIGMA, POLISHED_SIGMA])
 
 _ROOT = float(np.sqrt(2.0))
 # Rows: r^0 to r^4 by rho^0, rho^(1/2), rho, rho^(3/2), rho^2.
@@ -98,24 +127,42 @@ _OF_DEPTH = np.array(
 )
 
 
-# The functions of profiles, by those below.
-_PROFILE = np.zeros((N_AMPLITUDES, N_AMPLITUDES))
-_PROFILE[BACKGROUND, [BACKGROUND, SURFACE]] = 1.0
-_PROFILE[SLOPE, SLOPE] = 1.0
-_PROFILE[SURFACE:, SURFACE:] = SURFACES
+# The functions of profiles by finish, by those below.
+_PROFILE = np.zeros((len(SURFACES), N_AMPLITUDES, N_AMPLITUDES))
+_PROFILE[:, BACKGROUND, [BACKGROUND, SURFACE]] = 1.0
+_PROFILE[:, SLOPE, SLOPE] = 1.0
+_PROFILE[:, SURFACE:, SURFACE:] = SURFACES
 
 
 def profile_functions(
-    half_width: Array, blur: Array, depth: Array | float
+    half_width: Array, blur: Array, depth: Array | float, finish: IntArray | int = 0
 ) -> tuple[Array, Array, Array]:
     """Return what profiles are made of, as coefficients (n, N_AMPLITUDES, N_POWERS) of powers.
 
     The functions above, their derivatives by the distance inside the outline [1/px], and by the
     logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the unit of the
-    background's slope [px], that of all or of each (n,).
+    background's slope [px], and ``finish`` that of surfaces, of all or of each (n,).
     """
     values, slopes, widenings = _functions_of_r(half_width, blur, depth)
-    return _PROFILE @ values, _PROFILE @ slopes, _PROFILE @ widenings
+    profile = _PROFILE[finish]
+    return profile @ values, profile @ slopes, profile @ widenings
+
+
+def polish_evidence(finish: IntArray, information: Array, right: Array) -> Array:
+    """Return the log likelihood ratio (n,) of polished over matte surfaces.
+
+    By what profiles say of the amplitudes of surfaces of a ``finish`` (n,), in contrasts: normal
+    matrices (n, 5, 5) and right sides (n, 5), other unknowns eliminated.
+    """
+    of_powers = SURFACES[finish]
+    likelihood = []
+    for directions, sigma in zip(SURFACES, SURFACE_SIGMA, strict=True):
+        turn = (of_powers @ directions.T) * sigma  # amplitudes by unit ones of this finish
+        system = turn.swapaxes(1, 2) @ information @ turn + np.eye(len(sigma))
+        pull = (turn.swapaxes(1, 2) @ right[..., None])[..., 0]
+        explained = np.sum(pull * np.linalg.solve(system, pull[..., None])[..., 0], axis=1)
+        likelihood.append(0.5 * (explained - np.linalg.slogdet(system)[1]))
+    return np.asarray(likelihood[1] - likelihood[0])
 
 
 def _functions_of_r(

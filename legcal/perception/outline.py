@@ -17,9 +17,16 @@ from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.occluders import PlacedOccluders
-from legcal.perception.part_edges import EdgePair, LegPart, block_positions, find_pairs
+from legcal.perception.limb_search import limb_shifts
+from legcal.perception.part_edges import (
+    WIDTH_TOLERANCE,
+    EdgePair,
+    LegPart,
+    block_positions,
+    find_pairs,
+)
 from legcal.perception.profiles import Edge
-from legcal.perception.subpixel_edges import LostEdge, MeasuredEdge, measure_edges
+from legcal.perception.subpixel_edges import FIRST_BLUR, LostEdge, MeasuredEdge, measure_edges
 from legcal.perception.tuning import CONTRAST, INLIER_SHARE, SCATTER_PX, WIDTH_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -45,6 +52,7 @@ SLACK = 0.5  # radii by which a solid before an outline is nearer; others are th
 NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
 SKEW = 0.09  # tangent of the angle, 5 deg, at which the edge of a solid passes for an outline
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
+MAX_POLISH = 4.0  # of the log likelihood ratio of one outline: one in fifty is of something else
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
 
 
@@ -64,11 +72,16 @@ class ImageSearch:
     # The legs of which arms are parts: they follow the legs, and no fit knows their widths
     arms: tuple[int, ...] = ()
     occluders: PlacedOccluders = field(default_factory=PlacedOccluders.none)  # in its frame
+    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with such surfaces
 
     @property
     def n_legs(self) -> int:
         """Number of legs, arms left out."""
         return len(self.names) - len(self.arms)
+
+    def leg_of(self, index: int) -> int:
+        """Return the leg of a predicted one, or that of which an arm is a part."""
+        return index if index < self.n_legs else self.arms[index - self.n_legs]
 
 
 Method = Callable[[ImageSearch], tuple[Outlines, float]]
@@ -83,7 +96,8 @@ class OutlineLine(NamedTuple):
         Array | tuple[float, float]
     )  # where the used piece begins and ends, as fractions of the band
     covariance: Array  # (2, 2) of the offsets there [px^2]
-    quality: Sequence[float] = (math.nan,) * 4  # contrast, length, residual, by_gamma of Outlines
+    # contrast, length, residual, by_gamma, polish of Outlines
+    quality: Sequence[float] = (math.nan,) * 5
 
 
 class PartLines(NamedTuple):
@@ -106,11 +120,19 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     if parts:
         near = search.near_fit
         edges = [
-            Edge(part.band, v, float(epsilon), 0.5 * float(np.mean(pair[1] - pair[0])), part.hidden)
+            Edge(
+                part.band,
+                v,
+                float(epsilon),
+                0.5 * float(np.mean(pair[1] - pair[0])),
+                part.hidden,
+                (search.leg_of(part.leg.leg), part.segment.link) in search.polished,
+            )
             for part in parts
             for pair in [part.near if near else part.edges.v]
             for v, epsilon in zip(pair, EPSILON, strict=True)
         ]
+        edges = _at_limbs(search, parts, edges)
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near
         )
@@ -118,6 +140,24 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             of_leg = near and part.leg.leg < search.n_legs
             found.append(_with_verdict(part, (one, two), near_fit=of_leg))
     return outline_table(search, found), blur
+
+
+def _at_limbs(search: ImageSearch, parts: Sequence[LegPart], edges: list[Edge]) -> list[Edge]:
+    """Return edges with those of polished parts at their limbs, not at stripes beside these."""
+    polished = [i for i, one in enumerate(edges[::2]) if one.polished]
+    if not polished:
+        return edges
+    own = [edge for i in polished for edge in edges[2 * i : 2 * i + 2]]
+    apart = np.array([np.mean(two.v - one.v) for one, two in zip(own[::2], own[1::2], strict=True)])
+    width = np.array([np.mean(parts[i].predicted[1] - parts[i].predicted[0]) for i in polished])
+    sigma = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+    blur = FIRST_BLUR if search.blur is None else search.blur
+    inside = limb_shifts(search.grey, search.camera, own, blur, apart - width, sigma)
+    edges = list(edges)
+    for k, shift in enumerate(inside.tolist()):
+        i = 2 * polished[k // 2] + k % 2
+        edges[i] = replace(edges[i], v=edges[i].v + edges[i].epsilon * shift)
+    return edges
 
 
 def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
@@ -151,6 +191,20 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
         for is_used, why in zip(used.tolist(), outlines.reason, strict=True)
     )
     return replace(outlines, used=used, reason=reason)
+
+
+def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
+    """Return the legs and parts whose used outlines are those of polished surfaces.
+
+    By the likelihood ratios of all together, no one of which counts for more than so much.
+    """
+    evidence: dict[tuple[int, str], float] = {}
+    used = np.flatnonzero(outlines.used & np.isfinite(outlines.polish)).tolist()
+    for i in used:
+        part = int(outlines.leg[i]), outlines.part[i]
+        ratio = float(np.clip(outlines.polish[i], -MAX_POLISH, MAX_POLISH))
+        evidence[part] = evidence.get(part, 0.0) + ratio
+    return frozenset(part for part, ratio in evidence.items() if ratio > 0.0)
 
 
 def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
@@ -205,11 +259,10 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
 
 def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     """Return both outlines of all parts of an image, NaN where there is no line."""
-    legs = [*range(search.n_legs), *search.arms]
-    parts = [part._replace(leg=legs[part.leg]) for part in parts]
+    parts = [part._replace(leg=search.leg_of(part.leg)) for part in parts]
     parts.sort(key=lambda part: (part.leg, part.part))
     n = 2 * len(parts)
-    h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 4), np.nan)
+    h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 5), np.nan)
     covariance = np.full((n, 2, 2), np.nan)
     seen = [
         (2 * i + edge, part.band, line)
@@ -252,6 +305,7 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
         residual=quality[:, 2],
         gamma=gamma,
         by_gamma=quality[:, 3],
+        polish=quality[:, 4],
     )
 
 
@@ -330,7 +384,8 @@ def _with_verdict(
         spacing = min(after - before for before, after in pairwise(position))
         visible = (len(position) - 1) * spacing * length
         quality = (
-            round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4), edge.by_gamma
+            round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4),
+            edge.by_gamma, round(edge.polish, 2),
         )  # fmt: skip
         lines.append(
             OutlineLine(

@@ -55,7 +55,7 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
-DETECTOR_VERSION = 18  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 19  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first

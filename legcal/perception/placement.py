@@ -238,6 +238,7 @@ class Placement:
     pixel_error: float = WINDOW_PX  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
+    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with such surfaces
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
     moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
@@ -264,10 +265,12 @@ class Placement:
         T_base_camera: Sequence[RigidTransform | None],
         blur: Sequence[float] = (),
         arms: Mapping[int, PlacedArm] = MappingProxyType({}),
+        polished: frozenset[tuple[int, str]] = frozenset(),
     ) -> "Placement":
         """Return the placement of a joint fit, with the usual blur of each view [px]."""
         cameras = tuple(T_base_camera)
-        return cls(A_base, B_base, cameras, 0.0, blur=tuple(blur), arms=arms)
+        of_views = tuple(blur)
+        return cls(A_base, B_base, cameras, 0.0, blur=of_views, arms=arms, polished=polished)
 
     def shifted(self, search: Search, shift: Array) -> "Placement":
         """Return joint centres where views see them, (n_views, n_legs, 2, 3) from the model [m]."""

@@ -20,6 +20,7 @@ from legcal.perception.limb import (
     N_POWERS,
     SURFACE,
     SURFACE_SIGMA,
+    polish_evidence,
     powers,
     profile_functions,
 )
@@ -34,9 +35,10 @@ from legcal.perception.pixel_sums import (
 
 # Standard deviations of amplitudes, in contrasts of the outline, as limb.py orders them: of
 # what an outline has in common, of its changes along the outline, and of single blocks.
-COMMON = np.array([1e3, 0.3, *SURFACE_SIGMA])
-ALONG = np.array([1.0, 0.3, *(0.3 * SURFACE_SIGMA)])
-OF_BLOCKS = np.array([2.0, 1.0, *(0.2 * SURFACE_SIGMA)])
+# By finish (2, N_AMPLITUDES).
+COMMON = np.array([[1e3, 0.3, *sigma] for sigma in SURFACE_SIGMA])
+ALONG = np.array([[1.0, 0.3, *(0.3 * sigma)] for sigma in SURFACE_SIGMA])
+OF_BLOCKS = np.array([[2.0, 1.0, *(0.2 * sigma)] for sigma in SURFACE_SIGMA])
 N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
 BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
@@ -74,6 +76,7 @@ class PooledLines(NamedTuple):
     covariance: Array  # (n_edges, 2, 2) of these [px^2], by noise and by what shading may be
     blur: float  # standard deviation of the blur of the image [px]
     by_gamma: Array  # (n_edges,) how far each moves inside with ln gamma [px]; NaN: nothing seen
+    polish: Array  # (n_edges,) log likelihood ratio of polished over matte; NaN: nothing seen
 
 
 class _Iterate(NamedTuple):
@@ -102,7 +105,7 @@ def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> Poole
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
-        return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
+        return PooledLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing, nothing)
     at = pool.first_amplitudes(
         _Iterate(np.zeros((n, N_ALONG, N_AMPLITUDES)), np.zeros((n, 2)), np.full(n, np.log(blur)))
     )
@@ -136,7 +139,8 @@ def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> Poole
     line = [SHIFT, N_UNKNOWNS + SHIFT]
     of_lines = at_ends @ covariance[:, line][:, :, line] @ at_ends.T
     of_lines *= pool.oddity(at, even)[:, None, None]
-    return PooledLines(at.line @ at_ends.T, of_lines, float(np.exp(even)), by_gamma)
+    polish = pool.polish(at, covariance)
+    return PooledLines(at.line @ at_ends.T, of_lines, float(np.exp(even)), by_gamma, polish)
 
 
 def _with_blur(covariance: Array, precision: float) -> Array:
@@ -174,6 +178,7 @@ class _Pool:
     bounds: list[int]  # n_edges + 1
     along: Array  # (n, N_ALONG) polynomials at the blocks
     half_width: Array  # (n_edges,) [px]
+    finish: IntArray  # (n_edges,) of surfaces, as limb.py numbers them
     contrast: Array  # (n_edges,)
     noise: Array  # (n_edges,) of the blocks by themselves [grey levels^2]
     noise_ratio: Array  # (n_edges,) inside and outside
@@ -220,7 +225,7 @@ class _Pool:
         spread = np.maximum(power - lights**2 / np.maximum(weights, 1e-9), 0.0)
         contrast = 2.0 * np.sqrt(spread / np.maximum(count, 1.0)) + 1.0
         own = np.empty((len(edge), BLUR))
-        own[:, :N_AMPLITUDES] = (OF_BLOCKS * contrast[edge][:, None]) ** -2
+        own[:, :N_AMPLITUDES] = (OF_BLOCKS[blocks.finish[edge]] * contrast[edge][:, None]) ** -2
         own[:, SHIFT] = ROUGHNESS**-2
         nowhere = np.zeros((n_edges, 2)), np.full(n_edges, np.nan)
         return cls(
@@ -234,6 +239,7 @@ class _Pool:
             bounds,
             means[:, 1:],
             blocks.half_width,
+            blocks.finish,
             contrast,
             noise,
             ratio,
@@ -266,7 +272,9 @@ class _Pool:
                 even_weights(sums.grid, self.noise_ratio[self.edge], self.blur)
             )
         self.at = at
-        self.functions = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
+        self.functions = profile_functions(
+            self.half_width, np.exp(at.log_blur), self.depth, self.finish
+        )
         values, slopes = self._powers()
         self.products = self.sums.products(values, slopes, self.bounds)
         self.with_light = self.sums.with_light(values, slopes, self.bounds)
@@ -295,7 +303,15 @@ class _Pool:
             },
             **{
                 name: getattr(self, name)[edges]
-                for name in ("half_width", "contrast", "noise", "noise_ratio", "seen", "at_line")
+                for name in (
+                    "half_width",
+                    "finish",
+                    "contrast",
+                    "noise",
+                    "noise_ratio",
+                    "seen",
+                    "at_line",
+                )
             },
         )
 
@@ -327,7 +343,9 @@ class _Pool:
         self.look(at)
         values, one = self.functions[0], np.ones((len(self.edge), 1))
         of_edge = values @ self._of_edges(self.products, one)[:, 0] @ values.swapaxes(1, 2)
-        of_edge += _diagonal(self.noise[:, None] / (COMMON * self.contrast[:, None]) ** 2 + 1e-9)
+        of_edge += _diagonal(
+            self.noise[:, None] / (COMMON[self.finish] * self.contrast[:, None]) ** 2 + 1e-9
+        )
         target = values @ self._of_edges(self.with_light, one)[:, 0, :, None]
         amplitude = np.zeros_like(at.amplitude)
         amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
@@ -421,6 +439,20 @@ class _Pool:
         squares += ((at.log_blur - log_blur) / BLUR_PULL) ** 2
         return np.asarray((DEGREES + squares) / (DEGREES + EXPECTED_ODDITY))
 
+    def polish(self, at: _Iterate, covariance: Array) -> Array:
+        """Return the log likelihood ratios (n_edges,) of polished over matte; NaN: nothing seen.
+
+        What the blocks say of the surface that they have in common, whatever it was taken for.
+        """
+        own = slice(SURFACE, N_AMPLITUDES)
+        contrast = self.contrast[:, None]
+        after = np.linalg.inv(covariance[:, own, own]) * contrast[..., None] ** 2
+        before = self.precision[:, 0, own] * contrast**2
+        surface = at.amplitude[:, 0, own] / contrast
+        right = (after @ surface[..., None])[..., 0]
+        ratio = polish_evidence(self.finish, after - _diagonal(before), right)
+        return np.where(self.seen, ratio, np.nan)
+
     @cached_property
     def precision(self) -> Array:
         """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
@@ -429,8 +461,8 @@ class _Pool:
         """
         precision = np.full((len(self.half_width), N_ALONG, N_UNKNOWNS), 1e10)
         contrast = self.contrast[:, None]
-        precision[:, 0, :N_AMPLITUDES] = (COMMON * contrast) ** -2
-        precision[:, 1:, :N_AMPLITUDES] = ((ALONG * contrast) ** -2)[:, None, :]
+        precision[:, 0, :N_AMPLITUDES] = (COMMON[self.finish] * contrast) ** -2
+        precision[:, 1:, :N_AMPLITUDES] = ((ALONG[self.finish] * contrast) ** -2)[:, None, :]
         precision[:, :2, SHIFT] = (START_SIGMA[0] + START_SIGMA[1] * self.blur) ** -2
         precision[:, 0, BLUR] = PRIOR_BLUR**-2
         return precision

@@ -35,6 +35,7 @@ class Edge:
     epsilon: float  # +1 for edge 1, whose inside has greater v, -1 for edge 2
     half_width: float  # of the part in the image [px]
     hidden: BoolArray  # (n,) which of n equal stretches of the band other legs hide
+    polished: bool = False  # the surface of its part
 
 
 @dataclass(frozen=True, eq=False)

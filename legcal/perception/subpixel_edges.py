@@ -44,6 +44,7 @@ class MeasuredEdge:
     covariance: Array  # (2, 2) of the offsets at both ends of the used piece [px^2]
     clipped: float = -math.inf  # depth to which the background saturates most blocks [blurs]
     by_gamma: float = math.nan  # how far it moves inside with ln gamma [px]; NaN where not known
+    polish: float = math.nan  # log likelihood ratio of a polished surface over a matte one
 
     @property
     def sigma(self) -> float:
@@ -152,6 +153,7 @@ def _measured(
                 covariance,
                 depth,
                 float(joint.by_gamma[i]),
+                float(joint.polish[i]),
             )
         )
     return found
