@@ -291,6 +291,14 @@ def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
         assert np.isfinite(placed.leg_error).any()
 
 
+def test_a_known_pose_that_sees_no_leg_keeps_nothing_from_being_placed() -> None:
+    pictures, T = _scene(0, 6, 4, joint_error=2e-3)
+    away = T * RigidTransform.from_rotation(Rotation.from_rotvec([0.0, np.pi, 0.0]))
+    placed = place_camera(pictures, 6, known=[away])
+    assert placed.is_convincing
+    assert _is_right(placed, T)
+
+
 def _of_parallelograms(
     name: str, width: float, rng: np.random.Generator
 ) -> tuple[list[Picture], RigidTransform, Array, Array]:
