@@ -39,7 +39,7 @@ from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pai
 from legcal.perception.detection import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
-from legcal.perception.recognition import place_views
+from legcal.perception.recognition import TWO_POSES, place_views
 from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
 from legcal.simulation.visibility import field_of_view, silhouette
@@ -91,11 +91,11 @@ def judge(scene: Scene, found: Found) -> dict[str, Any]:
     seen = truth.visible
     hit = np.zeros_like(seen)
     hit[outlines.row[used], outlines.leg[used]] = True
-    problem = next(iter(found.placement.unplaced.values()), "")
+    refusals = [one.why.words for one in found.placement.unplaced.values()]
     if T is not None:
         verdict = "right" if _same(T, truth.T_base_camera) else "wrong"
     else:
-        verdict = "ambiguous" if "found two poses" in problem else "not found"
+        verdict = "ambiguous" if TWO_POSES in refusals else "not found"
     return {
         "seed": scene.seed, "machine": scene.machine, **scene.settings, "verdict": verdict,
         "doubt": verdict != "right" and has_doubt(scene),

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from legcal.causes import Cause
 
 MAX_WORD = 200  # characters without a space: longer ones are cut in the middle
 MAX_SENTENCE = 4000  # characters of one problem
@@ -23,7 +26,9 @@ _CONTROL = re.compile(  # not printable, or turning the direction of what is
 _LONG_WORD = re.compile(rf"\S{{{MAX_WORD + 1},}}")
 _MANY_ALIKE = 10  # problems of one kind: a message that has more spells out the first few
 _SPELT_OUT = 5
-_PARTICULAR = re.compile(r"'[^']*'|[^\s\d]*+\d\S*")  # what differs between problems of one kind
+
+
+HEADER = 0  # the row of a table that names its columns
 
 
 class Place(NamedTuple):
@@ -31,6 +36,38 @@ class Place(NamedTuple):
 
     file: str = ""
     row: int | None = None  # of a table, from 1 below its header
+    line: int | None = None  # of the file, from 1
+
+    def __str__(self) -> str:
+        if self.row == HEADER:
+            return f"{self.file}, header"
+        if self.row is not None:
+            line = f" (line {self.line})" * (self.line is not None)
+            return f"{self.file}, row {self.row}{line}"
+        return self.file + f", line {self.line}" * (self.line is not None)
+
+
+class Code(StrEnum):
+    """What kind of thing is wrong, as programs compare it.
+
+    Where a problem has none, its code is the kind of its error: ``not-visible``.
+    """
+
+    MISSING_FILE = "missing-file"
+    UNREADABLE_FILE = "unreadable-file"
+    BAD_SYNTAX = "bad-syntax"  # neither YAML, XML nor CSV
+    WRONG_IMAGE_SIZE = "wrong-image-size"
+    MISSING_KEY = "missing-key"
+    UNKNOWN_KEY = "unknown-key"
+    BAD_VALUE = "bad-value"
+    BAD_ELEMENT = "bad-element"  # of a URDF or MJCF file
+    MISSING_COLUMN = "missing-column"
+    UNKNOWN_COLUMN = "unknown-column"
+    REPEATED_COLUMN = "repeated-column"
+    NO_ROW = "no-row"
+    BAD_ROW = "bad-row"
+    REPEATED_ROW = "repeated-row"
+    BAD_CELL = "bad-cell"
 
 
 @dataclass(frozen=True)
@@ -42,21 +79,18 @@ class Problem:
     """
 
     what: str  # what could not be done: "the number could not be used"
-    found: str = ""
+    found: str | Cause = ""
     needed: str = ""
     remedy: str = ""
     file: str = ""
-    row: int | None = None  # of a table, from 1 below its header
+    row: int | None = None  # of a table, from 1 below its header, which is 0
     line: int | None = None  # of the file, from 1
     columns: tuple[str, ...] = ()  # of the table, or the place in the line
     name: str = ""  # of the entry, element or image that it is about; ``what`` says it as well
+    code: Code | None = None
 
     def __str__(self) -> str:
-        where = self.file
-        if self.row is not None:
-            where += f", row {self.row}" + f" (line {self.line})" * (self.line is not None)
-        elif self.line is not None:
-            where += f", line {self.line}"
+        where = str(Place(self.file, self.row, self.line))
         if self.columns:
             where += f", column{'s' * (len(self.columns) > 1)} {', '.join(self.columns)}"
         said = f"{where}: {self.what}" if where else self.what
@@ -68,9 +102,11 @@ class Problem:
         return said if said.endswith((".", "?")) else f"{said}."
 
     @property
-    def is_told_apart(self) -> bool:
-        """Whether there is more than a sentence."""
-        return self != Problem(self.what)
+    def kind(self) -> Hashable:
+        """What problems of one kind share; of one that is a sentence alone, all of it."""
+        if self.code or self.needed:
+            return self.code, self.columns, self.needed or self.remedy
+        return str(self)
 
     def in_file(self, file: object) -> Problem:
         """Return the problem with the file that it is in, where it does not say one."""
@@ -86,7 +122,7 @@ class Problem:
         """Return the facts that there are, as ``--json`` has them."""
         facts = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
-            key: printable(value) if isinstance(value, str) else value
+            key: printable(str(value)) if isinstance(value, str | Cause) else value
             for key, value in facts.items()
             if value not in ("", None, ())
         }
@@ -95,7 +131,7 @@ class Problem:
 class BadValue(ValueError):
     """A value cannot be used: what was found and what is needed; its reader knows where."""
 
-    def __init__(self, found: str, needed: str, remedy: str) -> None:
+    def __init__(self, found: str | Cause, needed: str, remedy: str) -> None:
         super().__init__(f"found {found}, needed {needed}; {remedy}.")
         self.found, self.needed, self.remedy = found, needed, remedy
 
@@ -128,6 +164,11 @@ class LegcalError(Exception):
 
     def __reduce__(self) -> tuple[type, tuple[tuple[Problem, ...]], dict[str, object]]:
         return type(self), (self.facts,), {"diagnosis": self.diagnosis}
+
+    def documents(self) -> list[dict[str, Any]]:
+        """Return the facts as ``--json`` has them, each with its code."""
+        kind = re.sub(r"\B(?=[A-Z])", "-", type(self).__name__).lower()
+        return [{"code": kind, **fact.document()} for fact in self.facts]
 
     def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
         """Return an error of the same kind whose problems are changed."""
@@ -164,8 +205,8 @@ def _cut(text: str, most: int) -> str:
 
 def _shortened(facts: Sequence[Problem], problems: Sequence[str]) -> list[str]:
     """Return sentences; of more than ten of a kind five, and how many there are besides."""
-    kinds = [_kind(fact, problem) for fact, problem in zip(facts, problems, strict=True)]
-    total, shown = Counter(kinds), Counter[tuple[str, ...]]()
+    kinds = [fact.kind for fact in facts]
+    total, shown = Counter(kinds), Counter[Hashable]()
     lines = []
     for kind, problem in zip(kinds, problems, strict=True):
         shown[kind] += 1
@@ -179,13 +220,6 @@ def _shortened(facts: Sequence[Problem], problems: Sequence[str]) -> list[str]:
         if k and length > MAX_MESSAGE:
             return [*lines[:k], f"... and {len(lines) - k} more."]
     return lines
-
-
-def _kind(fact: Problem, sentence: str) -> tuple[str, ...]:
-    """Return what problems of one kind share: what is needed, or a sentence without particulars."""
-    if fact.needed:
-        return (*fact.columns, fact.needed, fact.remedy)
-    return (_PARTICULAR.sub("", sentence),)
 
 
 class UsageError(LegcalError):

@@ -10,21 +10,21 @@ from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
-from legcal.estimation.problem import Linearization, Problem, linearize
+from legcal.estimation.problem import EstimationProblem, Linearization, linearize
 from legcal.geometry.types import Array
 from legcal.machine.equations import posture_constraints
 
 STEP = 1e-6
 
 
-def residuals(problem: Problem[Any], state: Any) -> Array:
+def residuals(problem: EstimationProblem[Any], state: Any) -> Array:
     """Return all whitened residuals one below the other, those of priors last."""
     linear = linearize(problem, state)
     of_factors = [linear[factor.name].r.ravel() for factor in problem.factors]
     return np.concatenate([*of_factors, linear.prior_r])
 
 
-def jacobians(problem: Problem[Any], linear: Linearization) -> dict[str, Array]:
+def jacobians(problem: EstimationProblem[Any], linear: Linearization) -> dict[str, Array]:
     """Return the derivatives (n, size) of each factor's residuals by all unknowns, and priors'."""
     found = {}
     for factor in problem.factors:
@@ -44,7 +44,7 @@ def jacobians(problem: Problem[Any], linear: Linearization) -> dict[str, Array]:
     return found | {"priors": priors}
 
 
-def jacobian(problem: Problem[Any], linear: Linearization) -> Array:
+def jacobian(problem: EstimationProblem[Any], linear: Linearization) -> Array:
     """Return the derivatives of all residuals by all unknowns as the solver has them, (n, size)."""
     return np.concatenate(list(jacobians(problem, linear).values()))
 
@@ -55,11 +55,11 @@ def projected_move(problem: FitProblem, state: State, x: Array) -> State:
 
 
 def by_differences(
-    problem: Problem[Any],
+    problem: EstimationProblem[Any],
     state: Any,
     values: Callable[[Any], Array],
     directions: Array,
-    move: Callable[[Any, Any, Array], Any] = Problem.moved,
+    move: Callable[[Any, Any, Array], Any] = EstimationProblem.moved,
 ) -> Array:
     """Return the derivatives of values of a state along rows of directions."""
     columns = [

@@ -23,7 +23,7 @@ from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.exports.formats import ExportDocument
 from legcal.files.published import write_schemas
-from legcal.files.schema import Document
+from legcal.files.schema import Document, SparseDocument
 from legcal.machine.description_table import TableFile
 from legcal.machine.inspection import Inspection
 from legcal.machine.schema import MechanismFile
@@ -74,9 +74,23 @@ class _NewDocument(RootModel[_Created | _Template]):
     """What ``legcal new --json`` prints, and ``legcal new --template --json``."""
 
 
-class _Error(Document):
+class _Problem(SparseDocument):
+    code: str
+    what: str
+    found: str | None = None
+    needed: str | None = None
+    remedy: str | None = None
+    file: str | None = None
+    row: int | None = None  # 0: the header
+    line: int | None = None
+    columns: list[str] | None = None
+    name: str | None = None
+
+
+class _Error(SparseDocument):
     kind: str
     message: str
+    problems: list[_Problem] | None = None
 
 
 class _ErrorDocument(Document):

@@ -282,9 +282,9 @@ def _compare(seed: int, moved: Array, dof: int = 200, significance: float = 0.05
     saved = float(away @ np.linalg.solve(covariance + old_covariance, away))
     ratio = LikelihoodRatio.of(saved, covariance, PRIOR)
     single = tuple(
-        Change(f"c{i}", (f"c{i}",), ("m",), ("",), np.eye(N)[:, i : i + 1]) for i in range(N)
+        Change("", f"c{i}", (f"c{i}",), ("m",), ("",), np.eye(N)[:, i : i + 1]) for i in range(N)
     )
-    pair = (Change("both", ("c0", "c1"), ("m", "m"), ("", ""), np.eye(N)[:, :2]),)
+    pair = (Change("", "both", ("c0", "c1"), ("m", "m"), ("", ""), np.eye(N)[:, :2]),)
     return judge_movement(found, ratio, dof, (single, pair), significance)
 
 

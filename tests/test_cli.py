@@ -10,7 +10,7 @@ import pytest
 from command_line import run
 from hexapod_example import Run, copy_of_the_example
 
-from legcal.errors import ModelError, NotVisible
+from legcal.errors import Code, DatasetError, ModelError, NotVisible, Problem
 
 
 @pytest.mark.parametrize(
@@ -95,12 +95,12 @@ def test_a_model_that_was_right_already_is_not_called_an_improvement(
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "kind", "said"),
+    ("error", "code", "kind", "said", "problems"),
     [
-        (ZeroDivisionError("division by zero"), 3, "InternalError", "a mistake in legcal"),
-        (KeyboardInterrupt(), 130, "Interrupted", "Stopped before the end"),
-        (ModelError(["one", "two"]), 2, "ModelError", "one\ntwo"),
-        (NotVisible("no leg"), 1, "NotVisible", "no leg"),
+        (ZeroDivisionError("division by zero"), 3, "InternalError", "a mistake in legcal", []),
+        (KeyboardInterrupt(), 130, "Interrupted", "Stopped before the end", []),
+        (ModelError(["one", "two"]), 2, "ModelError", "one\ntwo", ["model-error"] * 2),
+        (NotVisible("no leg"), 1, "NotVisible", "no leg", ["not-visible"]),
     ],
 )
 def test_failures_have_their_exit_code_and_are_said_once(
@@ -108,6 +108,7 @@ def test_failures_have_their_exit_code_and_are_said_once(
     code: int,
     kind: str,
     said: str,
+    problems: list[str],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -123,6 +124,7 @@ def test_failures_have_their_exit_code_and_are_said_once(
     found = json.loads(capsys.readouterr().out)["error"]
     assert found["kind"] == kind
     assert said in found["message"]
+    assert [problem["code"] for problem in found.get("problems", [])] == problems
 
 
 def test_json_has_the_facts_of_what_is_wrong(
@@ -136,11 +138,25 @@ def test_json_has_the_facts_of_what_is_wrong(
     assert run(monkeypatch, "doctor", str(tmp_path / "data"), "--json") == 2
     error = json.loads(capsys.readouterr().out)["error"]
     (problem,) = error["problems"]
+    assert problem["code"] == "bad-cell"
     assert problem["file"] == str(table)
     assert (problem["row"], problem["line"], problem["columns"]) == (1, 2, head.split(",")[-1:])
     assert problem["found"] == "'far'"
     assert problem["needed"].startswith("a finite number")
     assert all(problem[key] in error["message"] for key in ("what", "found", "needed", "remedy"))
+
+
+def test_of_many_problems_of_a_kind_a_few_are_spelt_out() -> None:
+    what, needed = "the number could not be used", "a finite number"
+    cells = [
+        Problem(what, f"'{k}'", needed, row=k, columns=(name,), code=Code.BAD_CELL)
+        for name in "ab"
+        for k in range(12)
+    ]
+    shown = str(DatasetError([*cells, "Another sentence."])).splitlines()
+    assert shown.count("... and 7 more like these.") == 2
+    assert shown[-1] == "Another sentence."
+    assert len(shown) == 13
 
 
 @pytest.mark.parametrize("words", [(), ("study",)])

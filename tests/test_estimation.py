@@ -8,9 +8,9 @@ import pytest
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import Huber, PseudoHuber
 from legcal.estimation.problem import (
+    EstimationProblem,
     Factor,
     GaussianPrior,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -35,7 +35,7 @@ class Waves:
 
 def waves(
     rng: np.random.Generator, unknown: IntArray, noise: float = 0.0, n_open: int = 0
-) -> Problem[Waves]:
+) -> EstimationProblem[Waves]:
     """Return the problem of measurements at random places, the first phase with a prior.
 
     Nothing shows the second offset of the first ``n_open`` groups.
@@ -58,7 +58,7 @@ def waves(
 
     prior = GaussianPrior(np.zeros(1, dtype=np.intp), TRUTH.phase[0], np.array([0.5]))
     labels = tuple(f"phase {i}" for i in range(int(unknown.max()) + 1))
-    return Problem(
+    return EstimationProblem(
         variables=(Variables("phase", unknown, labels=labels, units=("",) * 3, prior=prior),),
         eliminated=Variables("offset", all_free(N_ELEMENTS, 2)),
         factors=(
@@ -102,7 +102,9 @@ def test_elimination_gives_the_covariance_of_the_whole_system(n_open: int) -> No
     np.testing.assert_allclose(mine, covariance, rtol=1e-9)
 
 
-def _with_prior(problem: Problem[Waves], prior: GaussianPrior) -> Problem[Waves]:
+def _with_prior(
+    problem: EstimationProblem[Waves], prior: GaussianPrior
+) -> EstimationProblem[Waves]:
     (block,) = problem.variables
     return replace(problem, variables=(replace(block, prior=prior),))
 

@@ -53,7 +53,7 @@ from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import Problem, linearize
+from legcal.estimation.problem import EstimationProblem, linearize
 from legcal.estimation.solver import normal_equations
 from legcal.geometry.types import Array
 from legcal.perception import board_adjustment, view_fit
@@ -289,12 +289,12 @@ def test_problems_of_other_clients_have_them_too(
     client: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, run = CLIENTS[client]
-    seen: list[tuple[Problem[Any], Any]] = []
+    seen: list[tuple[EstimationProblem[Any], Any]] = []
 
     entry = "minimise" if hasattr(module, "minimise") else "linearize"  # with steps of its own
     unwatched = getattr(module, entry)
 
-    def watched(problem: Problem[Any], state: Any, *more: Any, **options: Any) -> Any:
+    def watched(problem: EstimationProblem[Any], state: Any, *more: Any, **options: Any) -> Any:
         seen.append((problem, state))
         return unwatched(problem, state, *more, **options)
 

@@ -157,7 +157,7 @@ def in_degrees(axes: LegAxes) -> LegAxes:
         (
             lambda a: replace(a, covariance=a.covariance * (a.row != 0)[:, None, None]),
             DatasetError,
-            "leg1 in row 1 could not be used: its covariance",
+            "leg1 in row 1 could not be used: found a covariance",
         ),
         (in_degrees, LegcalError, r"errors of \d+ of \d+ axes.*units \(rad, m\)"),
         (lambda a: a.choose(np.arange(8)), NotIdentifiable, "24 images with 8 axes and 144 read"),

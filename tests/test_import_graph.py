@@ -151,6 +151,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.problem",
         "joint_fit.variables",
         "link_joints",
+        "notes",
         "location.document",
         "location.locate",
         "location.urdf",
@@ -185,6 +186,7 @@ PUBLIC: dict[str, set[str]] = {
 OUTSIDE = {
     "__main__",
     "brief",
+    "causes",
     "errors",
     "figures",
     "option_fields",
@@ -292,6 +294,7 @@ def test_four_steps_and_joint_fit_do_not_know_each_other() -> None:
 
 def test_estimation_knows_no_images_and_no_robot() -> None:
     assert {_room(other) for m in _of("estimation") for other in _reachable(m)} <= {
+        "causes",
         "errors",
         "files",
         "geometry",

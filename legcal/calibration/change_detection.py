@@ -37,11 +37,17 @@ _STEP = 1e-6  # of numerical derivatives [rad], and of the mean leg length
 class Change:
     """One thing that may have changed."""
 
-    what: str  # in words: offset of leg1, base joint of leg2, leg3
+    part: str  # offset, base joint; "" for all of the owner
+    owner: str  # a leg, or a motor that moves joints at A
     components: tuple[str, ...]  # its numbers: leg1.offset or x, y, z
     units: tuple[str, ...]  # m or rad
     links: tuple[str, ...]  # in whose axes x, y, z are; empty for what is no coordinate
     columns: Array  # (p, m) derivative of all parameters by them
+
+    @property
+    def what(self) -> str:
+        """It in words: offset of leg1, base joint of leg2, leg3."""
+        return f"{self.part} of {self.owner}" if self.part else self.owner
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +235,7 @@ def possible_changes(
 
     for name, which, changes in things:
         of_thing = list[Change]()
-        for what, components, units, link, moved in changes:
+        for part, components, units, link, moved in changes:
             columns = np.column_stack(
                 [derivative(which, moved, k, unit) for k, unit in enumerate(units)]
             )
@@ -241,7 +247,8 @@ def possible_changes(
                 kept = np.flatnonzero(found).tolist()
                 of_thing.append(
                     Change(
-                        what,
+                        part,
+                        name,
                         tuple(components[k] for k in kept),
                         tuple(units[k] for k in kept),
                         (link,) * len(kept),
@@ -256,7 +263,7 @@ def possible_changes(
 
 
 _Moved = Callable[[Leg, int, float], Leg]  # a leg, one number of which has moved by a step
-# In words, its numbers, their units, the link in whose axes they are, and how
+# The part, its numbers, their units, the link in whose axes they are, and how
 _Possible = tuple[str, tuple[str, ...], tuple[str, ...], str, _Moved]
 _METRES, _RADIANS = ("m",) * 3, ("rad",) * 2
 
@@ -289,16 +296,14 @@ def _of_actuator(actuator: Actuator) -> list[_Possible]:
         return moved
 
     joint = actuator.joint
-    found: list[_Possible] = [
-        (f"zero of {joint}", (f"{joint}.zero",), (actuator.unit,), "", zero_moved)
-    ]
+    found: list[_Possible] = [("zero", (f"{joint}.zero",), (actuator.unit,), "", zero_moved)]
     numbers, units = ("1", "2", "place 1", "place 2"), (*_RADIANS, *_METRES[:2])
     if not actuator.turns:
-        return [*found, (f"direction of {joint}", ("1", "2"), _RADIANS, "", moved_from(0))]
-    found.append((f"axis of {joint}", numbers, units, "", moved_from(0)))
+        return [*found, ("direction", ("1", "2"), _RADIANS, "", moved_from(0))]
+    found.append(("axis", numbers, units, "", moved_from(0)))
     if actuator.arm is not None:
         line = ActuatorColumns.ARM.start - ActuatorColumns.AXIS.start
-        found.append((f"arm line of {joint}", numbers, units, "", moved_from(line)))
+        found.append(("arm line", numbers, units, "", moved_from(line)))
     return found
 
 
@@ -315,7 +320,7 @@ def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:
 
     if leg.kind is not LegKind.PASSIVE:
         what = "length" if leg.kind is LegKind.CONSTANT else "offset"
-        found.append((f"{what} of {name}", (f"{name}.{what}",), ("m",), "", longer))
+        found.append((what, (f"{name}.{what}",), ("m",), "", longer))
 
     def base_moved(leg: Leg, k: int, step: float) -> Leg:
         return replace(leg, A=leg.A + step * base[k])
@@ -324,8 +329,8 @@ def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:
         return replace(leg, B=leg.B + step * platform[k])
 
     found += [
-        (f"base joint of {name}", xyz, _METRES, machine.base, base_moved),
-        (f"platform joint of {name}", xyz, _METRES, machine.platform, platform_moved),
+        ("base joint", xyz, _METRES, machine.base, base_moved),
+        ("platform joint", xyz, _METRES, machine.platform, platform_moved),
     ]
     a, b = leg.base_axis, leg.platform_axis
     if a is not None:
@@ -333,14 +338,14 @@ def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:
         def base_turned(leg: Leg, k: int, step: float) -> Leg:
             return replace(leg, base_axis=_about(a, k, step).apply(a))
 
-        found.append((f"base axis of {name}", ("1", "2"), _RADIANS, "", base_turned))
+        found.append(("base axis", ("1", "2"), _RADIANS, "", base_turned))
     if b is not None:
 
         def platform_turned(leg: Leg, k: int, step: float) -> Leg:
             turn = _about(b, k, step)
             return replace(leg, platform_axis=turn.apply(b), twist=twist_after(leg, turn))
 
-        found.append((f"platform axis of {name}", ("1", "2"), _RADIANS, "", platform_turned))
+        found.append(("platform axis", ("1", "2"), _RADIANS, "", platform_turned))
     return found
 
 
@@ -378,9 +383,10 @@ def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tupl
 def _together(name: str, changes: Sequence[Change]) -> Change:
     """Return all that may change at one leg as one change."""
     return Change(
+        "",
         name,
         tuple(
-            component if "." in component else f"{change.what.split(' of ')[0]} {component}"
+            component if component == f"{name}.{change.part}" else f"{change.part} {component}"
             for change in changes
             for component in change.components
         ),

@@ -19,6 +19,7 @@ from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
+from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_causes import image_notes
@@ -49,6 +50,7 @@ from legcal.perception.photographs import (
     place_and_measure,
 )
 from legcal.perception.placement import (
+    NotPlaced,
     PlacedArm,
     Placement,
     placed_arms,
@@ -85,8 +87,8 @@ class Detection:
         they were expected, and no outline of theirs is here but those that were given.
     image_notes : tuple of str
         What is odd about images, views and radii.
-    notes : tuple of str
-        These, and what else a reader should know.
+    leg_notes : tuple of str
+        What else a reader should know of the search for the legs.
     corners : Corners or None
         The corners of calibration boards in all images; None without a board.
     arms : mapping
@@ -100,11 +102,16 @@ class Detection:
     cylinders: Sequence[Sequence[Cylinder]]
     T_base_camera: tuple[RigidTransform | None, ...]
     rows: IntArray
-    unplaced: dict[str, str]
+    unplaced: dict[str, NotPlaced]
     image_notes: tuple[str, ...]
-    notes: tuple[str, ...]
+    leg_notes: tuple[str, ...]
     corners: Corners | None = None
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know, also of the dataset."""
+        return (*self.dataset.notes, *self.image_notes, *self.leg_notes)
 
     def view_of(self, row: int) -> str:
         """Return the name of the view of a row."""
@@ -191,7 +198,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
     dataset, order, photographs = data.dataset, data.order, data.photographs
     scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
-    unplaced = dict[str, str]()
+    unplaced = dict[str, NotPlaced]()
     image_notes, notes = list[str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
@@ -230,7 +237,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         rows=images,
         unplaced=unplaced,
         image_notes=tuple(image_notes),
-        notes=(*dataset.notes, *image_notes, *notes, *data.unreached_notes()),
+        leg_notes=(*notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),
     )
 
@@ -247,11 +254,15 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
     """Return the images of a dataset that cannot be searched, to be clicked, in file order."""
     nominal = nominal_placement(data.machine, data.measurements, data.T_base_platform)
     rows, legs = inverse(data.order.rows), inverse(data.order.legs)
-    why = (
-        "found no rough camera pose, needed one, since the motors do not determine the pose of the "
-        f"platform; click its joints at the base ({LANDMARKS_NAME})."
+    why = Cause(
+        "its images could not be searched: found no rough camera pose, needed one, since the "
+        "motors do not determine the pose of the platform; click its joints at the base "
+        f"({LANDMARKS_NAME})."
     )
-    others = "found a rough camera pose here and none of other views, needed one of every view."
+    others = Cause(
+        "its images could not be searched: found a rough camera pose here and none of other views, "
+        "needed one of every view."
+    )
     dataset = data.dataset
     return Detection(
         dataset=dataset,
@@ -262,12 +273,11 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
         T_base_camera=tuple(view.T_base_camera for view in dataset.measurements.views),
         rows=images,
         unplaced={
-            view.name: f"view {view.name}: its images could not be searched: "
-            + (why if view.name in views else others)
+            view.name: NotPlaced(view.name, why if view.name in views else others)
             for view in dataset.measurements.views
         },
         image_notes=(),
-        notes=dataset.notes,
+        leg_notes=(),
     )
 
 

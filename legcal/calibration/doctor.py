@@ -50,9 +50,10 @@ from legcal.calibration.ordered_dataset import (
     order_dataset,
 )
 from legcal.calibration.pipeline import chosen_parameters, exact_cameras
+from legcal.causes import Cause, by_cause
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
 from legcal.data.holdout import dataset_at
-from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.image_causes import images_in_words
 from legcal.data.measurements import few, few_views, reading_columns, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_photographs
@@ -60,7 +61,7 @@ from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
 from legcal.files.folder import output_path
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception.diagnostics import TAKE_AGAIN, is_out_of_sight, left_out_notes
+from legcal.perception.diagnostics import defect_notes, is_out_of_sight
 from legcal.perception.image_quality import Exposure, measure_exposure
 from legcal.perception.photographs import defects_of
 from legcal.perception.placement import unplaced_notes
@@ -119,11 +120,10 @@ def doctor(
     dataset = source if isinstance(source, Dataset) else load_dataset(source, check_images=writes)
     if writes:
         rows_with_image(dataset)
-    of_tables = tuple(note for note in dataset.notes if note not in dataset.file_notes)
-    dataset, problems = inspect_files(replace(dataset, notes=of_tables))
+    dataset, problems = inspect_files(dataset)
     found, choices = _Found(dataset, writes), chosen_parameters(dataset, ())
     usable = _look_at_files(found, problems)
-    _look_at_readings(found, of_tables)
+    _look_at_readings(found, dataset.table_notes)
     _look_at_cameras(found, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         exposures = _look_at_photographs(found, usable, pool, report)
@@ -250,11 +250,11 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, Problem]]) -> li
         )
     of_files = {row: problem for row, problem in problems if row not in missing}
     unread = {row: problem for row, problem in of_files.items() if problem.name}  # of an image
-    for why, rows in by_cause({row: problem.found for row, problem in unread.items()}):
-        alike = [row for row in rows if unread[row].needed == unread[rows[0]].needed]
+    causes = {row: Cause("{} {}", (one.found, one.needed)) for row, one in unread.items()}
+    for cause, alike in by_cause(causes):
         if len(alike) > 1:
             what = f"{images_in_words(m, alike)} could not be read"
-            one = replace(unread[alike[0]], what=what, found=why, row=None)
+            one = replace(unread[alike[0]], what=what, found=str(cause.values[0]), row=None)
             found.add("files", "error", str(one), alike)
             of_files = {row: problem for row, problem in of_files.items() if row not in alike}
     for row, problem in of_files.items():
@@ -422,9 +422,7 @@ def _look_at_photographs(
     found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
     if blurs:
         found.checks["photographs"] += f", blurred by {float(np.median(blurs)):.1f} px"
-    for what in left_out_notes(
-        m, {r: str(why) for r, why in defects.items()}, dict.fromkeys(defects, TAKE_AGAIN)
-    ):
+    for what in defect_notes(m, defects):
         found.add("photographs", "warning", what)
     for same in (own for own in pixels.values() if len(own) > 1):
         several = len({int(m.pose[row]) for row in same}) > 1
@@ -540,9 +538,8 @@ def _look_at_legs(
     odd = [one for one in seen.image_notes if one not in told]
     for what in notes_beside(found.diagnosis, odd, "legcal doctor"):
         found.add("legs", "note" if found.diagnosis else "warning", what)
-    for what in seen.notes:
-        if what not in (*seen.dataset.notes, *seen.image_notes):
-            found.add("legs", "note", what)
+    for what in seen.leg_notes:
+        found.add("legs", "note", what)
     for view in views:
         n_found, n_visible = view.legs_found or 0, view.legs_visible or 0
         if not view.problem and n_found < FEW_LEGS * n_visible:
@@ -629,7 +626,7 @@ def _outline_figures(seen: Detection, view: str) -> dict[str, Any]:
         "length": _median(outlines.length[used]),
         "residual": _median(outlines.residual[used]),
         "rejected": dict(rejected.most_common()),
-        "problem": seen.unplaced.get(view) or None,
+        "problem": str(seen.unplaced[view]) if view in seen.unplaced else None,
     }
 
 

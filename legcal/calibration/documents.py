@@ -20,7 +20,6 @@ from pydantic import (
     model_serializer,
 )
 
-from legcal.data.image_causes import by_cause
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.reasons import Rejection
 from legcal.errors import DatasetError
@@ -269,18 +268,20 @@ class NamedImage(Document):
 class LeftOut(Document):
     """Images that were left out, and why."""
 
+    reason: str = ""  # its code
     why: str
     images: list[NamedImage]
 
 
 def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) -> list[LeftOut]:
-    """Return images that were left out, by row, a block a cause."""
+    """Return images that were left out, by row, a block a reason with its detail."""
     names = row_names(measurements)
-    views = [measurements.views[v].name for v in measurements.view.tolist()]
-    return [
-        LeftOut(why=what, images=[NamedImage(view=views[r], image=names[r]) for r in rows])
-        for what, rows in by_cause({row: str(cause) for row, cause in sorted(why.items())})
-    ]
+    images: dict[tuple[str, str], list[NamedImage]] = {}
+    for row, rejection in sorted(why.items()):
+        view = measurements.views[int(measurements.view[row])].name
+        alike = images.setdefault((str(rejection.reason), str(rejection)), [])
+        alike.append(NamedImage(view=view, image=names[row]))
+    return [LeftOut(reason=code, why=text, images=named) for (code, text), named in images.items()]
 
 
 class Observations(Document):

@@ -19,6 +19,7 @@ from legcal.calibration.joint_fit.solution import Solution, in_file_order
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.outlier_images import outlier_images
+from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, along_legs, reject_unused_legs
@@ -49,7 +50,7 @@ class Estimate:
     diagnosis: tuple[Diagnosis, ...] = ()  # what looks wrong where many images were left out
 
     @cached_property
-    def outliers(self) -> dict[int, str]:
+    def outliers(self) -> dict[int, Cause]:
         """What is said of images that contradict the fit, by their row."""
         return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
 

@@ -99,7 +99,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         rows=np.array(_rows_with_image(dataset), dtype=np.intp),
         unplaced={},
         image_notes=(),
-        notes=(),
+        leg_notes=(),
         arms=placed_arms(
             solution.legs,
             q,

@@ -15,11 +15,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
+from legcal.causes import Cause, by_cause
 from legcal.data.axes import LegAxes
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
-from legcal.data.image_causes import by_cause, images_in_words
+from legcal.data.image_causes import images_in_words
 from legcal.data.image_tables import (
     Order,
     canonical_order,
@@ -235,8 +236,10 @@ def nominal_poses(
     most, first = _largest_residual(machine), measurements.first_rows.tolist()
     found = _contradictions(machine, measurements, T)
     wrong = {
-        first[k]: f"found {one.in_words(machine)}; check this reading, its encoder and the offset "
-        "of the leg, or take"
+        first[k]: Cause(
+            "found {}; check this reading, its encoder and the offset of the leg, or take",
+            (one.cause(machine),),
+        )
         for k, one in found.items()
         if _is_refused(one, machine)
     }
@@ -246,24 +249,26 @@ def nominal_poses(
             others[:, np.equal(machine.reads, one.legs[0])] = np.nan
             T[k] = _least_squares(machine, others, [T[k]])[0][0]
     wrong |= {
-        first[k]: "found that the legs of the nominal model miss them by "
-        f"{1e3 * residual[k]:.1f} mm at the nearest pose, needed at most {1e3 * most:.1f} mm; "
-        "check these readings and legcal.home, or take"
+        first[k]: Cause(
+            "found that the legs of the nominal model miss them by {:.1f} mm at the nearest pose, "
+            "needed at most {:.1f} mm; check these readings and legcal.home, or take",
+            (1e3 * float(residual[k]), 1e3 * most),
+        )
         for k in off
         if not residual[k] <= most and k not in found
     }
     if wrong:
         raise DatasetError(
             [
-                f"The readings of {images_in_words(measurements, rows)} could not be used: {what} "
+                f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
                 f"the image{'s' * (len(rows) > 1)} out."
-                for what, rows in by_cause(wrong)
+                for cause, rows in by_cause(wrong)
             ]
         )
     return tuple(T), residual
 
 
-def contradicting_readings(machine: Machine, measurements: Measurements) -> dict[int, str]:
+def contradicting_readings(machine: Machine, measurements: Measurements) -> dict[int, Cause]:
     """Return what is found of readings of redundant motors that contradict each other, by row.
 
     They are those that :func:`nominal_poses` does not refuse.
@@ -274,7 +279,7 @@ def contradicting_readings(machine: Machine, measurements: Measurements) -> dict
     T = platforms_in_base(machine, [pose for pose, _ in followed])
     first = measurements.first_rows.tolist()
     return {
-        first[k]: one.in_words(machine)
+        first[k]: one.cause(machine)
         for k, one in _contradictions(machine, measurements, T).items()
         if not _is_refused(one, machine)
     }

@@ -16,11 +16,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.causes import Cause
 from legcal.data.measurements import Measurements, few
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import Factor, Frames, Problem, Residuals, Variables, all_free
+from legcal.estimation.problem import (
+    EstimationProblem,
+    Factor,
+    Frames,
+    Residuals,
+    Variables,
+    all_free,
+)
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
@@ -31,11 +39,11 @@ from legcal.machine.rods import actuator_index, joints_at, reading_of_rod
 MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
 MIN_REJECTED_LEGS = 2  # of which it rejected all outlines
 MIN_REJECTED_UNEXPLAINED = 0.67  # the share, if the readings agree with the image
-POSE_IN_DOUBT = (
+POSE_IN_DOUBT = Cause(
     "its readings do not give the pose of the platform, and what it shows suits several; take it "
     "again with more legs in sight"
 )
-CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
+CAMERA_MOVED = Cause("its readings suit it, so check that nobody moved the camera")
 MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
 # Lengths are parts of the mean leg length.
 MIN_NOISE = 1.25e-4  # of an outline at its leg
@@ -65,7 +73,7 @@ class _Shown:
 
 def outlier_images(
     measurements: Measurements, machine: Machine, solution: Solution
-) -> dict[int, str]:
+) -> dict[int, Cause]:
     """Return what is said of every outlier image that was fitted, by row, without its name."""
     o = solution.outlines
     rejected = o.rejected_for(Reason.DISAGREES)
@@ -85,9 +93,9 @@ def outlier_images(
             explanation = POSE_IN_DOUBT
         if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
             continue  # the outlines are wrong, not the image
-        notes[row] = (
-            f"{len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
-            f"left out; {explanation or CAMERA_MOVED}."
+        notes[row] = Cause(
+            "{} of its {} outlines disagree with the fit and were left out; {}.",
+            (len(wrong), len(judged), explanation or CAMERA_MOVED),
         )
     return notes
 
@@ -192,7 +200,7 @@ class _Image:
         if held:
             factors.append(Factor("readings", differences, (of_readings,), m, 1))
         pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
-        problem = Problem[_State]((pose,), None, tuple(factors))
+        problem = EstimationProblem[_State]((pose,), None, tuple(factors))
         try:
             found = minimise(problem, _State(Frames.of([self.fitted_pose])), LOSS)
         except DidNotConverge:
@@ -210,43 +218,44 @@ class _Image:
         variance = scale**2 * np.einsum("ja,ab,jb->j", J, np.linalg.inv(normal), J)
         return _Shown(q, np.sqrt(variance), scale * least_noise, found.cost / scale**2)
 
-    def wrong_reading(self, chosen: IntArray) -> str:
+    def wrong_reading(self, chosen: IntArray) -> Cause | None:
         """Return which reading is wrong if outlines suit all others, and no others but these."""
         motors = list(self.machine.motors)
         shown: dict[int, _Shown] = {}
         for leg in motors:
             found = self.shown(chosen, [other for other in motors if other != leg])
             if found is None:
-                return ""
+                return None
             shown[leg] = found
         noise = min((each.noise for each in shown.values()), default=0.0)
         cost = {leg: each.cost * (each.noise / noise) ** 2 for leg, each in shown.items()}
         best, *others = sorted(motors, key=cost.__getitem__)
         if others and cost[others[0]] - cost[best] < 0.5 * SIGNIFICANT_SIGMAS**2:
-            return ""
+            return None
         found = shown[best]
         value, sigma = float(found.readings[best]), float(found.sigma[best])
         off, least = np.abs(found.readings - self.given), self._least
         if np.any((off > least)[[other for other in motors if other != best]]):
-            return ""  # it is not the only one
+            return None  # it is not the only one
         noise = self.machine.legs[best].reading_of(found.noise)
         if off[best] < max(SIGNIFICANT_SIGMAS * max(sigma, noise), float(least[best])):
-            return ""
-        return self._one_wrong(best, value, sigma) if self._is_in_travel(best, value, sigma) else ""
+            return None
+        in_travel = self._is_in_travel(best, value, sigma)
+        return self._one_wrong(best, value, sigma) if in_travel else None
 
-    def explanation(self, chosen: IntArray) -> str:
+    def explanation(self, chosen: IntArray) -> Cause | None:
         """Return the probable cause by the outlines alone, and what to check.
 
-        It is "" where the readings agree with the image.
+        It is None where the readings agree with the image.
         """
         m, motors, alone = self.measurements, list(self.machine.motors), self.shown(chosen)
         if alone is None or not motors:
-            return "check its reading and that nobody moved camera or machine"
+            return Cause("check its reading and that nobody moved camera or machine")
         shown, sigma, given = alone.readings[motors], alone.sigma[motors], self.given[motors]
         least = np.maximum(SIGNIFICANT_SIGMAS * sigma, self._least[motors])
         wrong = np.flatnonzero(np.abs(shown - given) > least)
         if len(wrong) == 0:
-            return ""
+            return None
         distance = np.abs(m.q[:, motors] - shown)
         same = np.maximum(least, self._by(SAME_READING)[motors])
         alike = [
@@ -258,12 +267,12 @@ class _Image:
         ]
         if alike:
             nearest = min(alike, key=lambda other: float(distance[other].max()))
-            return (
-                f"it shows the reading given for image {m.image[nearest]}; check which image "
-                "belongs to which row"
+            return Cause(
+                "it shows the reading given for image {}; check which image belongs to which row",
+                (m.image[nearest],),
             )
         if not all(self._is_in_travel(motors[k], shown[k], sigma[k]) for k in wrong):
-            return (
+            return Cause(
                 "its outlines suit no pose within the travel of the legs; check that it was taken "
                 "with this reading and that nobody moved camera or machine"
             )
@@ -277,19 +286,19 @@ class _Image:
         for leg, off in zip(legs, possible.tolist(), strict=True):
             size, unit = SHOWN_IN[leg.reading_unit]
             worst[unit] = max(worst.get(unit, 0.0), size * off)
-        return (
-            "it shows another pose than its reading says, with readings of "
-            f"{few([str(leg.prismatic) for leg in legs])} off by up to "
-            f"{' and '.join(f'{most:.1f} {unit}' for unit, most in worst.items())}; check that it "
-            "was taken there"
+        return Cause(
+            "it shows another pose than its reading says, with readings of {} off by up to "
+            f"{' and '.join(f'{{:.1f}} {unit}' for unit in worst)}; check that it was taken there",
+            (few([str(leg.prismatic) for leg in legs]), *worst.values()),
         )
 
-    def _one_wrong(self, leg: int, shown: float, sigma: float) -> str:
+    def _one_wrong(self, leg: int, shown: float, sigma: float) -> Cause:
         joint, given = self.machine.legs[leg].prismatic, float(self.given[leg])
         size, unit = SHOWN_IN[self.machine.legs[leg].reading_unit]
-        return (
-            f"it shows a reading of {joint} of {size * shown:.2f} +- {size * sigma:.2f} {unit}, "
-            f"given {size * given:.2f} {unit}; check that reading"
+        return Cause(
+            f"it shows a reading of {{}} of {{:.2f}} +- {{:.2f}} {unit}, given {{:.2f}} {unit}; "
+            "check that reading",
+            (str(joint), size * shown, size * sigma, size * given),
         )
 
     def _by(self, distance: float) -> Array:

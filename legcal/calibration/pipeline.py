@@ -36,6 +36,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
 from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
+from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
@@ -47,7 +48,14 @@ from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few_views
 from legcal.data.outlines import reject_unused_legs
 from legcal.data.overrides import Override, overrides_of_call
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
+from legcal.errors import (
+    DatasetError,
+    DidNotConverge,
+    NotIdentifiable,
+    NotVisible,
+    Problem,
+    UsageError,
+)
 from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
@@ -160,18 +168,20 @@ def calibrate(
 
     # 6. Judge and write.
     found = estimate.in_file_order()
+    on_images = notes_beside(
+        found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
+    )
     notes = [
-        *(one.sentence for one in found.diagnosis),
-        *dataset.notes,
-        *notes_beside(found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"),
-        *choices.notes,
-        *identify_notes,
-        *cache_notes,
-        *found.fitted.unreached_notes(),
-        *board_notes(dataset, found.solution, found.corners),
+        *Note.about(Topic.DIAGNOSIS, (one.sentence for one in found.diagnosis)),
+        *Note.about(Topic.DATASET, dataset.notes),
+        *Note.about(Topic.IMAGES, on_images),
+        *Note.about(Topic.MODEL, (*choices.notes, *identify_notes)),
+        *Note.about(Topic.DATASET, cache_notes),
+        *Note.about(Topic.READINGS, found.fitted.unreached_notes()),
+        *Note.about(Topic.BOARDS, board_notes(dataset, found.solution, found.corners)),
         *found.solution.notes,
-        *_camera_notes(dataset, found.solution),
-        *exact_cameras(dataset, choices),
+        *Note.about(Topic.CAMERAS, _camera_notes(dataset, found.solution)),
+        *Note.about(Topic.CAMERAS, exact_cameras(dataset, choices)),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -221,9 +231,10 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
         if not (diagnosis or notes):
             raise
-        likeliest = [one.sentence for one in diagnosis]
-        beside = notes_beside(diagnosis, error.problems, "legcal calibrate")
-        refusal = type(error)([*likeliest, *beside, *notes])
+        refused: Sequence[str | Problem] = error.facts
+        if diagnosis:
+            refused = notes_beside(diagnosis, error.problems, "legcal calibrate")
+        refusal = type(error)([*(one.sentence for one in diagnosis), *refused, *notes])
         refusal.diagnosis = tuple(one.document().document() for one in diagnosis)
         raise refusal from error
 

@@ -15,6 +15,7 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_acc
 from legcal.calibration.joint_fit.scale import SCALE
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.notes import Note, Topic
 from legcal.calibration.result import Calibration, Verdict
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -84,7 +85,7 @@ def judge(
         verdict,
         (
             *notes,
-            *click_notes(dataset, solution),
+            *Note.about(Topic.IMAGES, click_notes(dataset, solution)),
             *closeness(dataset.folder, measurements.n_rows, platform),
         ),
         held_out,

@@ -143,7 +143,7 @@ def run(*, as_json: bool) -> int:
                 kind,
                 str(error),
                 as_json=as_json,
-                facts=error.facts,
+                problems=error.documents(),
                 diagnosis=error.diagnosis,
             )
             return error.exit_code

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from legcal.errors import LegcalError, OutOfResources, Problem, UsageError, printable
+from legcal.errors import LegcalError, OutOfResources, UsageError, printable
 from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
@@ -242,7 +242,7 @@ def print_failure(
     message: str,
     *,
     as_json: bool,
-    facts: Sequence[Problem] = (),
+    problems: Sequence[dict[str, object]] = (),
     diagnosis: Sequence[dict[str, object]] = (),
 ) -> None:
     """Say on stderr, or in JSON on stdout, why a command failed."""
@@ -250,8 +250,8 @@ def print_failure(
     if as_json:
         with suppress(OutOfResources):
             error: dict[str, object] = {"kind": kind, "message": message}
-            if any(problem.is_told_apart for problem in facts):
-                error["problems"] = [problem.document() for problem in facts]
+            if problems:
+                error["problems"] = list(problems)
             found = {"diagnosis": list(diagnosis)} if diagnosis else {}
             print_json({"error": error, **found})
             return

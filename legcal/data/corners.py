@@ -86,7 +86,7 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
             VERDICTS[0 if corners.used[i] else 1],
             corners.reason[i].reason,
             corners.source[i],
-            corners.reason[i].detail,
+            str(corners.reason[i].detail),
         ]
         for i, row in enumerate(corners.row.tolist())
     )

@@ -18,6 +18,7 @@ from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
     ENCODER_SIGMAS,
     ViewEntry,
+    entry_problem,
     find_dataset_file,
     read_dataset_file,
     view_problems,
@@ -81,7 +82,7 @@ class Dataset:
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the rows of ``observations.csv`` if there is one
-    notes: tuple[str, ...] = ()  # what is odd but allowed
+    table_notes: tuple[str, ...] = ()  # what is odd but allowed: in tables and the dataset file
     axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
     overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
@@ -89,7 +90,12 @@ class Dataset:
     landmarks: Landmarks | None = None  # the rows of ``landmarks.csv`` if there is one
     # What the files of images say of themselves, by the names of those that were looked at
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
-    file_notes: tuple[str, ...] = ()  # those of the notes that come from these
+    file_notes: tuple[str, ...] = ()  # what is odd in these
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is odd but allowed."""
+        return (*self.table_notes, *self.file_notes)
 
     def board_on(self, link: Link) -> FixedBoard | None:
         """Return the calibration board on a link, None if it has none."""
@@ -332,7 +338,7 @@ def load_dataset(
         machine=machine,
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
-        notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
+        table_notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
@@ -387,11 +393,8 @@ def _without_photographs(dataset: Dataset) -> str:
 def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
     """Return a dataset with what its images say of themselves, and what is wrong with rows."""
     facts, problems = inspect_rows(dataset)
-    of_files = [
-        one.what for one in notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
-    ]
-    notes = (*dataset.notes, *of_files)
-    return replace(dataset, notes=notes, facts=facts, file_notes=tuple(of_files)), problems
+    found = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
+    return replace(dataset, facts=facts, file_notes=tuple(one.what for one in found)), problems
 
 
 def _invisible(dataset: Dataset) -> list[str]:
@@ -455,11 +458,16 @@ def _mechanism_path(folder: Path, named: str) -> Path:
 
 def _leg_problems(
     path: Path, views: Mapping[str, ViewEntry], leg_names: Sequence[str]
-) -> list[str]:
+) -> list[Problem]:
     """Return the legs of views that the mechanism does not have."""
     return [
-        f"{path}: views.{name}.legs could not be used: found the unknown leg {describe(leg)}, "
-        f"needed legs of the mechanism; {closest(leg, leg_names)}"
+        entry_problem(
+            path,
+            f"views.{name}.legs",
+            f"the unknown leg {describe(leg)}",
+            "legs of the mechanism",
+            closest(leg, leg_names),
+        )
         for name, view in views.items()
         for leg in view.legs or ()
         if leg not in leg_names
@@ -631,11 +639,11 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
 
 def expand_hand_held(
     path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
-) -> tuple[Measurements, tuple[int, ...], list[str]]:
+) -> tuple[Measurements, tuple[int, ...], list[Problem]]:
     """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
     new: list[View] = []
     origin: list[int] = []
-    problems: list[str] = []
+    problems: list[Problem] = []
     index = np.zeros_like(measurements.view)
     for v, (name, entry) in enumerate(views.items()):
         rows = np.flatnonzero(measurements.view == v)
@@ -650,8 +658,13 @@ def expand_hand_held(
             origin.append(v)
         taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
         problems += [
-            f"{path}: views.{other} could not be used: found the name that an image of the "
-            f"hand-held view {name} gets, needed another; rename it."
+            entry_problem(
+                path,
+                f"views.{other}",
+                f"the name that an image of the hand-held view {name} gets",
+                "another",
+                "rename it",
+            )
             for other in taken
         ]
     return replace(measurements, views=tuple(new), view=index), tuple(origin), problems

@@ -20,7 +20,7 @@ from pydantic import (
 
 from legcal.data.overrides import Override, read_override
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
-from legcal.errors import DatasetError
+from legcal.errors import Code, DatasetError, Problem
 from legcal.files.motions import MotionEntry
 from legcal.files.quantity import PRIOR_SCHEMA, Quantity, read_prior
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
@@ -185,9 +185,15 @@ def read_dataset_file(path: Path) -> DatasetEntry:
     return validate(DatasetEntry, found, path)
 
 
+def entry_problem(path: Path, entry: str, found: str, needed: str, remedy: str) -> Problem:
+    """Return why an entry of the dataset file cannot be used."""
+    what = f"{entry} could not be used"
+    return Problem(what, found, needed, remedy, str(path), name=entry, code=Code.BAD_VALUE)
+
+
 def view_problems(
     path: Path, views: Mapping[str, ViewEntry], boards: Collection[Link]
-) -> list[str]:
+) -> list[Problem]:
     """Return what keeps views from showing no leg, and from being hand-held.
 
     *boards* are the links that have a board.
@@ -196,21 +202,34 @@ def view_problems(
     problems = []
     if blind and "platform" not in boards:
         problems.append(
-            f"{path}: {list_in_words([f'views.{name}.legs' for name in blind])} could not be used: "
-            "found no leg and no board on the platform, needed a leg or such a board in the images "
-            "of every view; name legs, or describe the board in the block board (on: platform)."
+            entry_problem(
+                path,
+                list_in_words([f"views.{name}.legs" for name in blind]),
+                "no leg and no board on the platform",
+                "a leg or such a board in the images of every view",
+                "name legs, or describe the board in the block board (on: platform)",
+            )
         )
     held = {name: view for name, view in views.items() if view.hand_held}
     problems += [
-        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
-        "board on the base in every image of a camera that is held in the hand; describe it in "
-        "the block board."
+        entry_problem(
+            path,
+            f"views.{name}.hand_held",
+            "no board",
+            "a calibration board on the base in every image of a camera that is held in the hand",
+            "describe it in the block board",
+        )
         for name in held
         if "base" not in boards
     ]
     problems += [
-        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
-        "held in the hand, needed none, the board gives the pose of every image; remove it."
+        entry_problem(
+            path,
+            f"views.{name}.T_base_camera",
+            "one pose of a camera that is held in the hand",
+            "none, the board gives the pose of every image",
+            "remove it",
+        )
         for name, view in held.items()
         if view.T_base_camera is not None
     ]

@@ -241,7 +241,7 @@ def format_observations(
             outlines.reason[i].reason,
             outlines.source[i],
             *measured[i],
-            outlines.reason[i].detail,
+            str(outlines.reason[i].detail),
         ]
         for i, row in enumerate(outlines.row.tolist())
     )

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.measurements import few
-from legcal.errors import DatasetError
+from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
 from legcal.vision.heic import HEIC_SUFFIXES
@@ -53,7 +53,7 @@ class Photograph:
 class Row:
     """What a row of the table says of its photograph; "" for nothing."""
 
-    where: str  # for messages
+    where: Place
     image: str
     view: str
     time: str
@@ -299,16 +299,26 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
         if k not in best:
             near = closest(rows[k].image, [p.name for p in photographs if p.name not in taken])
             problems.append(
-                f"{rows[k].where}, column image: the photograph could not be found: found no "
-                f"{describe(rows[k].image)}, needed one of the {len(photographs)} photographs; "
-                f"{near}"
+                Problem(
+                    "the photograph could not be found",
+                    f"no {describe(rows[k].image)}",
+                    f"one of the {len(photographs)} photographs",
+                    near,
+                    *rows[k].where,
+                    columns=("image",),
+                    code=Code.MISSING_FILE,
+                )
             )
     if len(best) == 0 and len(problems) > 1:
         problems = [
-            f"{table}: the photographs could not be matched by name: found none that is named like "
-            f"{describe(rows[named[0]].image)}, needed the names of files such as "
-            f"{describe(photographs[0].name)}; correct the column image, or remove it to match "
-            "rows and photographs in order."
+            Problem(
+                "the photographs could not be matched by name",
+                f"none that is named like {describe(rows[named[0]].image)}",
+                f"the names of files such as {describe(photographs[0].name)}",
+                "correct the column image, or remove it to match rows and photographs in order",
+                table,
+                code=Code.MISSING_FILE,
+            )
         ]
     raise DatasetError(problems)
 
@@ -318,21 +328,33 @@ def _named_once(
 ) -> Matching:
     """Return the pairs if every photograph has one row, and every row one photograph a view."""
     row_of: dict[str, int] = {}
-    problems = []
+    problems, undecided = [], "the photograph could not be decided"
     for k, same in found.items():
         folders = [photograph.folder for photograph in same]
         if len(set(folders)) < len(folders) or (rows[k].view and len(same) > 1):
             problems.append(
-                f"{rows[k].where}, column image: the photograph could not be decided: found "
-                f"{describe(rows[k].image)} for {few([p.name for p in same])}, needed one; write "
-                "the name with its folder and extension."
+                Problem(
+                    undecided,
+                    f"{describe(rows[k].image)} for {few([p.name for p in same])}",
+                    "one",
+                    "write the name with its folder and extension",
+                    *rows[k].where,
+                    columns=("image",),
+                    code=Code.BAD_CELL,
+                )
             )
         for photograph in same:
-            if row_of.setdefault(photograph.name, k) != k:
+            if (other := row_of.setdefault(photograph.name, k)) != k:
                 problems.append(
-                    f"{rows[k].where}, column image: the photograph could not be decided: found "
-                    f"{describe(photograph.name)} also for {rows[row_of[photograph.name]].where}, "
-                    "needed one row a photograph; add a column view, or write names with folders."
+                    Problem(
+                        undecided,
+                        f"{describe(photograph.name)} also for {rows[other].where}",
+                        "one row a photograph",
+                        "add a column view, or write names with folders",
+                        *rows[k].where,
+                        columns=("image",),
+                        code=Code.REPEATED_ROW,
+                    )
                 )
     if problems:
         raise DatasetError(problems)

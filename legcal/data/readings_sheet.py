@@ -26,7 +26,7 @@ from legcal.data.measurements import (
     readings_of_lengths,
 )
 from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import DatasetError, Place, UsageError
 from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, is_number, read_table, split_heading
@@ -109,7 +109,7 @@ class ReadingsSheet:
         return self._table.text(name)
 
     @property
-    def where(self) -> list[str]:
+    def where(self) -> list[Place]:
         """The place of each row in the file, for messages."""
         return self._table.where
 

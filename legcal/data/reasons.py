@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
+from legcal.causes import Cause
 from legcal.geometry.types import BoolArray
 
 
@@ -133,12 +134,12 @@ class Rejection:
     ----------
     reason : Reason
         The code.
-    detail : str
+    detail : str or Cause
         A name or figures for the reader; of ``PARTNER``, the code of the other outline.
     """
 
     reason: Reason = Reason.NONE
-    detail: str = ""
+    detail: str | Cause = ""
 
     def __bool__(self) -> bool:
         return self.reason is not Reason.NONE
@@ -148,14 +149,23 @@ class Rejection:
         """The reason in words, without figures and names."""
         return WORDS_BY_CODE[self.reason][0]
 
-    def __str__(self) -> str:
+    @property
+    def cause(self) -> Cause:
+        """The reason in words, with figures and names."""
         plain, detailed = WORDS_BY_CODE[self.reason]
         if not self.detail or not detailed:
-            return plain
-        detail = self.detail
+            return Cause(plain)
         if self.reason is Reason.PARTNER:
-            detail = str(read_rejection(detail, ""))
-        return detailed.format(detail)
+            return Cause(detailed, (read_rejection(str(self.detail), "").cause,))
+        return Cause(detailed, (self.detail,))
+
+    @property
+    def as_stored(self) -> Rejection:
+        """The same with the detail as tables have it: in words."""
+        return replace(self, detail=str(self.detail))
+
+    def __str__(self) -> str:
+        return str(self.cause)
 
 
 USED = Rejection()  # not rejected

@@ -1,7 +1,7 @@
 """One estimation problem for everything: variables, factors, one solver, information.
 
-Every estimate from measurements is the minimum of a :class:`Problem`; this room knows neither
-images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
+Every estimate from measurements is the minimum of an :class:`EstimationProblem`; this room knows
+neither images nor robots (:mod:`legcal.calibration.joint_fit` is its largest client):
 
 **State** A dataclass of the client with one field for each block of variables, of any type.
 
@@ -16,14 +16,14 @@ reported, ``coordinates`` and ``jacobian`` map x to the reported values where th
 their derivatives by the blocks named in ``touches``, in that order, and by the eliminated
 ``element``; ``whitening`` makes them unit Gaussians, ``robust`` applies the loss to them.
 
-**Problem** Kept variables, one block of eliminated variables (platform poses, board poses: each
-measurement touches at most one of them, and the Schur complement removes them), factors, an exact
-``constraint`` on the eliminated elements, and ``held_directions`` of the kept unknowns that are
-fixed.
+**EstimationProblem** Kept variables, one block of eliminated variables (platform poses, board
+poses: each measurement touches at most one of them, and the Schur complement removes them),
+factors, an exact ``constraint`` on the eliminated elements, and ``held_directions`` of the kept
+unknowns that are fixed.
 
 ::
 
-    problem = Problem((camera,), board_poses, (corners,))
+    problem = EstimationProblem((camera,), board_poses, (corners,))
     minimum = minimise(problem, state, Huber(3.0))  # Levenberg-Marquardt, loss narrowed on the way
     normal = information(problem, minimum.state, minimum.linear)
     covariance = named_covariance(problem, minimum.state, normal.kept_covariance())

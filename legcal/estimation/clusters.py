@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from legcal.estimation.loss import LEAST_SQUARES, Loss
-from legcal.estimation.problem import Linearization, Problem, S
+from legcal.estimation.problem import EstimationProblem, Linearization, S
 from legcal.estimation.solver import NormalEquations, inverse_on_range
 from legcal.geometry.types import Array, BoolArray, IntArray
 
@@ -117,7 +117,7 @@ class Clusters:
 
 
 def clustered(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,
     loss: Loss = LEAST_SQUARES,

@@ -387,7 +387,7 @@ class _Layout:
         )
 
 
-def _same_unknowns(layout: _Layout, problem: Problem[Any]) -> bool:
+def _same_unknowns(layout: _Layout, problem: EstimationProblem[Any]) -> bool:
     """Whether a problem has the unknowns of a layout, in the same columns."""
     return (
         layout.eliminated is problem.eliminated
@@ -414,7 +414,7 @@ def _same_touches(
 
 
 @dataclass(frozen=True, eq=False)
-class Problem(Generic[S]):
+class EstimationProblem(Generic[S]):
     """Variables, factors and constraints; see :mod:`legcal.estimation`."""
 
     variables: tuple[Variables, ...]  # kept, those with labels first
@@ -660,7 +660,7 @@ class Linearization:
 
 
 def linearize(
-    problem: Problem[S], state: S, computed_rows: Mapping[str, Residuals] | None = None
+    problem: EstimationProblem[S], state: S, computed_rows: Mapping[str, Residuals] | None = None
 ) -> Linearization:
     """Linearise a problem at a state.
 

@@ -20,8 +20,8 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import LEAST_SQUARES, Loss, PseudoHuber
 from legcal.estimation.problem import (
+    EstimationProblem,
     Linearization,
-    Problem,
     Residuals,
     S,
     Sparsity,
@@ -63,7 +63,7 @@ class Minimum(Generic[S]):
 
 
 def minimise(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     state: S,
     loss: Loss = LEAST_SQUARES,
     *,
@@ -82,7 +82,7 @@ def minimise(
     Parameters
     ----------
     problem, state, loss
-        Problem, starting values and robust loss.
+        EstimationProblem, starting values and robust loss.
     max_iterations : int
         Attempted steps.
     is_near : bool
@@ -155,7 +155,7 @@ def minimise(
     )
 
 
-def robust_cost(problem: Problem[S], linear: Linearization, loss: Loss) -> float:
+def robust_cost(problem: EstimationProblem[S], linear: Linearization, loss: Loss) -> float:
     """Return half the squares of priors and plain factors, plus the loss of robust factors."""
     plain, robust = float(linear.prior_r @ linear.prior_r), 0.0
     for factor in problem.factors:
@@ -173,7 +173,7 @@ def _with_width(loss: Loss, width: float) -> Loss:
 
 
 def _loss_for(
-    problem: Problem[S], linear: Linearization, loss: Loss, previous_width: float
+    problem: EstimationProblem[S], linear: Linearization, loss: Loss, previous_width: float
 ) -> Loss:
     """Widen the loss to a few median residuals while these exceed its final width."""
     if np.isinf(loss.width):
@@ -198,7 +198,9 @@ def _next_damping(damping: float, gain_ratio: float) -> float:
     return damping if gain_ratio > 0.25 else 4.0 * damping
 
 
-def _take_step(problem: Problem[S], state: S, step: Array) -> tuple[S, Linearization] | None:
+def _take_step(
+    problem: EstimationProblem[S], state: S, step: Array
+) -> tuple[S, Linearization] | None:
     """Take a step, shortened to the step limits; None if the new state is not defined."""
     if not np.all(np.isfinite(step)):
         return None
@@ -211,7 +213,7 @@ def _take_step(problem: Problem[S], state: S, step: Array) -> tuple[S, Lineariza
 
 
 def _correct_elements(
-    problem: Problem[S], state: S, linear: Linearization, loss: Loss, cost: float
+    problem: EstimationProblem[S], state: S, linear: Linearization, loss: Loss, cost: float
 ) -> tuple[S, Linearization] | None:
     """Move eliminated elements alone after a step that did not decrease the cost.
 
@@ -345,7 +347,7 @@ class NormalEquations:
 
 
 def normal_equations(
-    problem: Problem[S], state: S, linear: Linearization, loss: Loss = LEAST_SQUARES
+    problem: EstimationProblem[S], state: S, linear: Linearization, loss: Loss = LEAST_SQUARES
 ) -> NormalEquations:
     """Return the normal equations of the robust cost, with the curvature of the loss."""
     weighted = {}
@@ -358,7 +360,7 @@ def normal_equations(
 
 
 def information(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     state: S,
     linear: Linearization,
     loss: PseudoHuber = LEAST_SQUARES,
@@ -381,7 +383,7 @@ def information(
 
 
 def _normal_equations_of(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     state: S,
     linear: Linearization,
     weighted: dict[str, tuple[Residuals, float]],  # weight of the squares
@@ -411,7 +413,7 @@ def _normal_equations_of(
 
 
 def _summed_products(
-    kinds: list[tuple[Sparsity, Residuals, float]], problem: Problem[S]
+    kinds: list[tuple[Sparsity, Residuals, float]], problem: EstimationProblem[S]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the blocks U, W, V of J^T J and g_kept, g_elements of J^T r."""
     n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from legcal.estimation.problem import Problem, S, linearize
+from legcal.estimation.problem import EstimationProblem, S, linearize
 from legcal.geometry.types import Array, IntArray
 
 _UNKNOWN = 1e-3  # [1 / unit]: singular values up to here count as undetermined unknowns
 
 
-def information_rows(problem: Problem[S], state: S) -> Array:
+def information_rows(problem: EstimationProblem[S], state: S) -> Array:
     """Return square-root information R (m, n_kept) of the kept unknowns, elements marginalised out.
 
     R^T R is the reduced matrix of ``information`` for plain least squares.

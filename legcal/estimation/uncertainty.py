@@ -11,7 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.estimation.problem import Linearization, Problem, Residuals, S, Sparsity, linearize
+from legcal.estimation.problem import (
+    EstimationProblem,
+    Linearization,
+    Residuals,
+    S,
+    Sparsity,
+    linearize,
+)
 from legcal.estimation.solver import (
     Minimum,
     NormalEquations,
@@ -52,7 +59,7 @@ def worst_directions(
     return tuple(directions)
 
 
-def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
+def named_covariance(problem: EstimationProblem[S], state: S, covariance: Array) -> Array:
     """Return the covariance (n_named, n_named) of coordinates from that of the kept unknowns."""
     n = problem.n_named
     if problem.is_read_directly:
@@ -61,7 +68,7 @@ def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
     return np.asarray(by_x @ covariance[:n, :n] @ by_x.T)
 
 
-def named_information(problem: Problem[S], state: S, normal: NormalEquations) -> Array:
+def named_information(problem: EstimationProblem[S], state: S, normal: NormalEquations) -> Array:
     """Return the information (n_named, n_named) of coordinates, other unknowns marginalised out.
 
     Directions tied by exact constraints count as known a thousand times better than by
@@ -97,7 +104,7 @@ def _element_derivatives(normal: NormalEquations) -> Array:
 
 
 def explained_share(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,
     name: str,
@@ -143,7 +150,7 @@ def explained_share(
 
 
 def residual_changes(
-    problem: Problem[S], linear: Linearization, block: str, error: Array
+    problem: EstimationProblem[S], linear: Linearization, block: str, error: Array
 ) -> dict[str, Array]:
     """Return the change of whitened residuals (n, q) of each factor by an error of a block.
 
@@ -165,7 +172,7 @@ def residual_changes(
 
 
 def response(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,
     changes: Mapping[str, Array],
@@ -201,7 +208,7 @@ def _add_products(
         np.add.at(elements, sparsity.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
 
 
-def restricted_log_likelihood(problem: Problem[S], minimum: Minimum[S]) -> float:
+def restricted_log_likelihood(problem: EstimationProblem[S], minimum: Minimum[S]) -> float:
     """Return the log-likelihood of whitened residuals, all unknowns integrated out.
 
     At a minimum of plain squares, up to the determinants of the whitening and a constant that
@@ -221,7 +228,7 @@ def restricted_log_likelihood(problem: Problem[S], minimum: Minimum[S]) -> float
 
 
 def score_test(
-    problem: Problem[S],
+    problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,
     columns: Mapping[str, Array],
@@ -263,12 +270,12 @@ def score_test(
     return score, projected
 
 
-def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Array]:
+def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple[Array, Array]:
     """Return the scores of a block of random effects at zero effects.
 
     Parameters
     ----------
-    problem : Problem
+    problem : EstimationProblem
         Contains the block as the last named one; each of its unknowns has a prior of mean zero.
     state : S
         Near a minimum of the problem with some of the effects or none; the Gauss-Newton step from

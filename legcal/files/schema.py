@@ -26,7 +26,8 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
-from legcal.errors import BadValue, DatasetError, Problem
+from legcal.causes import Cause
+from legcal.errors import BadValue, Code, DatasetError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
 _MOST_NAMES = 10  # that a hint lists
@@ -190,20 +191,24 @@ def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
 
 def content_of(path: Path, what: str) -> bytes:
     """Return the bytes of a file, or refuse it in a sentence."""
-    unread, remedy = f"the {what} could not be read", f"check the path of the {what}"
+    unread = Problem(
+        f"the {what} could not be read",
+        remedy=f"check the path of the {what}",
+        file=str(path),
+        code=Code.UNREADABLE_FILE,
+    )
     if not os.path.isfile(path):  # unlike that of a Path, False where a name is too long
         found = "a folder" if os.path.isdir(path) else "no such file"
-        raise DatasetError(Problem(unread, found, "a file", remedy, str(path)))
+        raise DatasetError(replace(unread, found=found, needed="a file", code=Code.MISSING_FILE))
     try:
         return read_bytes(path, MAX_TEXT)
     except TooLarge as error:
-        needed = f"at most {MAX_TEXT}"
-        raise DatasetError(
-            Problem(unread, str(error.strerror), needed, remedy, str(path))
-        ) from error
+        bad = replace(unread, found=str(error.strerror), needed=f"at most {MAX_TEXT}")
+        raise DatasetError(bad) from error
     except OSError as error:
-        found, remedy = f"'{error.strerror}'", f"{remedy} and its permissions"
-        raise DatasetError(Problem(unread, found, "a readable file", remedy, str(path))) from error
+        remedy = f"{unread.remedy} and its permissions"
+        bad = replace(unread, found=f"'{error.strerror}'", needed="a readable file", remedy=remedy)
+        raise DatasetError(bad) from error
 
 
 def read_yaml(path: Path, what: str) -> dict[str, Any]:
@@ -213,7 +218,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
-    unread = Problem(f"the {what} could not be read", file=str(path))
+    unread = Problem(f"the {what} could not be read", file=str(path), code=Code.BAD_SYNTAX)
     try:
         found = _loaded(content)
     except yaml.MarkedYAMLError as error:
@@ -308,14 +313,20 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
     place = ".".join([*[prefix] * bool(prefix), *map(str, steps)]) or "the file"
     context = error.get("ctx", {})
 
-    def refused(found: str, needed: str, remedy: str, done: str = "read") -> Problem:
+    def refused(
+        found: str | Cause,
+        needed: str,
+        remedy: str,
+        done: str = "read",
+        code: Code = Code.BAD_VALUE,
+    ) -> Problem:
         what = f"{place} could not be {done}"
-        return Problem(what, found, needed, remedy, str(path), name=place)
+        return Problem(what, found, needed, remedy, str(path), name=place, code=code)
 
     match error["type"]:
         case "extra_forbidden":
             remedy = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
-            return refused("an unknown key", "", remedy, "used")
+            return refused("an unknown key", "", remedy, "used", Code.UNKNOWN_KEY)
         case "missing" if is_short:
             return refused(f"{loc[-1]} numbers", "more", "add what is missing")
         case "missing":
@@ -323,12 +334,13 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
             words = typing.get_args(known) if typing.get_origin(known) is Literal else ()
             value = " or ".join(map(str, words))
             remedy = f"add '{loc[-1]}: {value or '...'}' to the file"
-            return refused("no such key", value or "it", remedy)
+            return refused("no such key", value or "it", remedy, code=Code.MISSING_KEY)
         case "value_error":
             bad = context["error"]
             if isinstance(bad, BadValue):
                 return refused(bad.found, bad.needed, bad.remedy, "used")
-            return Problem(f"{place} could not be used: {bad}", file=str(path), name=place)
+            what = f"{place} could not be used: {bad}"
+            return Problem(what, file=str(path), name=place, code=Code.BAD_VALUE)
         case "greater_than":
             needed = f"a number greater than {context['gt']:g}"
         case "less_than":

@@ -14,7 +14,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.errors import DatasetError, Problem
+from legcal.errors import HEADER, Code, DatasetError, Place, Problem
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
     NAME_NEEDED,
@@ -112,9 +112,10 @@ class Table:
         return [f"row {row} (line {line})" for row, line in numbers]
 
     @property
-    def where(self) -> list[str]:
+    def where(self) -> list[Place]:
         """The place of each row with its file."""
-        return [f"{self.path}, {place}" for place in self.places]
+        rows = zip(self._rows, self._lines, strict=True)
+        return [Place(str(self.path), row, line) for row, line in rows]
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column; empty ones of a column that is not there."""
@@ -138,7 +139,14 @@ class Table:
         return np.column_stack(columns) if columns else np.zeros((len(self), 0))
 
     def refuse(
-        self, row: int, found: str, needed: str, *columns: str, remedy: str = "", what: str = ""
+        self,
+        row: int,
+        found: str,
+        needed: str,
+        *columns: str,
+        remedy: str = "",
+        what: str = "",
+        code: Code | None = None,
     ) -> None:
         """Refuse a row, cells of some columns or all of it."""
         self._problems.append(
@@ -151,6 +159,7 @@ class Table:
                 self._rows[row],
                 self._lines[row],
                 columns,
+                code=code or (Code.BAD_CELL if columns else Code.BAD_ROW),
             )
         )
 
@@ -179,7 +188,8 @@ class Table:
         for row, key in enumerate(keys):
             if key is not None and first.setdefault(key, row) != row:
                 earlier = self.places[first[key]]
-                self.refuse(row, f"{same} in {earlier}", "it once", remedy="remove one of them")
+                found, remedy = f"{same} in {earlier}", "remove one of them"
+                self.refuse(row, found, "it once", remedy=remedy, code=Code.REPEATED_ROW)
 
     def keep(self, rows: BoolArray) -> None:
         """Leave out all but some rows, and what is wrong with the others."""
@@ -244,7 +254,7 @@ def read_table(
     *,
     needed: str = "",
     remedy: str = "",
-    unknown: Callable[[str], str] = lambda name: "",
+    unknown: Callable[[str], Problem | None] = lambda name: None,
     reshape: Callable[[Lines], Lines] | None = None,
 ) -> Table:
     """Return a CSV file as a table, with the problems of its cells still to be raised.
@@ -256,47 +266,52 @@ def read_table(
     if reshape is not None and lines:
         lines = reshape(lines)
     if needed and len(lines) < 2:
+        found = f"{'a' if lines else 'no'} header and no row"
         raise DatasetError(
-            f"{path}: the {what} could not be used: found {'a' if lines else 'no'} header and no "
-            f"row, needed {needed}."
+            Problem(
+                f"the {what} could not be used", found, needed, file=str(path), code=Code.NO_ROW
+            )
         )
     header = lines[0][1] if lines else []
     other = re.search(r"[;\t]", header[0]) if len(header) == 1 else None
     if other:
-        raise DatasetError(
-            f"{path}, header: the columns could not be used: found {other[0]!r} between columns, "
-            "needed ',' there and '.' in numbers; save it again with commas (CSV)."
-        )
+        found, needed = f"{other[0]!r} between columns", "',' there and '.' in numbers"
+        again = "save it again with commas (CSV)"
+        raise DatasetError(header_problem(path, found, needed, again, Code.BAD_SYNTAX))
     known = {column.name: column for column in columns}
-    problems = _of_header(header, known, what, remedy, unknown)
-    if problems:
-        start = f"{path}, header: the columns could not be used: found"
-        raise DatasetError([f"{start} {problem}" for problem in problems])
+    if problems := list(_of_header(path, header, known, what, remedy, unknown)):
+        raise DatasetError(problems)
     table = Table(path, thing, [known[name] for name in header])
     table._add(lines[1:], header)
     return table
 
 
+def header_problem(path: Path, found: str, needed: str, remedy: str, code: Code) -> Problem:
+    """Return what is wrong with the header of a table."""
+    what = "the columns could not be used"
+    return Problem(what, found, needed, remedy, str(path), HEADER, code=code)
+
+
 def _of_header(
+    path: Path,
     header: Sequence[str],
     known: dict[str, Column],
     what: str,
     remedy: str,
-    unknown: Callable[[str], str],
-) -> list[str]:
-    """Return what is wrong with the names of columns, each cause once."""
+    unknown: Callable[[str], Problem | None],
+) -> Iterator[Problem]:
+    """Yield what is wrong with the names of columns, each cause once."""
     strange = [name for name in dict.fromkeys(header) if name not in known]
-    problems = [said for name in strange if (said := unknown(name))]
+    yield from (problem for name in strange if (problem := unknown(name)))
     if others := [name for name in strange if not unknown(name)]:
         near = dict.fromkeys(one for name in others if (one := nearest(name, known)))
         hint = f"did you mean {_names(near)}?" if near else closest(others[0], known)
-        words = f"the unknown column{'s' * (len(others) > 1)} {_names(others)}"
-        problems.append(f"{words}, needed those of a {what}; {hint}")
-    problems += [
-        f"the column '{name}' {header.count(name)} times, needed it once; remove one."
-        for name in known
-        if header.count(name) > 1
-    ]
+        found = f"the unknown column{'s' * (len(others) > 1)} {_names(others)}"
+        yield header_problem(path, found, f"those of a {what}", hint, Code.UNKNOWN_COLUMN)
+    for name in known:
+        if header.count(name) > 1:
+            found = f"the column '{name}' {header.count(name)} times"
+            yield header_problem(path, found, "it once", "remove one", Code.REPEATED_COLUMN)
     groups = {known[name].group for name in header if name in known} - {""}
     missing: dict[str, list[str]] = {}  # by what they are
     for name, column in known.items():
@@ -305,11 +320,9 @@ def _of_header(
             missing.setdefault(f" ({says})" if says else "", []).append(name)
     for says, names in missing.items():
         s, it = ("s", "them") if len(names) > 1 else ("", "it")
-        problems.append(
-            f"no column{s} {_names(names)}, needed {it}{says}; add the column{s}"
-            f"{f', or {remedy}' if remedy else ''}."
-        )
-    return problems
+        add = f"add the column{s}{f', or {remedy}' if remedy else ''}"
+        found = f"no column{s} {_names(names)}"
+        yield header_problem(path, found, f"{it}{says}", add, Code.MISSING_COLUMN)
 
 
 def _names(names: Iterable[str]) -> str:

@@ -458,23 +458,21 @@ def _rod(
     places = _places(axes, within)
     if len(places) == 2:
         raise problems[len(places[0])]
-    what = (
-        f"no slider and {len(places)} joints in different places, so that the rod hangs on a "
-        "moving arm and the joint at A moves"
-        if len(places) > 2
-        else "no slider and all joints in one place"
-    )
+    several = len(places) > 2
+    where = f"{len(places)} joints in different places" if several else "all joints in one place"
     if on is not None:
         raise OutOfClass(
-            f"the leg of motor '{on}' is outside the method: found {what.split(',')[0]} beyond it, "
-            "needed a rod of constant length with a joint at each end; this machine cannot be "
+            f"the leg of motor '{on}' is outside the method: found no slider and {where} beyond "
+            "it, needed a rod of constant length with a joint at each end; this machine cannot be "
             "calibrated this way."
         )
+    hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
     raise OutOfClass(
-        f"the leg of joint '{leg}' is outside the method: found {what}, needed a joint whose "
-        "centre is fixed in the base, then a slider or a rod of constant length, and a joint whose "
-        "centre is fixed in the platform, or a motor that moves the joint at A; name this motor in "
-        "name_mot, otherwise the machine cannot be calibrated this way."
+        f"the leg of joint '{leg}' is outside the method: found no slider and {where}{hangs}, "
+        "needed a joint whose centre is fixed in the base, then a slider or a rod of constant "
+        "length, and a joint whose centre is fixed in the platform, or a motor that moves the "
+        "joint at A; name this motor in name_mot, otherwise the machine cannot be calibrated this "
+        "way."
     )
 
 

@@ -91,6 +91,12 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
 
     Others are ``offset of leg 3``, ``direction of rail1`` and ``fx of camera c1``.
     """
+    several = {_split(name, leg_names)[:2] for name in parameters}
+    return parameters_in_words(parameters, leg_names) + " together" * (len(several) > 1)
+
+
+def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
+    """Return parameters in words, those of one kind together: ``z of platform joints 2 and 4``."""
     coordinates: dict[tuple[str, str], list[str]] = {}
     for name in parameters:
         owner, kind, which = _split(name, leg_names)
@@ -111,8 +117,7 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
     if len(phrases) > _MAX_GROUPS:
         more = len(phrases) - _MAX_GROUPS + 1
         phrases = [*phrases[: _MAX_GROUPS - 1], f"{more} more such changes"]
-    together = " together" if len(coordinates) > 1 else ""
-    return f"{list_in_words(phrases)}{together}"
+    return list_in_words(phrases)
 
 
 def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:

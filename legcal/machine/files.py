@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from legcal.errors import DatasetError, ModelError, Problem
+from legcal.errors import Code, DatasetError, ModelError, Problem
 from legcal.files.folder import RESULT
 from legcal.files.schema import content_of
 
@@ -79,6 +79,7 @@ def find_model(model: str | Path) -> Path:
             f"a mechanism YAML, its URDF, or one of {', '.join(names)}",
             "check the path",
             str(path),
+            code=Code.MISSING_FILE,
         )
     )
 
@@ -108,6 +109,7 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
             f"the URDF of the mechanism could not be found: looked for {near[0]} and "
             f"{near[1]}, needed one of them; write its path in legcal.urdf.",
             file=str(yaml_path),
+            code=Code.MISSING_FILE,
         )
     )
 

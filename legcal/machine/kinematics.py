@@ -301,7 +301,7 @@ def _disagreement(
     return DidNotConverge(
         Problem(
             f"the pose at the readings{which} could not be computed",
-            found[0].in_words(machine),
+            str(found[0].cause(machine)),
             "",
             "check this reading, its encoder and the offset of the leg",
             str(machine.yaml_path),

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
+from legcal.causes import Cause
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
@@ -87,17 +88,19 @@ class Contradiction:
     distances: tuple[float, ...]  # how far each, alone wrong, is from there [m at a joint]
     allowed: float  # how far that of the first may be if readings agree [m]
 
-    def in_words(self, machine: Machine) -> str:
-        """Describe how far the redundant readings disagree, and how far they may."""
+    def cause(self, machine: Machine) -> Cause:
+        """Return how far the redundant readings disagree, and how far they may."""
         legs = [machine.legs[j] for j in self.legs]
         first, *others = [leg.motor_label for leg in legs]
-        also = zip(others, self.distances[1:], strict=True)
-        words = ", ".join(f"{name} by {1e3 * distance:.1f} mm" for name, distance in also)
-        alike = f" (or as likely one of {words})" if others else ""
+        off, *distances = [1e3 * distance for distance in self.distances]
+        also = list(zip(others, distances, strict=True))
+        words = ", ".join(["{} by {:.1f} mm"] * len(also))
+        alike = f" (or as likely one of {words})" if also else ""
         whose = "leg" if legs[0].actuator is None else "motor"
-        return (
-            f"the reading of {whose} '{first}'{alike} {1e3 * self.distances[0]:.1f} mm from where "
-            f"the other motors put it, needed at most {1e3 * self.allowed:.1f} mm"
+        return Cause(
+            f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from where the other motors put it, "
+            "needed at most {:.1f} mm",
+            (first, *(one for pair in also for one in pair), off, 1e3 * self.allowed),
         )
 
 

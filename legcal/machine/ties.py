@@ -23,7 +23,7 @@ import numpy as np
 
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import SHOWN, describe_direction, sparse_basis
+from legcal.machine.directions import SHOWN, parameters_in_words, sparse_basis
 from legcal.machine.equations import (
     PoseEquations,
     n_pose_constraints,
@@ -253,7 +253,7 @@ def ties_in_words(machine: Machine) -> str | None:
 
 def _named(parameters: Sequence[str], machine: Machine) -> str:
     """Return parameters in words."""
-    return describe_direction(parameters, machine.leg_names).removesuffix(" together")
+    return parameters_in_words(parameters, machine.leg_names)
 
 
 def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) -> PoseEquations:

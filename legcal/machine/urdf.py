@@ -13,7 +13,7 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
-from legcal.errors import ModelError, Problem
+from legcal.errors import Code, ModelError, Problem
 from legcal.files.schema import NAME_NEEDED, describe, is_name
 from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
@@ -75,6 +75,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
                 "well-formed XML; mend that line, or copy the file again if it was cut off.",
                 file=str(path),
                 line=line,
+                code=Code.BAD_SYNTAX,
             )
         ) from error
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
@@ -154,6 +155,7 @@ class Problems:
                 file=str(self.path),
                 line=cast("int", element.sourceline),
                 name=name,
+                code=Code.BAD_ELEMENT,
             )
         )
 

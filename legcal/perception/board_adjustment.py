@@ -17,10 +17,10 @@ from legcal.estimation.clusters import Clusters, clustered
 from legcal.estimation.loss import Huber
 from legcal.estimation.problem import (
     NO_PRIOR,
+    EstimationProblem,
     Factor,
     Frames,
     GaussianPrior,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -167,7 +167,7 @@ def adjust_board(
 
 def _problem(
     camera: Camera, names: tuple[str, ...], sheet: Sheet | None, seen: BoardImages, n_images: int
-) -> Problem[_State]:
+) -> EstimationProblem[_State]:
     """Return the problem of the board's poses, named intrinsics and the sheet, where it is one."""
     blocks = [_intrinsics(camera, names)]
     if sheet is not None:
@@ -191,7 +191,7 @@ def _problem(
         1.0 / seen.sigma_px[:, None, None],
         robust=True,
     )
-    return Problem[_State](
+    return EstimationProblem[_State](
         variables=tuple(blocks),
         eliminated=Variables("board_pose", all_free(n_images, 6), Frames.moved),
         factors=(corners,),

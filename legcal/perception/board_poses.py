@@ -19,7 +19,7 @@ from legcal.data.corners import Corners
 from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements, few, row_names
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError, NotVisible, Problem
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import BoardImages, adjust_board
 from legcal.vision.board import Board
@@ -97,7 +97,7 @@ def camera_poses_by_board(
     by the camera file, or the board moved between images of a view.
     """
     T_board_camera: list[RigidTransform | None] = []
-    problems: dict[type[DatasetError] | type[NotVisible], list[str]] = {}
+    problems: dict[type[DatasetError] | type[NotVisible], list[Problem]] = {}
     for v, view in enumerate(measurements.views):
         here = np.flatnonzero((measurements.view[corners.row] == v) & corners.used)
         pose = None
@@ -105,22 +105,27 @@ def camera_poses_by_board(
             pose = _joint_pose(view.name, corners.choose(here), board, measurements)
         except (DatasetError, NotVisible) as error:
             if isinstance(error, DatasetError) or view.name in needed:
-                problems.setdefault(type(error), []).extend(error.problems)
+                problems.setdefault(type(error), []).extend(error.facts)
         else:
             if pose is None and view.name in needed:
                 n = int(np.sum(measurements.view == v))
                 problems.setdefault(NotVisible, []).append(
-                    f"view {view.name}: its camera could not be placed: found {MIN_CORNERS} "
-                    f"corners of the board or more in none of its {n} image{'s' * (n != 1)}, "
-                    "needed them in one; turn the camera so that it sees the board"
-                    f"{', all of its rim' * (board.kind == 'chessboard')}, or check what the "
-                    "dataset file says of the board."
+                    Problem(
+                        f"view {view.name}: its camera could not be placed",
+                        f"{MIN_CORNERS} corners of the board or more in none of its {n} image"
+                        f"{'s' * (n != 1)}",
+                        "them in one",
+                        "turn the camera so that it sees the board"
+                        f"{', all of its rim' * (board.kind == 'chessboard')}, or check what the "
+                        "dataset file says of the board",
+                        name=view.name,
+                    )
                 )
         T_board_camera.append(None if pose is None else pose.T_camera_plane.inv())
         if pose is not None:
             corners = _without_outliers(corners, here, pose)
-    for kind, sentences in problems.items():
-        raise kind(sentences)
+    for kind, of_kind in problems.items():
+        raise kind(of_kind)
     return tuple(T_board_camera), corners
 
 
@@ -135,7 +140,7 @@ def board_poses_in_images(
     """
     T_camera_board: dict[int, RigidTransform] = {}
     places = np.stack([measurements.view, measurements.pose], axis=1)[corners.row]
-    wrong: list[str] = []
+    wrong: list[Problem] = []
     for v, pose_number in np.unique(places[corners.used], axis=0).tolist():
         of_place = np.all(places == (v, pose_number), axis=1)
         here = np.flatnonzero(of_place & corners.used)
@@ -146,7 +151,7 @@ def board_poses_in_images(
         except NotVisible:
             continue
         except DatasetError as error:
-            wrong += error.problems
+            wrong += error.facts
             corners = corners.reject(of_place, Reason.NO_BOARD_POSE)
             continue
         if pose is not None:
@@ -296,15 +301,17 @@ def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> b
     return bool(d @ np.linalg.solve(covariance, d) < limit)
 
 
-def _another_board(name: str, board: Board, found: str, needed: str) -> str:
+def _another_board(name: str, board: Board, found: str, needed: str) -> Problem:
     """Return that corners are not those of this board by the camera file."""
     sizes = {
         "chessboard": "the numbers of squares",
         "charuco": "the numbers of squares, marker and square",
         "aprilgrid": "the numbers of tags and tag_spacing",
     }[board.kind]
-    return (
-        f"view {name}: its camera could not be placed by the corners of the board: found {found} "
-        f"the {board.kind} of the dataset file, needed {needed}; check {sizes} there, and that the "
-        "camera file is of this camera and lens."
+    return Problem(
+        f"view {name}: its camera could not be placed by the corners of the board",
+        f"{found} the {board.kind} of the dataset file",
+        needed,
+        f"check {sizes} there, and that the camera file is of this camera and lens",
+        name=name,
     )

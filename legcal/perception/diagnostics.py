@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.image_causes import by_cause, images_in_words
+from legcal.causes import Cause, by_cause
+from legcal.data.image_causes import images_in_words
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, is_edited
@@ -31,7 +32,7 @@ from legcal.perception.pair_matching import (
     leg_segments,
     match_pairs,
 )
-from legcal.perception.placement import Placement, Search, sensor_extent
+from legcal.perception.placement import NotPlaced, Placement, Search, sensor_extent
 from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
@@ -52,8 +53,8 @@ N_REFERENCES = 3  # good images that others are compared with
 MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
 GOOD_PERCENTILE = 75.0  # of the shares that images show, for what good ones do
 MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
-TAKE_AGAIN = "take it again"  # a remedy
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
+NO_OUTLINE = Rejection(Reason.OTHER, "no outline is used")
 
 MILLIMETRE = 1e-3  # [m]
 # Axes of cameras in other software, as columns the x, y and z of ours in them.
@@ -109,18 +110,20 @@ def find_wrong_images(
     usual = _usual(search, placement, found, suspects, run)
     task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
-    single = {row: str(why) for row, why in sorted(defects.items()) if view[row] not in defective}
-    notes = left_out_notes(search.measurements, single, dict.fromkeys(single, TAKE_AGAIN))
-    why, remedies, barely = dict[int, str](), dict[int, str](), dict[int, str]()
+    single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
+    notes = defect_notes(search.measurements, single)
+    left_out, barely = dict[int, Cause](), dict[int, Cause]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
-        reason, said, remedy = image_verdict(search.measurements, row, explanation, usual, found)
+        reason, said = image_verdict(search.measurements, row, explanation, usual, found)
+        if reason:
+            reasons[row] = reason
         if reason.reason is Reason.OTHER_SCENE:
-            reasons[row], barely[row] = reason, f"was left out: {said}; {remedy}."
+            barely[row] = Cause("was left out: {}.", (said,))
         elif reason:
-            reasons[row], why[row], remedies[row] = reason, said, remedy
+            left_out[row] = said
         else:
-            barely[row] = f"{said}; {remedy}."
-    notes += left_out_notes(search.measurements, why, remedies)
+            barely[row] = Cause("{}.", (said,))
+    notes += _left_out_notes(search.measurements, left_out)
     notes += _leg_notes(search, placement, outlines, found, reasons)
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
@@ -133,7 +136,7 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outli
     """
     out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
     reason = tuple(
-        reasons[row] if is_out and why.reason not in NOT_IN_SIGHT else why
+        reasons[row].as_stored if is_out and why.reason not in NOT_IN_SIGHT else why
         for row, is_out, why in zip(
             outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
         )
@@ -166,15 +169,18 @@ def _without_views(
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
-        own = {row: str(why) for row, why in defects.items() if measurements.view[row] == v}
-        why = "; ".join(what for what, _ in by_cause(own))
-        if len(own) == 1:
-            why = f"{measurements.image[next(iter(own))]}: {why}"
+        own = {row: why.cause for row, why in defects.items() if measurements.view[row] == v}
+        images = [f"{measurements.image[row]}: " for row in own] if len(own) == 1 else []
+        causes = [cause for cause, _ in by_cause(own)]
         cameras[v] = None
-        unplaced[name] = (
-            f"view {name}: its camera could not be placed: found nothing to see in its {len(own)} "
-            f"image{'s' * (len(own) != 1)} ({why}), "
-            "needed photographs of the legs; take them again."
+        unplaced[name] = NotPlaced(
+            name,
+            Cause(
+                f"its camera could not be placed: found nothing to see in its {{}} image"
+                f"{'s' * (len(own) != 1)} ({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}), "
+                "needed photographs of the legs; take them again.",
+                (len(own), *images, *causes),
+            ),
         )
     return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)
 
@@ -185,32 +191,34 @@ def image_verdict(
     explanation: ImageExplanation,
     usual: Mapping[int, float],
     found: Mapping[int, OutlineCount],
-) -> tuple[Rejection, str, str]:
-    """Return why an image is left out, false if it is not, what is said of it, and what to do."""
-    count = found[row]
-    much = f"{count.used} of {count.visible} outlines where its reading has the legs"
+) -> tuple[Rejection, Cause]:
+    """Return why an image is left out, false if it is not, and what is said of it and to do."""
     if explanation.reason:
-        return explanation.reason, str(explanation.reason), explanation.remedy
+        return explanation.reason, Cause("{}; {}", (explanation.reason.cause, explanation.remedy))
+    much = Cause("{} of {} outlines where its reading has the legs", tuple(found[row]))
     view = int(measurements.view[row])
     if explanation.own >= SHARE_OF_OTHERS * usual[view]:
-        shows = f"shows little of the legs: found {much}, in other images most"
-        return USED, shows, "look at its light and sharpness"
-    return (
-        Rejection(Reason.OTHER_SCENE),
-        f"found {much}, and nothing else that it shows",
-        "check that it is a photograph of this machine, taken by this camera at this reading",
+        little = "shows little of the legs: found {}, in other images most; look at its light and "
+        return USED, Cause(little + "sharpness", (much,))
+    nothing = (
+        "found {}, and nothing else that it shows; check that it is a photograph of this machine, "
+        "taken by this camera at this reading"
     )
+    return Rejection(Reason.OTHER_SCENE), Cause(nothing, (much,))
 
 
-def left_out_notes(
-    measurements: Measurements, why: Mapping[int, str], remedy: Mapping[int, str]
-) -> list[str]:
+def defect_notes(measurements: Measurements, defects: Mapping[int, Rejection]) -> list[str]:
+    """Return one sentence for each thing that is wrong with single images, by row."""
+    again = {row: Cause("{}; take it again", (why.cause,)) for row, why in defects.items()}
+    return _left_out_notes(measurements, again)
+
+
+def _left_out_notes(measurements: Measurements, why: Mapping[int, Cause]) -> list[str]:
     """Return one sentence for each cause for which images were left out, by row."""
-    said = {row: f"{text}; {remedy[row]}" for row, text in why.items()}
     notes = []
-    for what, rows in by_cause(said):
+    for cause, rows in by_cause(why):
         verb = ": was left out" if len(rows) == 1 else " were left out, all for one reason"
-        notes.append(f"{images_in_words(measurements, rows)}{verb}: {what}.")
+        notes.append(f"{images_in_words(measurements, rows)}{verb}: {cause}.")
     return notes
 
 
@@ -219,18 +227,19 @@ def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
     found = {}
     for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
         own = np.flatnonzero(outlines.row == row)
-        if not outlines.used[own].any():
-            reasons = Counter(
-                why
-                for i in own.tolist()
-                if (why := outlines.reason[i]) and why.reason not in NOT_IN_SIGHT
-            )
-            found[row] = (
-                reasons.most_common(1)[0][0]
-                if reasons
-                else Rejection(Reason.OTHER, "no outline is used")
-            )
+        if outlines.used[own].any():
+            continue
+        shown = [why for i in own.tolist() if (why := outlines.reason[i])
+                 and why.reason not in NOT_IN_SIGHT]  # fmt: skip
+        found[row] = _most_common(shown or [NO_OUTLINE])
     return found
+
+
+def _most_common(rejections: Sequence[Rejection]) -> Rejection:
+    """Return the reason of most, with its detail where it is that of all of them."""
+    reason = Counter(why.reason for why in rejections).most_common(1)[0][0]
+    details = {why.detail for why in rejections if why.reason is reason}
+    return Rejection(reason, details.pop() if len(details) == 1 else "")
 
 
 def share_shown(
@@ -277,7 +286,7 @@ def explain(
     ]
     share = max(share for share, _ in zooms)
     zoom = float(np.median([z for own, z in zooms if own == share]))
-    tried.append((share, Rejection(Reason.ZOOMED, f"{zoom:.2f}"), _ORIGINAL))
+    tried.append((share, Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,))), _ORIGINAL))
     rows = _other_readings(search, row)
     readings = [
         (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
@@ -464,10 +473,10 @@ def _leg_notes(
             mine = own & (outlines.leg == leg)
             if leg in used or not used or not mine.any():
                 continue
-            why = Counter(outlines.reason[i] for i in np.flatnonzero(mine).tolist())
+            why = _most_common([outlines.reason[i] for i in np.flatnonzero(mine).tolist()])
             notes.append(
                 f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
-                f"outline that can be used ({why.most_common(1)[0][0]}); look at legcal detect, "
+                f"outline that can be used ({why}); look at legcal detect, "
                 "or leave it out there."
             )
         good = {row: found[row] for row in rows}

@@ -26,9 +26,9 @@ from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import (
+    EstimationProblem,
     Factor,
     GaussianPrior,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -569,7 +569,7 @@ def _fitted(
     )
     each, n_model = np.arange(len(keys)), model(state).r.shape[1]
     for tolerance in FITTED:
-        problem = Problem[_State](
+        problem = EstimationProblem[_State](
             (of_cameras,),
             Variables("poses", all_free(len(keys), 6), poses_after),
             (

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from legcal.causes import Cause
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.light import reduce
@@ -62,11 +63,11 @@ class Exposure:
     def defect(self) -> Rejection:
         """Why nothing can be seen in the image; false if something may."""
         if self.bright < BLACK:
-            return Rejection(Reason.BLACK, f"{self.bright:.0f}")
+            return Rejection(Reason.BLACK, Cause("{:.0f}", (self.bright,)))
         if self.dark > WHITE:
-            return Rejection(Reason.OVEREXPOSED_IMAGE, f"{self.dark:.0f}")
+            return Rejection(Reason.OVEREXPOSED_IMAGE, Cause("{:.0f}", (self.dark,)))
         if self.range < MIN_RANGE:
-            return Rejection(Reason.EMPTY, f"{self.range:.0f}")
+            return Rejection(Reason.EMPTY, Cause("{:.0f}", (self.range,)))
         return USED
 
 
@@ -171,7 +172,6 @@ def image_defects(
         usual = float(np.percentile(others, USUAL_PERCENTILE))
         factor, more = MAX_BLUR_OF_OTHERS
         if blur > max(factor * usual, usual + more):
-            found[row] = Rejection(
-                Reason.BLURRED, f"{blur:.1f} px, the others of its {whose} by {usual:.1f}"
-            )
+            detail = Cause("{:.1f} px, the others of its {} by {:.1f}", (blur, whose, usual))
+            found[row] = Rejection(Reason.BLURRED, detail)
     return found

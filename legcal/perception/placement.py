@@ -10,12 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.image_causes import by_cause, image_notes
+from legcal.causes import Cause, by_cause
+from legcal.data.image_causes import image_notes
 from legcal.data.measurements import Measurements, few_views
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -210,6 +212,16 @@ def placed_arms(
     return found
 
 
+class NotPlaced(NamedTuple):
+    """Why a view, or all that are placed together, has no camera."""
+
+    view: str  # or the name of the group
+    why: Cause
+
+    def __str__(self) -> str:
+        return f"view {self.view}: {self.why}"
+
+
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Where cameras and joint centres are estimated to be, and how far outlines may be from there.
@@ -229,11 +241,11 @@ class Placement:
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
     moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
-    unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
+    unplaced: dict[str, NotPlaced] = field(default_factory=dict)  # by the names of views
     notes: tuple[str, ...] = ()  # what else a reader should know
     # What is said of images that show little or nothing of the legs, by row: near a fit they may
     # show more
-    barely: Mapping[int, str] = field(default_factory=dict)
+    barely: Mapping[int, Cause] = field(default_factory=dict)
     # by the legs that have them as parts; looked for once cameras are placed
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
@@ -274,21 +286,12 @@ class Placement:
         return (*unplaced_notes(self.unplaced), *self.notes, *on_images)
 
 
-def unplaced_notes(unplaced: Mapping[str, str]) -> list[str]:
+def unplaced_notes(unplaced: Mapping[str, NotPlaced]) -> list[str]:
     """Return why views have no camera, by name, one sentence a cause."""
-    said: dict[str, list[str]] = {}
-    for name, what in unplaced.items():
-        said.setdefault(what, []).append(name)
-    alone = {k: what for k, (what, names) in enumerate(said.items()) if len(names) == 1}
-    named = [names[0] for names in said.values()]
-    without = {k: what.removeprefix(f"view {named[k]}: ") for k, what in alone.items()}
-    notes = [what for what, names in said.items() if len(names) > 1]
-    for what, places in by_cause(without):
-        if len(places) == 1:
-            notes.append(alone[places[0]])
-        else:
-            notes.append(f"{few_views([named[k] for k in places])}, each: {what}")
-    return notes
+    return [
+        f"{few_views(views)}{', each' * (len(views) > 1)}: {why}"
+        for why, views in by_cause({one.view: one.why for one in unplaced.values()})
+    ]
 
 
 @dataclass(frozen=True, eq=False)

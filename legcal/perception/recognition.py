@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.causes import Cause
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
@@ -35,7 +36,14 @@ from legcal.perception.camera_search import (
 )
 from legcal.perception.detection import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture
-from legcal.perception.placement import Group, Joined, Placement, Search, group_views
+from legcal.perception.placement import (
+    Group,
+    Joined,
+    NotPlaced,
+    Placement,
+    Search,
+    group_views,
+)
 from legcal.perception.radii import (
     CONVERGED,
     MAX_ITERATIONS,
@@ -64,6 +72,12 @@ MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of
 # themselves, of a single image, and from which on no margin is needed.
 RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
+TWO_POSES = (
+    "its camera could not be placed: found two poses at which its images show the legs about as "
+    "well ({:.1f} and {:.1f} legs an image; {:.0f} mm and {:.0f} deg apart), needed one; add "
+    "images at readings that differ more between the legs, or clicks on its joints "
+    f"({LANDMARKS_NAME})."
+)
 
 
 def place_views(
@@ -401,7 +415,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
     """Put the views together, with the reasons of those that could not be placed."""
     search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
-    T, unplaced = list(found.hints), dict[str, str]()
+    T, unplaced = list(found.hints), dict[str, NotPlaced]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
     error: Array = np.full((len(views), search.n_legs), JOINT_ERROR)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
@@ -421,7 +435,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
         names = [views[v].name for v in group.views]
         if g in exchanged or not one.is_convincing:
             hinted, mirror = group.hint is not None, g in exchanged
-            why = _problem(group_name(names), one, hinted, is_mirrored=mirror)
+            why = NotPlaced(group_name(names), _why_not_placed(one, hinted, is_mirrored=mirror))
             unplaced |= dict.fromkeys(names, why)
             for v in group.views:
                 T[v] = None
@@ -434,46 +448,48 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
-def _problem(name: str, placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> str:
-    """Say why a view could not be placed."""
+def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> Cause:
+    """Return why a view could not be placed."""
     if is_mirrored:
-        return (
-            f"view {name}: its camera could not be placed: found that its images show the legs if "
+        return Cause(
+            "its camera could not be placed: found that its images show the legs if "
             "left and right are exchanged, needed photographs as the camera took them; replace "
             "mirrored images by the originals, or check what may look the same: the order of the "
             "columns of readings, and the signs of y in the model."
         )
     where = "near its rough pose or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:
-        return (
-            f"view {name}: its camera could not be placed: found no pair of edges in its images "
+        return Cause(
+            "its camera could not be placed: found no pair of edges in its images "
             "that could be a leg, needed legs; check that the photographs show the machine, "
             "sharp and neither black nor overexposed."
         )
-    legs, n = float(placed.support[0].mean()), placed.expected[0].mean()
+    legs, n = float(placed.support[0].mean()), float(placed.expected[0].mean())
     clicked = "" if hinted else f"; or click its joints ({LANDMARKS_NAME})"
     if not placed.is_enough:
-        return (
-            f"view {name}: its camera could not be placed: found no pose {where} at which its "
-            f"images show the legs (at the best one {legs:.1f} of {n:.0f} legs an image), needed "
-            f"{placed.needed:.1f}; check that the images belong to this machine and to their "
-            "readings, that they are no mirror images, the camera file, and the legs of the view "
-            f"if dataset.yaml names them{clicked}."
+        return Cause(
+            f"its camera could not be placed: found no pose {where} at which its images show the "
+            "legs (at the best one {:.1f} of {:.0f} legs an image), needed {:.1f}; check that the "
+            "images belong to this machine and to their readings, that they are no mirror images, "
+            f"the camera file, and the legs of the view if dataset.yaml names them{clicked}.",
+            (legs, n, float(placed.needed)),
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
-        return (
-            f"view {name}: its camera could not be placed: found too few outlines at the pose "
-            f"{where} at which its images show {legs:.1f} of {n:.0f} legs an image, needed more "
-            "than other edges in the images make as well; add images at other readings, in "
-            f"better light, or clicks on its joints ({LANDMARKS_NAME})."
+        return Cause(
+            f"its camera could not be placed: found too few outlines at the pose {where} at which "
+            "its images show {:.1f} of {:.0f} legs an image, needed more than other edges in the "
+            "images make as well; add images at other readings, in better light, or clicks on its "
+            f"joints ({LANDMARKS_NAME}).",
+            (legs, n),
         )
     other = placed.pose(1)
     apart = placed.pose().inv() * other
-    return (
-        f"view {name}: its camera could not be placed: found two poses at which its images show "
-        f"the legs about as well ({legs:.1f} and {placed.support[1].mean():.1f} legs an image; "
-        f"{1e3 * np.linalg.norm(apart.translation):.0f} mm and "
-        f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart), needed one; add images at "
-        "readings that differ more between the legs, or clicks on its joints "
-        f"({LANDMARKS_NAME})."
+    return Cause(
+        TWO_POSES,
+        (
+            legs,
+            float(placed.support[1].mean()),
+            1e3 * float(np.linalg.norm(apart.translation)),
+            float(np.degrees(apart.rotation.magnitude())),
+        ),
     )

@@ -1,7 +1,7 @@
 """Views fitted to their outlines, and guided matching of the legs that are missing.
 
 Edge pairs place a camera to some millimetres and leave out legs that have none; outlines are far
-better known. A group of views is one :class:`legcal.estimation.problem.Problem`:
+better known. A group of views is one :class:`legcal.estimation.problem.EstimationProblem`:
 
     pose        of the machine in the frame of the group, about the middle of its joints
     shift       of A and B of each leg against the model
@@ -20,15 +20,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.causes import Cause
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
 from legcal.estimation.problem import (
+    EstimationProblem,
     Factor,
     Frames,
     GaussianPrior,
     Linearization,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -42,7 +43,7 @@ from legcal.machine.leg import main_cylinders
 from legcal.perception.detection import measure_outlines
 from legcal.perception.outline import Method, measure
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
-from legcal.perception.placement import Group, Placement, Search
+from legcal.perception.placement import Group, NotPlaced, Placement, Search
 from legcal.perception.tuning import EVIDENCE, JOINT_ERROR, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
@@ -200,7 +201,9 @@ def fit_view(
     )
 
 
-def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Problem[_State]:
+def _problem(
+    group: Group, lines: "_Lines", start: _State, middle: Array
+) -> EstimationProblem[_State]:
     """Return the problem of a group; weights and sigmas of its priors are put on its rows later."""
     n_legs, every_item = len(start.shift), np.arange(lines.n_items)
     R, centre = start.pose.R[0], start.pose.t[0]
@@ -225,7 +228,7 @@ def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Pro
     every = slice(None)
     n = len(lines.leg)
     touches = ("pose", np.zeros(n, dtype=np.intp), every), ("shift", lines.leg, every)
-    return Problem(
+    return EstimationProblem(
         (pose, Variables("shift", all_free(n_legs, 6))),
         Variables("offset", all_free(lines.n_items, 3)),
         (
@@ -262,7 +265,7 @@ def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -
 
 
 def _normal_equations(
-    problem: Problem[_State],
+    problem: EstimationProblem[_State],
     state: _State,
     linear: Linearization,
     weight: Array,
@@ -593,13 +596,13 @@ def _without_weak_views(
             continue
         names = [search.measurements.views[v].name for v in group.views]
         n, n_images = 0 if fit is None else int(fit.n_outlines.sum()), len(group.rows)
-        why = (
-            f"view {group_name(names)}: its camera could not be placed: found only {n} outlines "
-            f"that agree in its {n_images} image{'s' * (n_images != 1)}, needed more than other "
-            "edges give by chance; add images at other readings, in better light, or a rough "
-            "T_base_camera."
+        why = Cause(
+            "its camera could not be placed: found only {} outlines that agree in its {} image"
+            f"{'s' * (n_images != 1)}, needed more than other edges give by chance; add images at "
+            "other readings, in better light, or a rough T_base_camera.",
+            (n, n_images),
         )
-        unplaced |= dict.fromkeys(names, why)
+        unplaced |= dict.fromkeys(names, NotPlaced(group_name(names), why))
         for v in group.views:
             T[v] = None
     return replace(placement, T_base_camera=tuple(T), unplaced=unplaced)

@@ -94,7 +94,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            *([printable(_to_be_added(plan))] if plan.given else []),
+            *([printable(f"once it is shot, {_to_be_added(plan)}")] if plan.given else []),
             printable(
                 f"calibrate with: legcal calibrate {plan.given or output} -o OUT{length}"
             ),
@@ -103,9 +103,9 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
 
 
 def _to_be_added(plan: Plan) -> str:
-    """Return what becomes of a session that adds to another one."""
+    """Return what to do with a session that adds to another one."""
     return (
-        "once it is shot, copy the photographs, the views in dataset.yaml and the rows of "
+        "copy the photographs, the views in dataset.yaml and the rows of "
         f"measurements.csv into {plan.given}"
     )
 
@@ -189,7 +189,7 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "Save each photograph under its name in measurements.csv.",
     ]
     if plan.given:
-        items.append(f"In the end, {_to_be_added(plan).removeprefix('once it is shot, ')}.")
+        items.append(f"In the end, {_to_be_added(plan)}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
     measured = plan.machine.rod_for_scale(has_length=plan.board is not None)

@@ -85,7 +85,7 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
                 T = platform_in_base(machine, platform_pose(machine, configuration))
                 off = contradictions(machine, [T], row[None])
                 problem = (
-                    off[0].in_words(machine)
+                    str(off[0].cause(machine))
                     if off
                     else feasibility.problem(configuration, of_motors=False)
                 )

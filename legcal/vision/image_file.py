@@ -17,7 +17,8 @@ from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from legcal.errors import BadValue, DatasetError, Place, Problem
+from legcal.causes import Cause
+from legcal.errors import BadValue, Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
@@ -94,7 +95,7 @@ NOWHERE = Place()
 class BadImage(BadValue):
     """What is wrong with the bytes of an image file."""
 
-    def __init__(self, found: str, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
+    def __init__(self, found: str | Cause, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
         super().__init__(found, needed, remedy)
 
 
@@ -195,7 +196,8 @@ def _size_read(form: str, read: Callable[[bytes], tuple[int, int]], content: byt
     except BadImage:
         raise
     except (*PILLOW_ERRORS, UserWarning) as error:
-        raise BadImage(f"a {form} file of {len(content)} bytes, damaged or cut off") from error
+        found = Cause("a {} file of {} bytes, damaged or cut off", (form, len(content)))
+        raise BadImage(found) from error
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
@@ -285,7 +287,8 @@ def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, 
     """Return the bytes of an image file, and what is wrong with them if anything."""
     if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
-        return b"", _problem(path, named, found, _COMPLETE, "correct the path or remove the row")
+        remedy = "correct the path or remove the row"
+        return b"", _problem(path, named, found, _COMPLETE, remedy, Code.MISSING_FILE)
     try:
         content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
@@ -302,14 +305,22 @@ def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, 
             f"{camera.width} x {camera.height} px as in its camera file",
             "use the original image, neither scaled, cropped nor rotated, or the calibration of "
             "its size",
+            Code.WRONG_IMAGE_SIZE,
         )
     return content, None
 
 
-def _problem(path: Path, named: Place, found: str, needed: str, remedy: str = _AGAIN) -> Problem:
+def _problem(
+    path: Path,
+    named: Place,
+    found: str | Cause,
+    needed: str,
+    remedy: str = _AGAIN,
+    code: Code = Code.UNREADABLE_FILE,
+) -> Problem:
     """Return why an image cannot be used."""
     what = f"image {path} could not be read"
-    return Problem(what, found, needed, remedy, named.file, named.row, name=str(path))
+    return Problem(what, found, needed, remedy, *named, name=str(path), code=code)
 
 
 def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:

@@ -30,7 +30,7 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.calibration.camera_calibration.picture import PICTURE_FILE, write_picture
 from legcal.data.measurements import few
-from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
+from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
 from legcal.geometry.types import Array
@@ -408,13 +408,11 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
             facts.append(read_facts(content))
             continue
         except OSError as error:
-            found, needed = f"'{error.strerror}'", "a readable file"
+            wrong = f"'{error.strerror}'", "a readable file"
         except BadImage as error:
-            found, needed = error.found, error.needed
-        problems.append(
-            f"{path}: the image could not be read: found {found}, needed {needed}; copy it again "
-            "or leave it out."
-        )
+            wrong = str(error.found), error.needed
+        unread, remedy = "the image could not be read", "copy it again or leave it out"
+        problems.append(Problem(unread, *wrong, remedy, str(path)))
     if problems:
         raise DatasetError(problems)
     if len(sizes) > 1:

@@ -26,9 +26,9 @@ from legcal.calibration.joint_fit.problem import arm_sigmas
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.estimation.problem import (
     NO_PRIOR,
+    EstimationProblem,
     Factor,
     GaussianPrior,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -214,7 +214,7 @@ def session_problem(
     more: Sequence[tuple[Variables, IntArray, Array]] = (),  # see below
     lengths: Array | None = None,  # of length_rows
     arms: GaussianPrior = NO_PRIOR,  # of prior_of_arms
-) -> tuple[Problem[_Nominal], _Nominal]:
+) -> tuple[EstimationProblem[_Nominal], _Nominal]:
     """Return the problem of a session and the state where it is linearised.
 
     Views of a board on the base share one camera frame, that of the board. A board on the platform
@@ -234,7 +234,7 @@ def session_problem(
         jacobian=lambda x: np.diag(predicted.unit),
         prior=prior,
     )
-    problem = Problem[_Nominal](
+    problem = EstimationProblem[_Nominal](
         variables=(
             parameters,
             Variables("camera", all_free(predicted.n_frames, 6)),

@@ -573,7 +573,7 @@ def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalErr
             f"The joint fit failed with the stated values of {_first_names(stated)}, which are the "
             "likely cause if it converges without them; correct these values first, or leave them "
             "out.",
-            *failure.problems,
+            *failure.facts,
         ]
     )
 

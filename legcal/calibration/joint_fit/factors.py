@@ -24,7 +24,7 @@ from legcal.data.axes import LegAxes, join_axes
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
-from legcal.errors import DatasetError
+from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
@@ -313,7 +313,7 @@ def observed_outlines(
     parts = tuple(sorted(set(keys)))
     covariance = outlines.covariance[index]
     cameras, by_gamma = _cameras_of(measurements), _by_gamma(outlines, measurements)[index]
-    problems = [
+    problems: list[str | Problem] = [
         *_mixed_gammas(by_gamma, outlines.gamma[index], view, cameras),
         *_bad_covariances(covariance, row, leg, measurements, legs),
         *(
@@ -367,14 +367,19 @@ def observed_outlines(
 
 def _bad_covariances(
     covariance: Array, row: IntArray, leg: IntArray, measurements: Measurements, legs: FittedLegs
-) -> list[str]:
+) -> list[Problem]:
     """Describe each covariance that is not positive definite."""
     s00, s01, s11 = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     good = (s00 > 0.0) & (s11 > 0.0) & (s00 * s11 > s01**2)
     return [
-        f"The outline of {legs.names[leg[i]]} in {measurements.image[row[i]] or f'row {row[i]}'} "
-        f"could not be used: its covariance s00 = {s00[i]:g}, s01 = {s01[i]:g}, s11 = {s11[i]:g} "
-        "px^2 is not positive definite; correct it in the observations."
+        Problem(
+            f"The outline of {legs.names[leg[i]]} in "
+            f"{measurements.image[row[i]] or f'row {row[i]}'} could not be used",
+            "a covariance that is not positive definite "
+            f"(s00 = {s00[i]:g}, s01 = {s01[i]:g}, s11 = {s11[i]:g} px^2)",
+            remedy="correct it in the observations",
+            code=Code.BAD_ROW,
+        )
         for i in np.flatnonzero(~good)
     ]
 
@@ -678,9 +683,13 @@ def observed_axes(
     correlation = axes.covariance / (scale[:, :, None] * scale[:, None, :])
     least = np.linalg.eigvalsh(correlation)[:, 0]
     problems = [
-        f"The axis of {legs.names[axes.leg[i]]} in "
-        f"{measurements.image[axes.row[i]] or f'row {axes.row[i] + 1}'} could not be used: its "
-        "covariance is not positive definite; correct its standard deviations."
+        Problem(
+            f"The axis of {legs.names[axes.leg[i]]} in "
+            f"{measurements.image[axes.row[i]] or f'row {axes.row[i] + 1}'} could not be used",
+            "a covariance that is not positive definite",
+            remedy="correct its standard deviations",
+            code=Code.BAD_ROW,
+        )
         for i in np.flatnonzero(~(least > 0.0))
     ]
     if problems:

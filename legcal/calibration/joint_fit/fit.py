@@ -201,7 +201,7 @@ def _fit_from_best_start(
         )
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
-    problems = dict.fromkeys(problem for failure in failures for problem in failure.problems)
+    problems = dict.fromkeys(problem for failure in failures for problem in failure.facts)
     raise DidNotConverge(
         list(problems) or "The fit was given no starting values; it needs at least one."
     )

@@ -59,9 +59,9 @@ from legcal.errors import NotIdentifiable
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import (
     NO_PRIOR,
+    EstimationProblem,
     Frames,
     GaussianPrior,
-    Problem,
     Variables,
     all_free,
     fixed_at_start,
@@ -90,7 +90,7 @@ _MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of a frame: [rad], and an
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FitProblem(Problem[State]):
+class FitProblem(EstimationProblem[State]):
     """A joint fit, built and not yet solved."""
 
     parameters: LegParameters

@@ -76,7 +76,7 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
                     else "put a calibration board on the platform and one on the base, give a leg "
                     "an encoder, or state measured coordinates of joints (--set)."
                 ),
-                *failure.problems,
+                *failure.facts,
             ]
         ) from None
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, DidNotConverge
-from legcal.estimation.problem import Frames, Problem, Tangent
+from legcal.estimation.problem import EstimationProblem, Frames, Tangent
 from legcal.geometry.axes import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
@@ -509,7 +509,7 @@ class LegConstraints:
         d = 6 + self.legs.n_actuators
         return [*freedoms(self.legs.frame_legs), *range(6, d)]
 
-    def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
+    def tangent(self, problem: EstimationProblem[State], state: State) -> Tangent | None:
         """Return the tangent space of poses; None without constraints.
 
         The basis is scaled to one radian or the mean leg length.

@@ -30,10 +30,10 @@ from legcal.calibration.location.frames import (
 from legcal.calibration.location.search import kept_rows
 from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
 from legcal.estimation.problem import (
+    EstimationProblem,
     Factor,
     Frames,
     GaussianPrior,
-    Problem,
     Residuals,
     Variables,
     all_free,
@@ -178,7 +178,7 @@ def _most_likely(
     held = np.zeros((0, N_STEP))
     if fixed is not None:
         held = (fixed / pairs.scale[:, None]).T.reshape(-1, 2, 6)[..., _TURN_FIRST]
-    problem = Problem[_State](
+    problem = EstimationProblem[_State](
         variables=(
             Variables("base", all_free(1, 6), Frames.moved, max_step=_MAX_STEP),
             Variables("tool", all_free(1, 6), Frames.moved, max_step=_MAX_STEP),

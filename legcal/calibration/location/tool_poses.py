@@ -26,9 +26,9 @@ from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs, tool_motions
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
+from legcal.errors import Code, DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
-from legcal.files.table import Column, Table, read_table
+from legcal.files.table import Column, Table, header_problem, read_table
 from legcal.geometry.covariances import whitener
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -121,21 +121,16 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         "row",
         [*reading_columns(machine.legs), *_COLUMNS],
         needed="a row for each pose; measure some",
-        unknown=_about_angles,
+        unknown=lambda name: _about_angles(path, name),
     )
     readings, notes = readings_in(table, machine.legs)
     position = table.numbers(_POSITION)
     rotation, oriented, worst = _orientations(table)
     if "angle_sigma" in table:
         if "qx" not in table:
+            found, needed = "angle_sigma and no quaternions", "qx, qy, qz, qw beside it"
             table.refuse_file(
-                Problem(
-                    "the columns could not be used",
-                    "angle_sigma and no quaternions",
-                    "qx, qy, qz, qw beside it",
-                    "add the columns",
-                    f"{path}, header",
-                )
+                header_problem(path, found, needed, "add the columns", Code.MISSING_COLUMN)
             )
         table.need(["angle_sigma"], oriented)
     joints = [column.name for column in reading_columns(machine.legs)]
@@ -169,14 +164,13 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     )
 
 
-def _about_angles(name: str) -> str:
-    """Return what is to be said about a column that looks like an angle."""
+def _about_angles(path: Path, name: str) -> Problem | None:
+    """Return what is wrong with a column that looks like an angle."""
     if not _ANGLES.fullmatch(name):
-        return ""
-    return (
-        f"'{name}', which looks like an angle, needed orientations as quaternions qx, qy, qz, qw; "
-        "convert the angles."
-    )
+        return None
+    found, needed = f"'{name}', which looks like an angle", "orientations as quaternions "
+    needed += ", ".join(_QUATERNION)
+    return header_problem(path, found, needed, "convert the angles", Code.UNKNOWN_COLUMN)
 
 
 def _orientations(table: Table) -> tuple[Array, BoolArray, float]:

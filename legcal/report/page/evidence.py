@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import platform as system
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.identify.identifiability import ranks_of_dataset
+from legcal.calibration.notes import Topic, topic_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.summary import UNITS
 from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
@@ -24,14 +24,6 @@ from legcal.report.page.parameter_rows import correlation
 from legcal.version import __version__
 
 MAX_HASHED = 400_000_000  # of images [bytes]: more would be waited for
-_CAUSES: Mapping[str, tuple[str, ...]] = {  # words by which notes are told apart, the first found
-    "Cameras": ("camera", "intrinsic", "gamma", "focal", "distort", "lens"),
-    "Calibration boards": ("board", "corner"),
-    "Images and outlines": ("image", "outline", "photograph", "view", "blur"),
-    "Readings": ("reading", "encoder", "travel", "slider"),
-    "Model": ("model", "nominal", "twist", "tied", "joint"),
-    "Fit": ("joint fit", "started from"),
-}
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Any]:
@@ -147,15 +139,11 @@ def note_blocks(calibration: Calibration) -> list[Any]:
         columns = ("what looks wrong", "cannot be told from", ">images that agree", ">without it",
                    "remedy")  # fmt: skip
         blocks.append(Table(columns, diagnosis, "Diagnosis"))
-    groups: dict[str, list[str]] = {cause: [] for cause in _CAUSES}
-    for note in calibration.notes:
-        words = note.lower()
-        at = {c: min((words.find(w) for w in ws if w in words), default=-1)
-              for c, ws in _CAUSES.items()}  # fmt: skip
-        first = min((k for k in at.values() if k >= 0), default=None)
-        cause = next((c for c, k in at.items() if k == first), "Fit")
-        groups[cause].append(note)
-    blocks += [Items(notes, title=cause) for cause, notes in groups.items() if notes]
+    for topic in Topic:
+        if topic is Topic.DIAGNOSIS:
+            continue  # as a table
+        notes = [note for note in calibration.notes if topic_of(note) is topic]
+        blocks += [Items(notes, title=topic)] * bool(notes)
     steps = calibration.result.stages.staged
     said = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
     if any(said):

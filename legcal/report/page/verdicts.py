@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 
 from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.result import Calibration
 from legcal.calibration.verification import Check
 from legcal.pages.document import Light, Verdict
@@ -98,7 +99,7 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]
         steps.append(
             "Look at the worst outlines below: blur, reflections and wrong edges show there."
         )
-    if any("taken as exact" in note for note in result.notes):
+    if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
         steps.append(
             "Calibrate the camera with legcal camera: its file then states how well it is known, "
             "which belongs into the uncertainty of the result."

@@ -1,0 +1,75 @@
+"""Why something is so, as words and the values in them, so that equal causes are said once.
+
+A sentence is made where people read it; until then a cause is data: those with the same words and
+names are one cause, whatever their figures are, and are said together with the range of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
+
+_K = TypeVar("_K", bound=Hashable)
+
+
+class Figures(tuple[float, ...]):
+    """Numbers that are said as a range, from the least to the greatest."""
+
+    def __format__(self, spec: str) -> str:
+        shown = list(dict.fromkeys(format(number, spec) for number in sorted(self)))
+        return " to ".join(dict.fromkeys((shown[0], shown[-1])))
+
+
+Value: TypeAlias = "str | float | Figures | Cause"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause: words with a place for each value, as ``str.format`` has them, and the values.
+
+    A value is a name, a number (or several), or another cause.
+    """
+
+    words: str
+    values: tuple[Value, ...] = ()
+
+    def __str__(self) -> str:
+        return self.words.format(*self.values)
+
+    @property
+    def kind(self) -> Hashable:
+        """The cause without its figures."""
+        return self.words, tuple(
+            value.kind if isinstance(value, Cause) else value if isinstance(value, str) else None
+            for value in self.values
+        )
+
+
+def together(causes: Sequence[Cause]) -> Cause:
+    """Return causes of one kind as one, with all their figures."""
+    columns = zip(*(cause.values for cause in causes), strict=True)
+    return Cause(causes[0].words, tuple(map(_joined, columns)))
+
+
+def _joined(values: tuple[Value, ...]) -> Value:
+    """Return one value of causes of one kind, from that of each."""
+    if isinstance(values[0], str):
+        return values[0]
+    if isinstance(values[0], Cause):
+        return together([value for value in values if isinstance(value, Cause)])
+    numbers: list[float] = []
+    for value in values:
+        if isinstance(value, int | float):
+            numbers.append(value)
+        elif isinstance(value, Figures):
+            numbers += value
+    return Figures(numbers)
+
+
+def by_cause(causes: Mapping[_K, Cause]) -> list[tuple[Cause, tuple[_K, ...]]]:
+    """Return each cause once, with what it is the cause of."""
+    alike: dict[Hashable, dict[_K, Cause]] = {}
+    for key, cause in causes.items():
+        alike.setdefault(cause.kind, {})[key] = cause
+    return [(together(list(same.values())), tuple(same)) for same in alike.values()]
