@@ -10,11 +10,13 @@ from dataset_folder import dataset_of_readings
 from hexapod_example import Run
 from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
+from simulated import simulated
 
+from legcal import calibrate
 from legcal.calibration.result import Verdict
-from legcal.calibration.verdict import judge
+from legcal.calibration.verdict import click_notes, judge
 from legcal.data.dataset import load_dataset
-from legcal.data.landmarks import Landmarks
+from legcal.data.landmarks import Landmarks, joint_name
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, pose_distance
 from legcal.machine.loader import load_mechanism
@@ -169,3 +171,28 @@ def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run)
     assert not verdict.trustworthy
     name = m.views[1].name
     assert f"clicks on joints in view {name} (" in verdict.sentence
+
+
+def test_a_click_that_a_fit_contradicts_is_named_with_the_joint_that_it_may_show(
+    tmp_path: Path,
+) -> None:
+    calibration = calibrate(simulated(tmp_path / "set", "3-rpr", poses=6).folder)
+    dataset, solution = calibration.dataset, calibration.solution
+    joints = np.stack(ends_at_poses(solution.legs, *components(solution.T_Rb_Re)), axis=2)
+    m, v = dataset.measurements, int(dataset.measurements.view[0])
+    P = solution.T_camera_Rb[v].apply(joints[m.pose[0]].reshape(-1, 3))
+    px = solution.cameras[v].project(P) + np.random.default_rng(1).normal(size=(6, 2))
+    leg, end = np.repeat(np.arange(3), 2), np.tile([0, 1], 3)
+    clicks = Landmarks(np.zeros(6, dtype=np.intp), leg, end, px, np.full(6, 3.0))
+    assert not click_notes(replace(dataset, landmarks=clicks), solution)
+    exchanged = px[
+        [0, 1, 5, 3, 4, 5]
+    ]  # the base joint of leg2 is clicked at the platform's of leg3
+    wrong = replace(dataset, landmarks=replace(clicks, px=exchanged))
+    (note,) = click_notes(wrong, solution)
+    first, second = (joint_name(dataset.machine.leg_names[j], e) for j, e in ((1, 0), (2, 1)))
+    off = np.linalg.norm(px[2] - px[5])
+    found = float(note.split(") is ")[1].split(" px")[0])
+    assert f"The click on {first} in " in note
+    assert found == pytest.approx(off, abs=5.0)
+    assert f"needed at most 12 px; perhaps it shows {second}; correct or remove it." in note

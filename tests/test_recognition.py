@@ -47,7 +47,7 @@ from legcal.perception.pair_matching import (
 )
 from legcal.perception.placement import Group, Search, group_views
 from legcal.perception.pose_hypotheses import pose_hypotheses
-from legcal.perception.radii import estimate_radii
+from legcal.perception.radii import MIN_CHANGE, RadiusFactors, estimate_radii
 from legcal.perception.view_fit import (
     ViewFit,
     fit_view,
@@ -276,6 +276,28 @@ def test_radii_that_pictures_contradict_are_estimated(factor: float, legs: list[
     assert not estimate_radii([(0, pictures, _pose(T))]).factor
 
 
+@pytest.mark.parametrize(("factor", "legs"), [(0.9, [0, 1, 2, 3, 4, 5]), (0.98, [1])])
+def test_a_leg_that_is_as_thin_as_all_or_hardly_thinner_keeps_its_radius(
+    factor: float, legs: list[int]
+) -> None:
+    """Light and optics make the edges of thin legs thinner: that is no radius of one of them."""
+    pictures, T = _scene(2, n=8)
+    stated = []
+    for p in pictures:
+        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
+        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
+    radii = estimate_radii([(0, stated, _pose(T))])
+    assert (radii.common > 0.0) == (len(legs) == 6)
+    suspects = {part for part in radii.factor if part[0] == 1}
+    assert not radii.only(suspects).factor
+
+
+def test_corrections_that_lead_back_to_the_model_leave_its_radius() -> None:
+    first, back = RadiusFactors({(5, 3e-3): 0.9}), RadiusFactors({(5, 2.7e-3): 1.09})
+    assert not first.then(back).beyond(MIN_CHANGE).factor
+    assert first.beyond(MIN_CHANGE).factor == first.factor
+
+
 # The camera of a view.
 
 
@@ -289,6 +311,14 @@ def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
         assert np.all(np.diff(placed.score) <= 0.0)
         assert placed.support.shape == placed.expected.shape == (len(placed.poses), 4)
         assert np.isfinite(placed.leg_error).any()
+
+
+def test_a_known_pose_that_sees_no_leg_keeps_nothing_from_being_placed() -> None:
+    pictures, T = _scene(0, 6, 4, joint_error=2e-3)
+    away = T * RigidTransform.from_rotation(Rotation.from_rotvec([0.0, np.pi, 0.0]))
+    placed = place_camera(pictures, 6, known=[away])
+    assert placed.is_convincing
+    assert _is_right(placed, T)
 
 
 def _of_parallelograms(

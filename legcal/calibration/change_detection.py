@@ -1,10 +1,13 @@
 """Change detection: whether a machine is still the one that was calibrated, by a few new images.
 
 The new images are fitted by themselves, with priors so wide that any plausible change fits, so
-that nothing which moved is taken for a wrong outline. Their estimate is then compared with the
-earlier result: the difference has the covariance of both, and its weighted square has an F
-distribution if nothing moved. Directions that the new images determine worse than the priors do not
-count.
+that nothing which moved is taken for a wrong outline, and once more with the earlier result as a
+prior. The squares that the free fit saves have an F distribution if nothing moved: this likelihood
+ratio asks only how well both agree with the images, while a difference of parameters is also large
+between two minima that fit alike.
+
+What moved is read off the difference of the free fit to the earlier result, which has the
+covariance of both. Directions that the new images determine worse than the priors do not count.
 """
 
 from __future__ import annotations
@@ -59,10 +62,33 @@ class Explanation:
 
 
 @dataclass(frozen=True, eq=False)
+class LikelihoodRatio:
+    """What a fit with wide priors saves, compared with one that also has the earlier result.
+
+    Along a direction with the variance v by the new images and the wide prior, counted in that
+    prior's, the squares saved are 1 - v times one of chi2 with one degree of freedom.
+    """
+
+    saved: float  # squares, in variances of the noise
+    parts: Array  # (p,) of 1 - v
+
+    @classmethod
+    def of(cls, saved: float, covariance: Array, prior: Array) -> LikelihoodRatio:
+        """Return it with the *covariance* (p, p) and priors that :func:`difference` has."""
+        v = np.linalg.eigvalsh(covariance / np.outer(prior, prior))
+        return cls(saved, np.clip(1.0 - v, 0.0, 1.0))
+
+    def p_value(self, noise_dof: int) -> float:
+        """Return the probability of so much or more if nothing moved, by its first two moments."""
+        mean, variance = float(np.sum(self.parts)), 2.0 * float(np.sum(self.parts**2))
+        return float(fdtrc(2.0 * mean**2 / variance, noise_dof, self.saved / mean))
+
+
+@dataclass(frozen=True, eq=False)
 class Movement:
     """What new images say of an earlier result."""
 
-    statistic: float  # weighted square of the difference of the parameters
+    statistic: float  # squares that the free fit saves
     dof: int  # directions that are compared
     noise_dof: int  # degrees of freedom of the noise of the new images
     p_value: float  # probability of such a statistic or a larger one if nothing moved
@@ -81,7 +107,6 @@ def difference(
     prior: Array,  # (p,) standard deviations of the priors, whose means are the earlier result
     old: Array,  # (p,) parameters of the earlier result
     old_covariance: Array,  # (p, p)
-    variance_factor: float = 1.0,  # of the new images: that of a few may be small by chance
 ) -> tuple[Array, Array, Array]:
     """Return directions (k, p) that the new images determine, differences along, covariance (k, k).
 
@@ -108,8 +133,7 @@ def difference(
     return (
         directions,
         vectors[:, is_determined].T @ score / weight[is_determined],
-        np.diag(variance_factor / weight[is_determined])
-        + directions @ old_covariance @ directions.T,
+        np.diag(1.0 / weight[is_determined]) + directions @ old_covariance @ directions.T,
     )
 
 
@@ -126,6 +150,7 @@ def noise_dof(dof: int, covariance: Array, prior: Array) -> int:
 
 def judge_movement(
     found: tuple[Array, Array, Array],
+    ratio: LikelihoodRatio,
     noise_dof: int,
     changes: Sequence[Sequence[Change]],
     significance: float,
@@ -137,27 +162,35 @@ def judge_movement(
     directions, values, covariance = found
     whitening = whitener(covariance)
     residual = whitening @ values
-    statistic, k = float(residual @ residual), len(residual)
-    p_value = _p_value(statistic, k, noise_dof)
+    # Linear theory counts far outliers in full, the costs do not.
+    share = ratio.saved / max(float(residual @ residual), np.finfo(np.float64).tiny)
+    p_value = ratio.p_value(noise_dof)
     explanations: list[Explanation] = []
     if p_value < significance:
         for of_kind in changes:
-            tried = [_explain(whitening @ directions, residual, c, noise_dof) for c in of_kind]
+            tried = [
+                _explain(whitening @ directions, residual, c, noise_dof, share) for c in of_kind
+            ]
             explanations = sorted(tried, key=lambda explanation: explanation.remaining)
             enough = [e for e in explanations if e.p_value >= significance]
             if enough:
                 explanations = enough
                 break
-    return Movement(statistic, k, noise_dof, p_value, significance, tuple(explanations))
+    return Movement(
+        ratio.saved, len(residual), noise_dof, p_value, significance, tuple(explanations)
+    )
 
 
-def _explain(directions: Array, residual: Array, change: Change, noise_dof: int) -> Explanation:
-    """Return what a change leaves of a whitened difference (k,)."""
+def _explain(
+    directions: Array, residual: Array, change: Change, noise_dof: int, share: float
+) -> Explanation:
+    """Return what a change leaves of a whitened difference (k,), and *share* of its squares."""
     by_change = directions @ change.columns
     inverse = np.linalg.pinv(by_change, rcond=1e-9)
     values = inverse @ residual
     left = residual - by_change @ values
-    remaining, dof = float(left @ left), len(residual) - int(np.linalg.matrix_rank(by_change))
+    remaining = share * float(left @ left)
+    dof = len(residual) - int(np.linalg.matrix_rank(by_change))
     sigma = np.sqrt(np.sum(inverse**2, axis=1))
     return Explanation(change, values, sigma, remaining, _p_value(remaining, dof, noise_dof))
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.calibration.change_detection import (
+    LikelihoodRatio,
     Movement,
     difference,
     judge_movement,
@@ -27,14 +28,18 @@ from legcal.calibration.documents import (
 from legcal.calibration.joint_fit.held_out import PlatformPair
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
 from legcal.calibration.result_folder import EarlierResult, load_result
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.estimation.problem import Frames
-from legcal.geometry.types import Array
+from legcal.estimation.problem import Frames, GaussianPrior, linearize
+from legcal.estimation.solver import Minimum, information, minimise
+from legcal.estimation.uncertainty import named_covariance
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.parameter_id import ARMS, ParameterId
@@ -282,6 +287,70 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Free:
+    """The new images fitted with wide priors, at one of their minima."""
+
+    problem: FitProblem
+    minimum: Minimum[State]
+    which: IntArray  # the tested parameters among the named unknowns
+    more: Array  # (n, n) covariance of these besides that by information
+    prior: Array  # (n,) their wide priors
+
+    @property
+    def poses(self) -> Frames:
+        """The platform poses."""
+        return self.minimum.state.platform_pose.frames
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the tested parameters (n,) and their covariance (n, n), below the prior's."""
+        problem, state, which = self.problem, self.minimum.state, self.which
+        normal = information(problem, state, self.minimum.linear, problem.loss)
+        named = named_covariance(problem, state, normal.kept_covariance())
+        covariance, unit = named[np.ix_(which, which)] + self.more, np.outer(self.prior, self.prior)
+        variance, vectors = np.linalg.eigh(covariance / unit)
+        covariance = (vectors * np.minimum(variance, 1.0)) @ vectors.T * unit
+        return problem.coordinates(state)[which], covariance
+
+
+def _fits(
+    solution: Solution, prior: _EarlierEstimate, variance_factor: float
+) -> tuple[_Free, _Free, float]:
+    """Return the free fit, that one next to the earlier result, and the squares that it saves.
+
+    They are saved over a fit with the earlier result as a prior beside the wide ones. A free fit
+    that starts where this one ends is what the images say near the earlier result; another minimum
+    counts where it fits better.
+    """
+    posterior, loss = solution.posterior, solution.posterior.problem.loss
+    problem, state = posterior.problem, posterior.state
+    block, outlines = problem.block("legs"), problem.factor("outlines")
+    number = np.array([block.labels.index(name) for name in prior.names], dtype=np.intp)
+    which = problem.where("legs")[number]
+    # Errors of edges that return to places are in no residual.
+    normal = information(problem, state, linearize(problem, state), loss)
+    at_places = named_covariance(problem, state, posterior.covariance - normal.kept_covariance())
+    at_places = at_places[np.ix_(which, which)]
+    held = solution.kinematic.of_values(prior.names)[1]
+    more = at_places + prior.held_sigma**2 * held.T @ held
+    earlier = GaussianPrior.from_covariance(number, prior.old, prior.covariance + at_places)
+
+    whitening = outlines.whitening / np.sqrt(variance_factor)
+    problem = problem.with_factors(replace(outlines, whitening=whitening))
+    with_earlier = problem.with_parts((replace(block, prior=block.prior + earlier),), ())
+
+    def minimum(of: FitProblem, begin: State) -> Minimum[State]:
+        most = of.settings.max_iterations
+        return minimise(of, begin, loss, max_iterations=most, must_converge=False)
+
+    there = minimum(with_earlier, replace(state, legs=problem.legs.nominal))
+    near, elsewhere = minimum(problem, there.state), minimum(problem, state)
+    best = near if near.cost <= elsewhere.cost else elsewhere
+    beside, free = (_Free(problem, one, which, more, prior.sigma) for one in (near, best))
+    saved = 2.0 * (there.cost - best.cost)
+    return free, beside, max(saved, 0.0)  # images of the earlier result save nothing
+
+
 def _compare(
     dataset: Dataset,
     earlier: EarlierResult,
@@ -292,33 +361,36 @@ def _compare(
     """Return what the fit of the new images says against the earlier result."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
-    values = solution.estimates.vector(prior.names)
-    covariance, held = solution.kinematic.of_values(prior.names)
-    covariance = covariance + prior.held_sigma**2 * held.T @ held
     variance_factor = _earlier_noise(solution, earlier)
-    found = difference(
-        values, covariance, prior.sigma, prior.old, prior.covariance, variance_factor
-    )
+    free, near, saved = _fits(solution, prior, variance_factor)
+    values, covariance = free.estimate()
+    found = difference(values, covariance, prior.sigma, prior.old, prior.covariance)
     dof = earlier.document.residuals.dof
     if variance_factor == 1.0:
         dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
-    legs = geometries(machine)
+    ratio = LikelihoodRatio.of(saved, covariance, prior.sigma)
     changes = possible_changes(machine, _only(parametrization, columns))
-    movement = judge_movement(found, dof, changes, significance)
-    poses = Frames.of(solution.T_Rb_Re)
-    J = pose_sensitivity(legs, parametrization, machine.frame_legs, *poses)[:, :, columns]
+    movement = judge_movement(found, ratio, dof, changes, significance)
+    fit = free if movement.moved else near
+    J = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, *fit.poses)
+    at_platform = _moved_platform(J[:, :, columns], fit, prior)
+    return Check(dataset, earlier, solution, movement, at_platform)
+
+
+def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPair:
+    """Return how far a fit moves the platform; J (k, 6, n) has its derivative by the parameters."""
+    values, covariance = fit.estimate()
     # Priors pull what was found to the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.sigma**2
-    spread = variance_factor * G @ covariance + G @ prior.covariance @ G.T
+    spread = G @ covariance + G @ prior.covariance @ G.T
     shift = J @ (values - prior.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
-    at_platform = PlatformPair(
+    return PlatformPair(
         _rms(shift[:, 3:] ** 2),
         _rms(variance[:, 3:]),
         _rms(shift[:, :3] ** 2),
         _rms(variance[:, :3]),
     )
-    return Check(dataset, earlier, solution, movement, at_platform)
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:

@@ -149,8 +149,9 @@ class PoseCandidates:
 
     @property
     def share(self) -> float:
-        """Share of the expected legs that agree with the first pose."""
-        return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
+        """Share of the expected legs that agree with the first pose; 0 where none is expected."""
+        expected = float(self.expected[0].sum()) if len(self.poses) else 0.0
+        return float(self.support[0].sum()) / expected if expected else 0.0
 
     def _leads(self, enough: tuple[float, float]) -> bool:
         """Say whether the first pose leads by so many legs and such a part of its score."""

@@ -61,15 +61,24 @@ class RadiusFactors:
         return self.common or 1.0
 
     def only(self, suspects: Collection[LegRadius]) -> "RadiusFactors":
-        """Return the factors of some parts; of all only where most of them are among these."""
+        """Return the factors of some parts; of all only where most of them are among these.
+
+        Where all differ alike and few of them are suspect, light and optics make the edges of all
+        thinner, and it is no reason why these few were not found.
+        """
         mine = {
             part: factor
             for part, factor in self.factor.items()
             if any(part[0] == leg and look_alike(part[1], radius) for leg, radius in suspects)
         }
-        if self.common and len(mine) >= MIN_SHARE_ALIKE * len(self.factor):
-            return self
+        if self.common:
+            return self if len(mine) >= MIN_SHARE_ALIKE * len(self.factor) else NO_RADIUS_FACTORS
         return RadiusFactors(mine)
+
+    def beyond(self, different: float) -> "RadiusFactors":
+        """Return the factors that differ from the model by more than a logarithm."""
+        more = {part: f for part, f in self.factor.items() if abs(np.log(f)) > different}
+        return RadiusFactors(more, self.common) if more else NO_RADIUS_FACTORS
 
     def of_the_same(self, step: "RadiusFactors") -> "RadiusFactors":
         """Return what a step says of the parts whose radii this one has corrected."""

@@ -47,6 +47,7 @@ from legcal.perception.placement import (
 from legcal.perception.radii import (
     CONVERGED,
     MAX_ITERATIONS,
+    MIN_CHANGE,
     NO_RADIUS_FACTORS,
     LegRadius,
     RadiusFactors,
@@ -298,7 +299,10 @@ def _by_other_radii(
         radii = radii.then(step)
     if radii.common and views.support < MIN_RADII_GAIN * as_given.support:
         return as_given, NO_RADIUS_FACTORS  # the scale is not known well
-    return views, radii
+    lasting = radii.beyond(MIN_CHANGE)  # corrections may lead back to the model
+    if len(lasting.factor) < len(radii.factor):
+        views = views.by_cylinders(with_radii(given, lasting.corrected))
+    return views, lasting
 
 
 def _first_radii(views: PlacedViews, run: Run) -> RadiusFactors:
