@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import ENCODING, QUALITY, Outlines
+from legcal.data.outlines import MEASURED, Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
@@ -90,7 +90,7 @@ def outlines_of(
     used = rng.uniform(size=len(places)) > rejected
     lost = ~used & (rng.uniform(size=len(places)) < 0.5)
     quality = rng.uniform(0.0, [100.0, 500.0, 1.0], size=(len(places), 3))
-    encoding = np.stack([np.full(len(places), 2.2), rng.normal(size=len(places))], axis=1)
+    encoding = np.stack([np.full(len(places), 2.2), *rng.normal(size=(2, len(places)))], axis=1)
     if source == "edited":
         quality[:] = encoding[:] = np.nan
     for numbers in (h, ends, covariance, quality, encoding):
@@ -113,12 +113,13 @@ def outlines_of(
         residual=quality[:, 2],
         gamma=encoding[:, 0],
         by_gamma=encoding[:, 1],
+        polish=encoding[:, 2],
     )
 
 
 def assert_same(found: Outlines, expected: Outlines) -> None:
     """Fail unless both tables are the same to the last bit."""
-    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used", *QUALITY, *ENCODING):
+    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used", *MEASURED):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
     assert found.part == expected.part
     assert found.reason == expected.reason

@@ -26,8 +26,7 @@ from legcal.data.axes import (
 )
 from legcal.data.measurements import row_names
 from legcal.data.outlines import (
-    ENCODING,
-    QUALITY,
+    MEASURED,
     Outlines,
     no_outlines,
     read_observations,
@@ -40,7 +39,7 @@ FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 MEASUREMENTS = recorded(labels=["", "", "a", "b"])
-OPTIONAL = (*QUALITY, *ENCODING)
+OPTIONAL = MEASURED
 
 
 AxisTable = tuple[IntArray, IntArray, Array, Array]  # row, leg, values and sigmas of Table 1
@@ -132,7 +131,7 @@ def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
         (
             no_outlines(),
             "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
-            "contrast,length,residual,gamma,by_gamma,detail",
+            "contrast,length,residual,gamma,by_gamma,polish,detail",
         ),
         (axis_table(), "view,image,leg,psi,theta,x,z,sigma_psi,sigma_theta,sigma_x,sigma_z"),
     ],
