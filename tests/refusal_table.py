@@ -774,7 +774,7 @@ def _tables() -> Iterable[Refusal]:
         ("gamma-0", cell(o, 2, gamma="0", by_gamma="0.1"), ("row 2", "gamma", "'0'")),
         ("header", header(o, "edge", "side"), (o, "edge")),
         ("no-table", text(o, ""), (o,)),
-        ("short", swap(o, "\n", "\nc1,x\n"), ("2", "24")),
+        ("short", swap(o, "\n", "\nc1,x\n"), ("2", "25")),
         (
             "all-at-once",
             (cell(o, 1, view="up", leg="none", edge="0"), cell(o, 4, a="x", b="y")),
