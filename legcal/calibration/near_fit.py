@@ -20,7 +20,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data.image_causes import image_notes
 from legcal.data.measurements import few
-from legcal.data.outlines import Outlines, no_outlines, through_cameras
+from legcal.data.outlines import Outlines, no_outlines, polished_parts, through_cameras
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
@@ -29,7 +29,7 @@ from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import polished_parts, used_as_before
+from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,

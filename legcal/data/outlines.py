@@ -43,6 +43,7 @@ NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
 
+MAX_POLISH = 4.0  # of the log likelihood ratio of one outline: one in fifty is of something else
 UNIT_EXACT = 1e-12  # |h| as computed; it is kept as it stands
 UNIT_TOLERANCE = 1e-3  # |h| as written with few digits; it is normalised
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it
@@ -114,6 +115,20 @@ class Outlines(ImageTable):
 def unmeasured(n: int) -> dict[str, Array]:
     """Return what is known of how well n outlines were seen that nobody measured: nothing."""
     return {name: np.full(n, np.nan) for name in MEASURED}
+
+
+def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
+    """Return the legs and parts whose used outlines are those of polished surfaces.
+
+    By the likelihood ratios of all together, no one of which counts for more than so much.
+    """
+    evidence: dict[tuple[int, str], float] = {}
+    used = np.flatnonzero(outlines.used & np.isfinite(outlines.polish)).tolist()
+    for i in used:
+        part = int(outlines.leg[i]), outlines.part[i]
+        ratio = float(np.clip(outlines.polish[i], -MAX_POLISH, MAX_POLISH))
+        evidence[part] = evidence.get(part, 0.0) + ratio
+    return frozenset(part for part, ratio in evidence.items() if ratio > 0.0)
 
 
 def through_cameras(

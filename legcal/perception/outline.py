@@ -52,7 +52,6 @@ SLACK = 0.5  # radii by which a solid before an outline is nearer; others are th
 NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
 SKEW = 0.09  # tangent of the angle, 5 deg, at which the edge of a solid passes for an outline
 LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
-MAX_POLISH = 4.0  # of the log likelihood ratio of one outline: one in fifty is of something else
 NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
 
 
@@ -191,20 +190,6 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
         for is_used, why in zip(used.tolist(), outlines.reason, strict=True)
     )
     return replace(outlines, used=used, reason=reason)
-
-
-def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
-    """Return the legs and parts whose used outlines are those of polished surfaces.
-
-    By the likelihood ratios of all together, no one of which counts for more than so much.
-    """
-    evidence: dict[tuple[int, str], float] = {}
-    used = np.flatnonzero(outlines.used & np.isfinite(outlines.polish)).tolist()
-    for i in used:
-        part = int(outlines.leg[i]), outlines.part[i]
-        ratio = float(np.clip(outlines.polish[i], -MAX_POLISH, MAX_POLISH))
-        evidence[part] = evidence.get(part, 0.0) + ratio
-    return frozenset(part for part, ratio in evidence.items() if ratio > 0.0)
 
 
 def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:

@@ -23,7 +23,7 @@ from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data.axes import LegAxes, join_axes
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, polished_parts
 from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener
@@ -152,6 +152,7 @@ class ObservedOutlines:
     cameras: tuple[str, ...]  # representative view of the camera of each view
     on_actuators: bool = False  # some joints at A move
     arms: frozenset[tuple[int, str]] = frozenset()  # parts that are arms
+    polished: frozenset[tuple[int, str]] = frozenset()  # parts with such surfaces
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property
@@ -187,7 +188,16 @@ class ObservedOutlines:
     def at(self, which: IntArray) -> ObservedOutlines:
         """Select outlines by index, without biases."""
         bare = self.without_biases()
-        shared = ("parts", "views", "series", "cameras", "on_actuators", "arms", "memory")
+        shared = (
+            "parts",
+            "views",
+            "series",
+            "cameras",
+            "on_actuators",
+            "arms",
+            "polished",
+            "memory",
+        )
         chosen = {
             f.name: getattr(bare, f.name)[which] for f in fields(self) if f.name not in shared
         }
@@ -362,6 +372,7 @@ def observed_outlines(
         cameras,
         legs.n_actuators > 0,
         frozenset((j, leg.arm.link) for j, leg in enumerate(legs.nominal) if leg.arm is not None),
+        polished_parts(outlines),
     )
 
 

@@ -34,6 +34,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     estimate_noise,
     estimated_biases,
     expected_biases,
+    least_at_places,
     noise_of_the_median,
     possible_biases,
     shifts_at_places,
@@ -300,12 +301,12 @@ def _at_places(fit: Fit) -> AtPlaces | None:
     columns = {"outlines": problem.factor("outlines").whitening @ shifts}
     plain = normal_equations(problem, state, linear)
     sigma = sigmas_at_places(*score_test(problem, linear, plain, columns))
-    if not sigma.any():
+    of_places = np.repeat(sigma, shifts.shape[2] // len(sigma))
+    of_places = np.maximum(of_places, least_at_places(problem.outlines, shifts))
+    if not of_places.any():
         return None
     normal = information(problem, state, linear, problem.loss)
-    moved = response(problem, linear, normal, columns) * np.repeat(
-        sigma, shifts.shape[2] // len(sigma)
-    )
+    moved = response(problem, linear, normal, columns) * of_places
     return AtPlaces(sigma, moved @ moved.T)
 
 
