@@ -7,7 +7,7 @@ a highlight: Lambert's law, darker towards the limb or not, and lobes about half
 and camera (Blinn), exponents 5 to 200. The light along the depth is fitted by powers of r up to
 r^4, less the background, which has the mean light of another such surface. Prints the principal
 directions of these coefficients in units of the contrast, their median sizes as standard
-deviations, and what the powers leave: the first two are ``MATTE`` and ``MATTE_SIGMA`` of
+deviations, and what the powers leave: the first two are ``MATTE_DIRECTIONS`` and ``MATTE_SIGMA`` of
 ``legcal.perception.limb``.
 """
 
@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.perception.limb import MATTE, MATTE_SIGMA
+from legcal.perception.limb import MATTE_DIRECTIONS, MATTE_SIGMA
 
 LAMPS, IN_FRONT = 2, 0.8
 EXPONENTS, GLOSS, EVEN, DARKENING = (5.0, 200.0), (0.0, 1.0), (0.02, 0.5), 0.6
@@ -68,12 +68,12 @@ def main() -> None:
     seen = contrast > LEAST_CONTRAST * np.median(contrast)
     coefficients, left = (x[seen] / contrast[seen, None] for x in (coefficients, left))
     _, vector = np.linalg.eigh(coefficients.T @ coefficients)
-    vector *= np.sign(np.sum(vector * MATTE.T, axis=0))
+    vector *= np.sign(np.sum(vector * MATTE_DIRECTIONS.T, axis=0))
     size = np.median(np.abs(coefficients @ vector), axis=0) / MEDIAN_SIZE
     print("principal directions, by r^0 to r^4", np.round(vector.T, 3), sep="\n")
     print("standard deviations", np.round(size, 2))
     print(f"left by the powers: {np.sqrt(np.mean(left**2)):.3f} of the contrast")
-    turned = np.abs(vector.T - MATTE).max()
+    turned = np.abs(vector.T - MATTE_DIRECTIONS).max()
     print(f"constants differ by {turned:.3f}, sizes by {np.abs(size / MATTE_SIGMA - 1).max():.3f}")
 
 

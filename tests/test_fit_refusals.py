@@ -68,6 +68,7 @@ def one_pose_many_times(n_times: int) -> HexapodSession:
         used=np.tile(o.used, n_times),
         gamma=np.tile(o.gamma, n_times),
         by_gamma=np.tile(o.by_gamma, n_times),
+        polish=np.tile(o.polish, n_times),
         part=o.part * n_times,
         reason=o.reason * n_times,
         source=o.source * n_times,

@@ -328,6 +328,25 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
 
 
+def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None:
+    session = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4)
+    rng = np.random.default_rng(0)
+    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    matte, polished = (
+        refine(
+            session.legs,
+            measurements,
+            replace(outlines, polish=np.full(len(outlines), polish)),
+            disturbed_start(session),
+        )
+        for polish in (-3.0, 3.0)
+    )
+    np.testing.assert_allclose(joint_errors(polished.parameters), joint_errors(matte.parameters))
+    assert polished.quality.shared_px[PLACES[0]] == pytest.approx(0.2, rel=0.05)
+    sigma, less = (np.sqrt(np.diag(one.kinematic.covariance)) for one in (polished, matte))
+    assert np.median(sigma / less) > 2.0
+
+
 def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSession) -> None:
     start, shared = disturbed_start(session), []
     for seed in range(3):

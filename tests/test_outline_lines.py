@@ -18,7 +18,7 @@ from legcal.perception.blocks import (
 )
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
-    MATTE,
+    MATTE_DIRECTIONS,
     N_AMPLITUDES,
     N_POWERS,
     powers,
@@ -216,7 +216,7 @@ HALF_WIDTH, DEPTH = 15.0, 3.5
 
 def amplitudes(background: float, slope: float, *of_r: float) -> Array:
     """Return the amplitudes of a profile with a surface of so much of r^0 to r^4."""
-    surface = np.linalg.solve(MATTE.T, np.array(of_r) - [background, 0.0, 0.0, 0.0, 0.0])
+    surface = np.linalg.solve(MATTE_DIRECTIONS.T, np.array(of_r) - [background, 0.0, 0.0, 0.0, 0.0])
     return np.array([background, slope, *surface])
 
 

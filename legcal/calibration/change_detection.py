@@ -81,7 +81,7 @@ class LikelihoodRatio:
     def p_value(self, noise_dof: int) -> float:
         """Return the probability of so much or more if nothing moved, by its first two moments."""
         mean, variance = float(np.sum(self.parts)), 2.0 * float(np.sum(self.parts**2))
-        return float(fdtrc(2.0 * mean**2 / variance, noise_dof, self.saved / mean))
+        return float(fdtrc(2.0 * mean**2 / variance, max(noise_dof, 1), self.saved / mean))
 
 
 @dataclass(frozen=True, eq=False)

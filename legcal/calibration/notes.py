@@ -22,7 +22,7 @@ class Topic(StrEnum):
 class Note(str):
     """A sentence with its topic; one without is about the fit."""
 
-    topic: Topic
+    topic: Topic = Topic.FIT
 
     @classmethod
     def about(cls, topic: Topic, sentences: Iterable[str]) -> list[Note]:

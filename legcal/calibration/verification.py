@@ -55,6 +55,7 @@ from legcal.workers import Workers, worker_pool
 
 SIGNIFICANCE = 0.01
 MAX_SIGNIFICANCE = 0.5
+BETTER = 2.5  # of costs, by which another minimum of the new images is the one
 PRIOR_SIGMA = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
 
 
@@ -343,11 +344,12 @@ def _fits(
         most = of.settings.max_iterations
         return minimise(of, begin, loss, max_iterations=most, must_converge=False)
 
-    there = minimum(with_earlier, replace(state, legs=problem.legs.nominal))
+    starts = (replace(state, legs=problem.legs.nominal), state)
+    there = min((minimum(with_earlier, begin) for begin in starts), key=lambda one: one.cost)
     near, elsewhere = minimum(problem, there.state), minimum(problem, state)
-    best = near if near.cost <= elsewhere.cost else elsewhere
+    best = elsewhere if near.cost - elsewhere.cost > BETTER else near
     beside, free = (_Free(problem, one, which, more, prior.sigma) for one in (near, best))
-    saved = 2.0 * (there.cost - best.cost)
+    saved = 2.0 * (there.cost - min(near.cost, elsewhere.cost))
     return free, beside, max(saved, 0.0)  # images of the earlier result save nothing
 
 

@@ -43,7 +43,7 @@ NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
 
-MAX_POLISH = 4.0  # of the log likelihood ratio of one outline: one in fifty is of something else
+MAX_POLISH = 4.0  # log likelihood ratio by which one outline speaks for or against polish at most
 UNIT_EXACT = 1e-12  # |h| as computed; it is kept as it stands
 UNIT_TOLERANCE = 1e-3  # |h| as written with few digits; it is normalised
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it

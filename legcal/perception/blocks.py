@@ -68,7 +68,7 @@ class Blocks:
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
     half_width: Array  # (n_edges,)
-    finish: IntArray  # (n_edges,) of surfaces: 0 matte, 1 polished
+    finish: IntArray  # (n_edges,) of surfaces, as limb.py numbers them
     level: Array  # (n_edges,) mean light of each edge
     clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
     moved: Array  # (n,) [px]

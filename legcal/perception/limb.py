@@ -15,10 +15,10 @@ hundred up to rho = 0.8. All blocks of an outline are fitted together with seven
     five surfaces   inside, less the background: sums of 1, r, ..., r^4
 
 How much of each there may be depends on the finish. Matte to glossy cylinders under lamps anywhere
-have five surfaces in the principal directions of what they send (``SURFACES``), with the sizes of
-the median cylinder (``SURFACE_SIGMA``). A polished cylinder reflects its surroundings besides, at
+have five surfaces in the principal directions of what they send, with the sizes of the median
+cylinder. A polished cylinder reflects its surroundings besides, at
 the limb those close behind it and 90 degrees away where r = 0.7: stripes, taken as a random process
-of r that forgets itself over ``REFLECTION_LENGTH``. Single blocks are fitted with five functions
+of r with the correlation length ``REFLECTION_LENGTH``. Single blocks are fitted with five functions
 that most limbs are made of (:func:`simple_functions`).
 """
 
@@ -74,9 +74,9 @@ def powers(z: Array) -> tuple[Array, Array]:
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
 N_AMPLITUDES = 7
-# Rows: the principal directions of r^0 to r^4, and standard deviations of these, in contrasts, by
-# benchmarks/limb_light.py; matte ones and polished ones.
-MATTE = np.array(
+# Of matte surfaces: rows are the principal directions of r^0 to r^4, with standard deviations in
+# contrasts, by benchmarks/limb_light.py.
+MATTE_DIRECTIONS = np.array(
     [
         [-0.400, -0.363, -0.506, -0.500, -0.450],
         [-0.632, -0.520, 0.136, 0.369, 0.419],
@@ -86,8 +86,8 @@ MATTE = np.array(
     ]
 )
 MATTE_SIGMA = np.array([0.59, 0.98, 1.13, 0.95, 7.26])
-# Of what polished surfaces reflect besides: standard deviation in contrasts, over which r it
-# forgets itself, and the largest r, which is that of the depth that is looked at.
+# Of what polished surfaces reflect besides: standard deviation in contrasts, correlation length in
+# r, and the largest r, which is that of the depth that is looked at.
 REFLECTION, REFLECTION_LENGTH, REFLECTION_REACH = 0.3, 0.4, 0.7
 
 
@@ -109,10 +109,11 @@ def _principal(covariance: Array) -> tuple[Array, Array]:
     return directions.T, np.sqrt(variance)
 
 
-_MATTE = MATTE.T @ (MATTE_SIGMA**2 * MATTE.T).T
-POLISHED, POLISHED_SIGMA = _principal(_MATTE + _reflections())
-SURFACES = np.stack([MATTE, POLISHED])  # by finish: 0 matte, 1 polished
-SURFACE_SIGMA = np.stack([MATTE_SIGMA, POLISHED_SIGMA])
+_OF_MATTE = MATTE_DIRECTIONS.T @ (MATTE_SIGMA**2 * MATTE_DIRECTIONS.T).T
+_POLISHED_DIRECTIONS, _POLISHED_SIGMA = _principal(_OF_MATTE + _reflections())
+MATTE, POLISHED = 0, 1  # finishes, by which the following are ordered
+SURFACES = np.stack([MATTE_DIRECTIONS, _POLISHED_DIRECTIONS])
+SURFACE_SIGMA = np.stack([MATTE_SIGMA, _POLISHED_SIGMA])
 
 _ROOT = float(np.sqrt(2.0))
 # Rows: r^0 to r^4 by rho^0, rho^(1/2), rho, rho^(3/2), rho^2.

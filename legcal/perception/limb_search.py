@@ -15,11 +15,12 @@ from legcal.geometry.types import Array
 from legcal.perception.light import to_light
 from legcal.perception.limb import (
     N_AMPLITUDES,
-    SURFACE_SIGMA,
+    POLISHED,
     powers,
     profile_functions,
 )
 from legcal.perception.pixel_sums import PixelBins, applied, medians
+from legcal.perception.pooled_fit import COMMON
 from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
@@ -28,8 +29,6 @@ SHIFTS = np.arange(-4.0, 4.25, 0.5)  # of a limb towards the inside that are tri
 DEPTHS = 7.0, 3.0  # of pixels outside and inside a line [px]
 MAX_DEPTH = 0.8  # of the latter, in half-widths
 ROWS, MOST_BLOCKS, MIN_SAMPLES = 8, 16, 30  # of a block, of an outline, and of pixels of a block
-POLISHED = 1  # surfaces are taken to be
-AMPLITUDES = np.array([1e3, 0.3, *SURFACE_SIGMA[POLISHED]])  # standard deviations, in contrasts
 MIN_NOISE, NOISE_ROUNDS = 0.1, 3  # variance [grey levels^2]
 MOST_VOTE = 10.0  # log likelihood by which a block speaks against a place at most
 MIN_GAIN, MIN_SHIFT = 8.0, 1.0  # in log likelihood, and [px], for which another edge is taken
@@ -72,7 +71,7 @@ def _evidence(grey: Grey, camera: Camera, edges: Sequence[Edge], blur: float) ->
     sums = PixelBins.of(read.d[kept], weight, blur, window=window).sums(light)
     power, count = sums.power.sum(axis=1), sums.count.sum(axis=1)
     contrast = medians(2.0 * np.sqrt(power / count) + 1.0, edge, bounds)
-    prior = np.eye(N_AMPLITUDES) * ((AMPLITUDES * contrast[:, None]) ** -2)[edge, None]
+    prior = np.eye(N_AMPLITUDES) * ((COMMON[POLISHED] * contrast[:, None]) ** -2)[edge, None]
     one = np.full(len(edges), blur)
     design = profile_functions(half_width, one, outer, POLISHED)[0][edge]
     whole = (0, len(edge))
@@ -96,6 +95,9 @@ def _evidence(grey: Grey, camera: Camera, edges: Sequence[Edge], blur: float) ->
     explained = np.sum(pull * np.linalg.solve(system, pull[..., None])[..., 0], axis=-1)
     likelihood = 0.5 * (explained - np.linalg.slogdet(system)[1])
     vote = np.logaddexp(-MOST_VOTE, likelihood - likelihood.max(axis=0))
+    # Too deep inside the limb its expansion is no use, and with no surface in sight there is none.
+    surface = inner[edge] - SHIFTS[:, None]
+    vote[(surface > MAX_DEPTH * half_width[edge]) | (surface <= 0.0)] = -MOST_VOTE
     for k in np.unique(edge).tolist():
         evidence[k] = vote[:, bounds[k] : bounds[k + 1]].sum(axis=1)
     return evidence

@@ -71,7 +71,7 @@ class ImageSearch:
     # The legs of which arms are parts: they follow the legs, and no fit knows their widths
     arms: tuple[int, ...] = ()
     occluders: PlacedOccluders = field(default_factory=PlacedOccluders.none)  # in its frame
-    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with such surfaces
+    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with polished surfaces
 
     @property
     def n_legs(self) -> int:
@@ -131,7 +131,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
             for pair in [part.near if near else part.edges.v]
             for v, epsilon in zip(pair, EPSILON, strict=True)
         ]
-        edges = _at_limbs(search, parts, edges)
+        parts, edges = _at_limbs(search, parts, edges)
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near
         )
@@ -141,22 +141,31 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
     return outline_table(search, found), blur
 
 
-def _at_limbs(search: ImageSearch, parts: Sequence[LegPart], edges: list[Edge]) -> list[Edge]:
-    """Return edges with those of polished parts at their limbs, not at stripes beside these."""
+def _at_limbs(
+    search: ImageSearch, parts: list[LegPart], edges: list[Edge]
+) -> tuple[list[LegPart], list[Edge]]:
+    """Return parts and edges with those of polished parts at their limbs, not at stripes."""
     polished = [i for i, one in enumerate(edges[::2]) if one.polished]
     if not polished:
-        return edges
+        return parts, edges
     own = [edge for i in polished for edge in edges[2 * i : 2 * i + 2]]
     apart = np.array([np.mean(two.v - one.v) for one, two in zip(own[::2], own[1::2], strict=True)])
     width = np.array([np.mean(parts[i].predicted[1] - parts[i].predicted[0]) for i in polished])
     sigma = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
     blur = FIRST_BLUR if search.blur is None else search.blur
     inside = limb_shifts(search.grey, search.camera, own, blur, apart - width, sigma)
-    edges = list(edges)
-    for k, shift in enumerate(inside.tolist()):
-        i = 2 * polished[k // 2] + k % 2
-        edges[i] = replace(edges[i], v=edges[i].v + edges[i].epsilon * shift)
-    return edges
+    parts, edges = list(parts), list(edges)
+    for i, shift in zip(polished, inside.reshape(-1, 2), strict=True):
+        if not shift.any():
+            continue
+        pair = edges[2 * i : 2 * i + 2]
+        v = np.array([e.v + e.epsilon * s for e, s in zip(pair, shift.tolist(), strict=True)])
+        half_width = 0.5 * float(np.mean(v[1] - v[0]))
+        edges[2 * i : 2 * i + 2] = [
+            replace(e, v=own_v, half_width=half_width) for e, own_v in zip(pair, v, strict=True)
+        ]
+        parts[i] = replace(parts[i], pair=replace(parts[i].edges, v=v))
+    return parts, edges
 
 
 def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:

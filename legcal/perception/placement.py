@@ -238,7 +238,7 @@ class Placement:
     pixel_error: float = WINDOW_PX  # [px]
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
-    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with such surfaces
+    polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with polished surfaces
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
     moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs

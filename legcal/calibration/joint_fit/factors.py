@@ -152,7 +152,7 @@ class ObservedOutlines:
     cameras: tuple[str, ...]  # representative view of the camera of each view
     on_actuators: bool = False  # some joints at A move
     arms: frozenset[tuple[int, str]] = frozenset()  # parts that are arms
-    polished: frozenset[tuple[int, str]] = frozenset()  # parts with such surfaces
+    polished: frozenset[tuple[int, str]] = frozenset()  # parts with polished surfaces
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
     @property

@@ -64,8 +64,8 @@ N_KINDS = len(KINDS) + 1
 GAMMA_SIGMA = 0.5  # prior on ln gamma: photographs are linear, or near 2.2
 SIDEWAYS = np.sqrt(2.0)  # ratio of the standard deviations of sideways and inward biases
 _MAX_PLACES = 100  # with the most outlines
-# Bias at a place of a polished part, which reflects much the same there in all poses [px]: means of
-# edges in a view scatter by that in photographs of chromed and polished rods with truth.
+# Bias at a place of a polished part, which reflects much the same there in all poses [px]: in
+# photographs of chromed and polished rods with truth, means of an edge in a view scatter by that.
 _POLISHED_BIAS = 0.2
 _MIN_BIAS_GAIN = 6.0  # one set of white residuals in ten to twenty gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
@@ -496,7 +496,7 @@ def shifts_at_places(outlines: ObservedOutlines, used: BoolArray) -> Array:
     shifts = np.zeros((len(o), len(_MODES[0][1]), len(PLACES), len(clusters)))
     for k, members in enumerate(clusters):
         shifts[members, :, :, k] = shifts_of_edges(len(members))
-    return shifts.reshape(*shifts.shape[:2], -1)
+    return shifts.reshape(*shifts.shape[:2], len(PLACES) * len(clusters))
 
 
 def least_at_places(outlines: ObservedOutlines, shifts: Array) -> Array:

@@ -70,7 +70,7 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 class AtPlaces:
     """Errors of edges that return to places; not estimated as biases."""
 
-    sigma: Array  # (2,) of ``PLACES`` [px]
+    sigma: Array  # (2,) of ``PLACES``, root mean squares over all places [px]
     covariance: Array  # (n_kept, n_kept) added to the covariance of the kept unknowns
 
 
@@ -83,7 +83,7 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    at_places: AtPlaces | None = None  # errors shared there, None where residuals show none
+    at_places: AtPlaces | None = None  # errors shared there, None where there are none
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
 
     @property
@@ -201,7 +201,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     _refuse_wrong_axes(fit)
     return replace(
         fit,
-        at_places=_at_places(fit) if fit.edge_biases.are_shown else None,
+        at_places=_at_places(fit),
         notes=check_convergence(changes, problem.outlines.covariance, problem.settings),
     )
 
@@ -293,20 +293,28 @@ def _without_wrong_readings(
 
 
 def _at_places(fit: Fit) -> AtPlaces | None:
-    """Estimate errors at places from the residuals, and their effect on the covariance."""
+    """Return errors at places and their effect on the covariance; None where there are none.
+
+    They are estimated where residuals show biases at all; those of polished parts are there anyway.
+    """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    if not (fit.edge_biases.are_shown or problem.outlines.polished):
+        return None
     shifts = shifts_at_places(problem.outlines, fit.accepted)
     if not shifts.size:
         return None
+    least = least_at_places(problem.outlines, shifts)
     columns = {"outlines": problem.factor("outlines").whitening @ shifts}
-    plain = normal_equations(problem, state, linear)
-    sigma = sigmas_at_places(*score_test(problem, linear, plain, columns))
-    of_places = np.repeat(sigma, shifts.shape[2] // len(sigma))
-    of_places = np.maximum(of_places, least_at_places(problem.outlines, shifts))
+    shown = np.zeros(len(PLACES))
+    if fit.edge_biases.are_shown:
+        plain = normal_equations(problem, state, linear)
+        shown = sigmas_at_places(*score_test(problem, linear, plain, columns))
+    of_places = np.maximum(np.repeat(shown, shifts.shape[2] // len(shown)), least)
     if not of_places.any():
         return None
     normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * of_places
+    sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
     return AtPlaces(sigma, moved @ moved.T)
 
 
