@@ -131,7 +131,7 @@ def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     free = sigma > 0.0  # all but twists
     assert not found.outlines.used[wrong].any()
     assert (~found.outlines.used[~wrong]).sum() <= 2
-    assert all("px" in found.outlines.reason[i].detail for i in np.flatnonzero(wrong))
+    assert all("px" in str(found.outlines.reason[i].detail) for i in np.flatnonzero(wrong))
     of_clean, of_dirty = (
         np.sqrt(np.mean((_errors(session, one)[free] / sigma[free]) ** 2)) for one in (clean, found)
     )
@@ -191,7 +191,7 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     assert str(found.outlines.reason[99]) == "disagrees with the fit by 5.4 px"
     for wrong, (_, reason) in swaps.items():
         assert found.outlines.reason[wrong].reason is Reason.DISAGREES
-        assert found.outlines.reason[wrong].detail.endswith(reason)
+        assert str(found.outlines.reason[wrong].detail).endswith(reason)
     assert np.abs(joint_errors(found.parameters)).max() < 1e-9
 
 

@@ -240,7 +240,7 @@ def test_sentences_of_earlier_versions_are_read_as_reasons(
     found = read(path).reason[0]
     assert found == Rejection(code, detail)
     assert str(found) == text.partition(", found")[0]
-    assert read_rejection(found.reason, found.detail) == found
+    assert read_rejection(found.reason, str(found.detail)) == found
 
 
 # --- refused
