@@ -60,10 +60,10 @@ def _joined(values: tuple[Value, ...]) -> Value:
         return together([value for value in values if isinstance(value, Cause)])
     numbers: list[float] = []
     for value in values:
-        if isinstance(value, Figures):
+        if isinstance(value, int | float):
+            numbers.append(value)
+        elif isinstance(value, Figures):
             numbers += value
-        elif not isinstance(value, str | Cause):
-            numbers.append(float(value))
     return Figures(numbers)
 
 
