@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.perception.blocks import MAX_DEPTH, ROWS
 from legcal.perception.light import to_light
 from legcal.perception.limb import (
     N_AMPLITUDES,
@@ -20,15 +21,14 @@ from legcal.perception.limb import (
     profile_functions,
 )
 from legcal.perception.pixel_sums import PixelBins, applied, medians
-from legcal.perception.pooled_fit import COMMON
+from legcal.perception.pooled_fit import COMMON, MIN_SAMPLES
 from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 
 SHIFTS = np.arange(-4.0, 4.25, 0.5)  # of a limb towards the inside that are tried [px]
 DEPTHS = 7.0, 3.0  # of pixels outside and inside a line [px]
-MAX_DEPTH = 0.8  # of the latter, in half-widths
-ROWS, MOST_BLOCKS, MIN_SAMPLES = 8, 16, 30  # of a block, of an outline, and of pixels of a block
+MOST_BLOCKS = 16  # of an outline
 MIN_NOISE, NOISE_ROUNDS = 0.1, 3  # variance [grey levels^2]
 MOST_VOTE = 10.0  # log likelihood by which a block speaks against a place at most
 MIN_GAIN, MIN_SHIFT = 8.0, 1.0  # in log likelihood, and [px], for which another edge is taken
