@@ -1,8 +1,8 @@
-"""Photographs measured again close to a fit, and fitted again.
+"""Second measurement of the photographs near a fit, and a second fit.
 
-What is measured there depends little on where the search for the fit began: fits that agree give
-the same outlines, others give edges that light leaves open at one or another place. Where the
-outlines show the gamma of a camera that is not given, all is done again with that.
+Outlines measured there hardly depend on the start of the search: fits that agree give the same
+outlines; others give edges that light leaves open at one or another place. Where outlines show the
+gamma of a camera that is not given, they are measured and fitted again with that gamma.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from legcal.perception.photographs import (
 )
 from legcal.perception.placement import Placement, placed_arms
 
-# Of joints between two fits, from where on outlines are measured again: this percentile of all
-MOVED_PX, MOST_JOINTS, MOST_ROUNDS = 1.0, 90.0, 4
-MIN_FOUND_AGAIN = 0.5  # of the outlines of an image, or of all
+# Outlines are measured again while this percentile of the joints moves by more, at most so often
+MAX_JOINT_SHIFT_PX, JOINT_PERCENTILE, MAX_ROUNDS = 1.0, 90.0, 4
+MIN_FOUND_AGAIN = 0.5  # least share of the outlines of an image, or of all
 
 
 def measure_again(
@@ -50,10 +50,10 @@ def measure_again(
     board: BoardViews | None,
     options: Options,
 ) -> Estimate:
-    """Search photographs again, close to a fit, and fit again.
+    """Measure photographs again near a fit, and fit again.
 
-    Those that were kept, and those in which nothing like the legs was found before any fit: they
-    count if most outlines are found now.
+    Photographs that show nothing like the legs before any fit are searched as well; they count if
+    most outlines are found now.
     """
     rows = seen.kept(seen.photographs.detect)
     if not len(rows):
@@ -76,22 +76,22 @@ def measure_again(
             best = there
     last, refused = first, trials.found()
     if refused:
-        found = search.fitted(best, refused)
-        if not loses_outlines(first.outlines, found.outlines):
-            last, refused = found, {}
+        with_gammas = search.fitted(best, refused)
+        if not loses_outlines(first.outlines, with_gammas.outlines):
+            last, refused = with_gammas, {}
     measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
-    facts = {image: found for image, found in data.dataset.facts.items() if image in measured}
+    facts = {image: fact for image, fact in data.dataset.facts.items() if image in measured}
     notes = compression_notes(data.measurements, facts)
     return replace(last, image_notes=(*trials.notes(refused), *notes))
 
 
 @dataclass(frozen=True, eq=False)
 class _SearchNearFit:
-    """Photographs that are measured close to a fit, and what else fits have in common."""
+    """Photographs that are measured near fits, with the data and options of these fits."""
 
     data: OrderedDataset
     photographs: Photographs  # those that are searched again
-    seen: MeasuredImages  # what was found before any fit
+    seen: MeasuredImages  # the first measurement, before any fit
     board: BoardViews | None
     options: Options
 
@@ -107,24 +107,27 @@ class _SearchNearFit:
     def converged(self, near: Estimate) -> Estimate:
         """Measure near a fit and fit again, until outlines are where they were looked for."""
         joints = self._joints(near)
-        for _ in range(MOST_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             near, before = self.fitted(near, {}), joints
             joints = self._joints(near)
             away = np.linalg.norm(joints - before, axis=-1)
-            if not np.isfinite(away).any() or np.nanpercentile(away, MOST_JOINTS) <= MOVED_PX:
+            if (
+                not np.isfinite(away).any()
+                or np.nanpercentile(away, JOINT_PERCENTILE) <= MAX_JOINT_SHIFT_PX
+            ):
                 break
         return near
 
     def _joints(self, near: Estimate) -> Array:
-        """Return where photographs show the joints of a fit, (n, 2 n_legs, 2) [px], or NaN."""
+        """Return the images of the joints of a fit, (n, 2 n_legs, 2) [px]; NaN behind a camera."""
         m, rows = self.data.measurements, self.photographs.detect
         _, placement = self.at(near, {})
         joints = np.concatenate([placement.A_base, placement.B_base], axis=1)[rows]
         pixels = np.full((*joints.shape[:2], 2), np.nan)
-        for of_row, own, v in zip(pixels, joints, m.view[rows].tolist(), strict=True):
+        for of_row, joints_of_row, v in zip(pixels, joints, m.view[rows].tolist(), strict=True):
             T = placement.T_base_camera[v]
             if T is not None:
-                X = T.inv().apply(own)
+                X = T.inv().apply(joints_of_row)
                 ahead = X[:, 2] > 0.0
                 of_row[ahead] = m.views[v].camera.project(X[ahead])
         return pixels
@@ -146,7 +149,7 @@ class _SearchNearFit:
             outlines = max(outlines, with_other, key=lambda found: int(found.used.sum()))
         # The table and the next fit have the cameras of the files.
         both, view = (photographs, self.photographs), self.data.measurements.view
-        lenses = [[one.camera for one in p.measurements.views] for p in both]
+        lenses = [[seen.camera for seen in p.measurements.views] for p in both]
         outlines = through_cameras(outlines, view[outlines.row], *lenses)
         still = hardly_shown(outlines, self.seen.unlike)
         outlines = reject_images(outlines, dict.fromkeys(still, Rejection(Reason.OTHER_SCENE)))
@@ -160,7 +163,7 @@ class _SearchNearFit:
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     """Return the visible cylinders of the legs with the radii of a fit.
 
-    Cylinders of a leg that were equally thick stay so: they look like one.
+    Cylinders of a leg with the same radius keep the same radius.
     """
     fitted = [
         {
@@ -174,7 +177,7 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 
 
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
-    """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
+    """Return the legs and cameras of a fit, with R_b on the nominal one."""
     T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
     m = data.measurements
     q = measured_readings(solution.legs, *poses, m.q_of_poses)
@@ -201,7 +204,7 @@ def hardly_shown(outlines: Outlines, rows: Iterable[int]) -> list[int]:
     """Return the images of some of which less than half of the visible outlines is used."""
     shown = outlines.choose(is_visible(outlines))
     used = {row: shown.used[shown.row == row] for row in rows}
-    return [row for row, own in used.items() if not len(own) or own.mean() < MIN_FOUND_AGAIN]
+    return [row for row, flags in used.items() if not len(flags) or flags.mean() < MIN_FOUND_AGAIN]
 
 
 def not_found_again(first: Estimate, again: Estimate) -> list[str]:
@@ -209,9 +212,9 @@ def not_found_again(first: Estimate, again: Estimate) -> list[str]:
 
     Those on cameras as well, where that is so of all images together.
     """
-    before, found = first.outliers, again.solution.outlines
-    gone = hardly_shown(found, [row for row in before if row not in again.outliers])
-    few_found = found.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
+    before, outlines = first.outliers, again.solution.outlines
+    gone = hardly_shown(outlines, [row for row in before if row not in again.outliers])
+    few_found = outlines.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
     cameras = first.solution.camera_doubts.notes if few_found else ()
     notes = image_notes(first.fitted.measurements, {row: before[row] for row in gone})
     return [*cameras, *notes]

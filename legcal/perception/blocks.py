@@ -24,8 +24,8 @@ DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 MAX_DEPTH = 0.8  # largest used depth, in half-widths
 NEAR_DEPTH = (1.0, 2.0)  # the same inside narrow parts once lines are known well
 MILD_DEPTH, MAX_NEAR_DEPTH = 0.25, 0.6  # then, in half-widths: used if it is more; and at most
-ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
-MIN_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
+ROWS = 8  # rows of a block in the first rounds, and in the last ones of a sharp picture
+MIN_ROWS_CLIPPED = 16  # least rows of a block where the background saturates the picture
 MIN_SHARE_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
 ENOUGH_BLOCKS, MAX_BLOCK = 16, 3  # of an outline for longer blocks, so many times at most
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
@@ -45,7 +45,7 @@ N_ROUNDS, CONVERGED_LINE = 10, 1e-3  # of weights: at most, and until no end mov
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
 MIN_SCATTER = 0.01  # added to the standard deviation of a block [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
-MIN_BLOCKS = 4  # of a line
+MIN_BLOCKS = 4  # least blocks of a line
 
 
 def depth_for_blur(blur: float) -> float:
@@ -172,7 +172,7 @@ class Blocks:
         return bins
 
     def kept(self) -> BoolArray:
-        """Return which blocks lie on the lines of their edges, (n,)."""
+        """Whether blocks lie on the lines of their edges, (n,)."""
         return np.asarray(self.shares() > 0.0)
 
     def shares(self) -> Array:
@@ -228,13 +228,13 @@ class Blocks:
             lines = fit_lines(bounds, position, shift, fit.variance / gain**2, largest)
             after = before.copy()
             for k, (i, line) in enumerate(zip(np.flatnonzero(active).tolist(), lines, strict=True)):
-                self.lines[i], own = line, slice(bounds[k], bounds[k + 1])
+                self.lines[i], in_line = line, slice(bounds[k], bounds[k + 1])
                 if line is None:
                     active[i] = False
                     continue
-                along = line.ends[0] + (line.ends[1] - line.ends[0]) * position[own]
-                after[own] = along * gain[own]
-                active[i] = np.abs(after[own] - before[own]).max() > CONVERGED
+                along = line.ends[0] + (line.ends[1] - line.ends[0]) * position[in_line]
+                after[in_line] = along * gain[in_line]
+                active[i] = np.abs(after[in_line] - before[in_line]).max() > CONVERGED
             self.moved[chosen] = after
             if not np.any(active):
                 break
@@ -280,7 +280,7 @@ class BlockFit:
     freedom: Array  # samples beyond what is fitted, at least one
     normal: Array  # (n, 5, 5) products of the functions of the limb model
     right: Array  # (n, 5) of them with the grey levels
-    power: Array  # of grey levels
+    power: Array  # sums of squared grey levels
 
     def sharpness(self) -> Array:
         """Return how much chi^2 (n,) falls by there being more than a bend of the shading."""
@@ -345,9 +345,9 @@ def fit_blocks(
     return BlockFit(shift, variance, noise, contrast, freedom, *of_model)
 
 
-def _dot(one: Array, other: Array) -> Array:
+def _dot(a: Array, b: Array) -> Array:
     """Return the products (n,) of vectors (n, k)."""
-    return np.asarray(np.einsum("nk,nk->n", one, other), dtype=np.float64)
+    return np.asarray(np.einsum("nk,nk->n", a, b), dtype=np.float64)
 
 
 def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: Array) -> Array:

@@ -74,7 +74,7 @@ def powers(z: Array) -> tuple[Array, Array]:
 
 BACKGROUND, SLOPE, SURFACE = 0, 1, 2
 N_AMPLITUDES = 7
-# Of matte surfaces: rows are the principal directions of r^0 to r^4, with standard deviations in
+# Prior of matte surfaces: rows are principal directions of r^0 to r^4, standard deviations in
 # contrasts, by benchmarks/limb_light.py.
 MATTE_DIRECTIONS = np.array(
     [
@@ -86,7 +86,7 @@ MATTE_DIRECTIONS = np.array(
     ]
 )
 MATTE_SIGMA = np.array([0.59, 0.98, 1.13, 0.95, 7.26])
-# Of what polished surfaces reflect besides: standard deviation in contrasts, correlation length in
+# Reflections of polished surfaces besides: standard deviation in contrasts, correlation length in
 # r, and the largest r, which is that of the depth that is looked at.
 REFLECTION, REFLECTION_LENGTH, REFLECTION_REACH = 0.3, 0.4, 0.7
 
@@ -138,7 +138,7 @@ _PROFILE[:, SURFACE:, SURFACE:] = SURFACES
 def profile_functions(
     half_width: Array, blur: Array, depth: Array | float, finish: IntArray | int = 0
 ) -> tuple[Array, Array, Array]:
-    """Return what profiles are made of, as coefficients (n, N_AMPLITUDES, N_POWERS) of powers.
+    """Return the functions of profiles as coefficients (n, N_AMPLITUDES, N_POWERS) of powers.
 
     The functions above, their derivatives by the distance inside the outline [1/px], and by the
     logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the unit of the
@@ -203,7 +203,7 @@ _SIMPLE[4, [SURFACE + 2, SURFACE + 4]] = 0.5, 0.125  # rho = r^2 / 2 + r^4 / 8
 
 
 def simple_functions(half_width: Array, blur: Array) -> tuple[Array, Array]:
-    """Return what single blocks are made of, as coefficients (n, N_SIMPLE, N_POWERS) of powers.
+    """Return the functions of single blocks as coefficients (n, N_SIMPLE, N_POWERS) of powers.
 
     Constant, slope of the background, step, limb r, and depth, both as parts of the half-width; and
     their derivatives by the distance inside the outline [1/px]. Half-widths and blurs (n,) in px.

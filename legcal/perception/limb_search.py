@@ -1,4 +1,4 @@
-"""Which of several parallel edges along a part are its limbs.
+"""Choice of the limbs among parallel edges along a part.
 
 Stripes that a polished rod reflects run along it as its limbs do, often with more contrast, while
 the limb shows only where what is behind ends. The limb model tells them apart: inside it may be any
@@ -26,9 +26,9 @@ from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 
-SHIFTS = np.arange(-4.0, 4.25, 0.5)  # of a limb towards the inside that are tried [px]
-DEPTHS = 7.0, 3.0  # of pixels outside and inside a line [px]
-MOST_BLOCKS = 16  # of an outline
+SHIFTS = np.arange(-4.0, 4.25, 0.5)  # places of a limb that are tried, inwards [px]
+DEPTHS = 7.0, 3.0  # range of pixels outside and inside a line [px]
+MOST_BLOCKS = 16  # most blocks of an outline
 MIN_NOISE, NOISE_ROUNDS = 0.1, 3  # variance [grey levels^2]
 MOST_VOTE = 10.0  # log likelihood by which a block speaks against a place at most
 MIN_GAIN, MIN_SHIFT = 8.0, 1.0  # in log likelihood, and [px], for which another edge is taken
@@ -37,7 +37,7 @@ MIN_GAIN, MIN_SHIFT = 8.0, 1.0  # in log likelihood, and [px], for which another
 def limb_shifts(
     grey: Grey, camera: Camera, edges: Sequence[Edge], blur: float, narrower: Array, sigma: Array
 ) -> Array:
-    """Return how far inside lines the limbs are, (n_edges,) [px].
+    """Return the shifts of limbs from lines, positive inwards, (n_edges,) [px].
 
     Edges are edge 1 and edge 2 of each part; a part is *narrower* (n_parts,) than its edges are
     apart [px], by a standard deviation *sigma*; the blur is known roughly [px].
@@ -72,8 +72,8 @@ def _evidence(grey: Grey, camera: Camera, edges: Sequence[Edge], blur: float) ->
     power, count = sums.power.sum(axis=1), sums.count.sum(axis=1)
     contrast = medians(2.0 * np.sqrt(power / count) + 1.0, edge, bounds)
     prior = np.eye(N_AMPLITUDES) * ((COMMON[POLISHED] * contrast[:, None]) ** -2)[edge, None]
-    one = np.full(len(edges), blur)
-    design = profile_functions(half_width, one, outer, POLISHED)[0][edge]
+    blurs = np.full(len(edges), blur)
+    design = profile_functions(half_width, blurs, outer, POLISHED)[0][edge]
     whole = (0, len(edge))
     normal, right = [], []
     for shift in SHIFTS:

@@ -1,4 +1,4 @@
-"""The outlines of all legs in one image: found, measured and judged (section 3.1).
+"""Detection, measurement and judgement of the outlines of all legs in an image (section 3.1).
 
 :func:`measure` is the seam: what one image should show goes in, outlines with covariance and
 verdict come out. Reading order: where the parts should be and what hides them; the pair of edges;
@@ -34,36 +34,36 @@ from legcal.vision.image_file import Grey
 from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
 
 MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
-MIN_WIDTH = 5.0  # of a part [px]
-MAX_GUIDED_WINDOW = 0.8  # of the width, up to which a window separates both outlines
+MIN_WIDTH = 5.0  # least width of a part [px]
+MAX_GUIDED_WINDOW = 0.8  # widest window that still separates both outlines, as a part of the width
 MIN_KEPT = 0.25  # share of all unhidden blocks that must lie on the line of an outline
 MIN_CLEAR_KEPT = 0.5  # the same of an outline without its partner
-SCATTER_BLURS = 1.2  # of the blocks of an edge [blurs], where that is more than SCATTER_PX
-MAX_SIGMA = 1.0  # of an outline [px]
+SCATTER_BLURS = 1.2  # largest scatter of the blocks of an edge [blurs], at least SCATTER_PX
+MAX_SIGMA = 1.0  # largest standard deviation of an outline [px]
 STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
 MIN_STEP = 1.15  # part of the step that a saturated background must leave [px]
 # Of two outlines that are predicted well, from the predicted width: [px], standard deviations
 NEAR_WIDTH_PX, NEAR_WIDTH_SIGMAS = 0.2, 3.0
-MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
+MAX_SIGMA_RATIO = 0.75  # largest ratio of sigma of an outline to sigma of the edge of a shade
 # How far a lone outline may be from its prediction: of the window, of its partner's distance
 LONE_OFFSET, LONE_RATIO = 0.5, 0.5
-WIDTH_PART = 0.035  # of the predicted width, which two outlines may be off besides WIDTH_PX
+WIDTH_PART = 0.035  # tolerance of widths besides WIDTH_PX, as a part of the predicted width
 SLACK = 0.5  # radii by which a solid before an outline is nearer; others are the part as drawn
-NEAR_DOUBT = (0.6, 1.0)  # of such widths near a fit: where outlines count less, and not at all
+NEAR_DOUBT = (0.6, 1.0)  # tolerances at which outlines near a fit count less, and not at all
 SKEW = 0.09  # tangent of the angle, 5 deg, at which the edge of a solid passes for an outline
-LEAST_DOUBTED = 0.05  # of its weight, the root: what an outline counts that is used
-NARROW_BIAS = 0.15  # of the better of two outlines, in what their width is too small
+LEAST_DOUBTED = 0.05  # least root of the weight of an outline that is used
+NARROW_BIAS = 0.15  # bias of the better of two outlines, as a part of what their width lacks
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSearch:
-    """What one image should show, and how far from there it is looked for."""
+    """An image, the legs that it should show, and the search window around each."""
 
     row: int
     grey: Grey
     camera: Camera
     legs: Sequence[PredictedLeg]  # all that it should show: also those not looked for hide others
-    names: Sequence[str]  # of all legs, for reasons
+    names: Sequence[str]  # names of all legs, for reasons
     window: Array  # (n_legs,) largest distance from a prediction [px]; NaN: not looked for
     guided: bool = False  # whether a fit to other legs predicts them: one edge is enough
     blur: float | None = None  # as other images show it, or roughly [px]
@@ -79,7 +79,7 @@ class ImageSearch:
         return len(self.names) - len(self.arms)
 
     def leg_of(self, index: int) -> int:
-        """Return the leg of a predicted one, or that of which an arm is a part."""
+        """Return the leg of a predicted leg or arm."""
         return index if index < self.n_legs else self.arms[index - self.n_legs]
 
 
@@ -100,7 +100,7 @@ class OutlineLine(NamedTuple):
 
 
 class PartLines(NamedTuple):
-    """What was found of a part."""
+    """Both outlines of a part, with the reasons of rejected ones."""
 
     leg: int
     part: str
@@ -114,7 +114,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
 
     Two outlines for every part of every leg that is looked for, found or not.
     """
-    parts, found = find_parts(search)
+    parts, lines = find_parts(search)
     blur = math.nan
     if parts:
         near = search.near_fit
@@ -135,10 +135,10 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
         measured, blur = measure_edges(
             search.grey, search.camera, edges, together, search.blur, near_fit=near
         )
-        for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True):
+        for part, first, second in zip(parts, measured[::2], measured[1::2], strict=True):
             of_leg = near and part.leg.leg < search.n_legs
-            found.append(_with_verdict(part, (one, two), near_fit=of_leg))
-    return outline_table(search, found), blur
+            lines.append(_with_verdict(part, (first, second), near_fit=of_leg))
+    return outline_table(search, lines), blur
 
 
 def _at_limbs(
@@ -148,12 +148,17 @@ def _at_limbs(
     polished = [i for i, one in enumerate(edges[::2]) if one.polished]
     if not polished:
         return parts, edges
-    own = [edge for i in polished for edge in edges[2 * i : 2 * i + 2]]
-    apart = np.array([np.mean(two.v - one.v) for one, two in zip(own[::2], own[1::2], strict=True)])
+    polished_edges = [edge for i in polished for edge in edges[2 * i : 2 * i + 2]]
+    apart = np.array(
+        [
+            np.mean(two.v - one.v)
+            for one, two in zip(polished_edges[::2], polished_edges[1::2], strict=True)
+        ]
+    )
     width = np.array([np.mean(parts[i].predicted[1] - parts[i].predicted[0]) for i in polished])
     sigma = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
     blur = FIRST_BLUR if search.blur is None else search.blur
-    inside = limb_shifts(search.grey, search.camera, own, blur, apart - width, sigma)
+    inside = limb_shifts(search.grey, search.camera, polished_edges, blur, apart - width, sigma)
     parts, edges = list(parts), list(edges)
     for i, shift in zip(polished, inside.reshape(-1, 2), strict=True):
         if not shift.any():
@@ -318,27 +323,27 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
         radius = EPSILON * (h @ leg.A_camera)
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
     n = [len(of_part) for of_part in points]
-    own = np.repeat([part.leg.leg for part in searched], n)
+    number = np.repeat([part.leg.leg for part in searched], n)
     margin = np.repeat([MARGIN / part.band.scale for part in searched], n)
     P_camera = np.concatenate(points)
-    front = hidden_by(search.legs, own, P_camera, margin)
+    front = hidden_by(search.legs, number, P_camera, margin)
     if len(search.occluders):
         reach = margin * np.linalg.norm(P_camera, axis=1)
-        along = np.where(own < search.n_legs, own, -1)
+        along = np.where(number < search.n_legs, number, -1)
         before = SLACK * np.repeat([part.segment.radius for part in searched], n)
         solid = search.occluders.hide(P_camera, along, reach, before)
         front = np.where(solid >= 0, len(search.names) + solid, front)
-    found = [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
+    hiding = [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
     for i, occluder in enumerate(search.occluders.occluders):
         edges = search.occluders.silhouette(i)
-        for part, of_part in zip(searched, found, strict=True):
+        for part, of_part in zip(searched, hiding, strict=True):
             if part.leg.leg == occluder.leg or not len(edges):
                 continue
             free = of_part < 0
             beside = _beside(part, edges, float(search.window[part.leg.leg])) & free
             if np.any(2 * beside.sum(axis=1) > free.sum(axis=1)):
                 of_part[free] = len(search.names) + i
-    return found
+    return hiding
 
 
 def _beside(part: _Predicted, edges: Array, window: float) -> BoolArray:
@@ -424,13 +429,17 @@ def verdict(
         _rejection(edge, length, width) if seen else Rejection(Reason.NO_EDGE)
         for edge, seen in zip(measured, pair.found, strict=True)
     ]
-    one, two = measured
-    if isinstance(one, MeasuredEdge) and isinstance(two, MeasuredEdge) and not any(reasons):
-        by_width = _by_width(one, two, expected, near_fit=near_fit)
+    first_edge, second_edge = measured
+    if (
+        isinstance(first_edge, MeasuredEdge)
+        and isinstance(second_edge, MeasuredEdge)
+        and not any(reasons)
+    ):
+        by_width = _by_width(first_edge, second_edge, expected, near_fit=near_fit)
         reach = math.inf if near_fit else window
         if reach is None or not all(by_width.reasons):
             return by_width
-        return _by_place((one, two), predicted, reach, by_width)
+        return _by_place((first_edge, second_edge), predicted, reach, by_width)
     confirmed = pair.suits(expected)
     stands = [
         isinstance(edge, MeasuredEdge)
@@ -446,14 +455,14 @@ def verdict(
 
 
 def _by_width(
-    one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit: bool
+    first: MeasuredEdge, second: MeasuredEdge, expected: Array, *, near_fit: bool
 ) -> PartVerdict:
     """Judge two edges that may be trusted but for their distance."""
-    widths = two.v - one.v
-    sigma_one, sigma_two = one.sigma, two.sigma
+    widths = second.v - first.v
+    first_sigma, second_sigma = first.sigma, second.sigma
     tolerance = WIDTH_PX + WIDTH_PART * expected
     if near_fit:  # both are predicted well
-        near = NEAR_WIDTH_PX + NEAR_WIDTH_SIGMAS * math.hypot(sigma_one, sigma_two)
+        near = NEAR_WIDTH_PX + NEAR_WIDTH_SIGMAS * math.hypot(first_sigma, second_sigma)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
     if near_fit:
@@ -467,7 +476,9 @@ def _by_width(
     i = int(np.argmax(mismatch))
     reason = Rejection(Reason.WIDTH, f"{widths[i]:.1f} px for {expected[i]:.1f} px")
     better, ratio = (
-        (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
+        (first, first_sigma / second_sigma)
+        if first_sigma < second_sigma
+        else (second, second_sigma / first_sigma)
     )
     if (
         near_fit
@@ -477,7 +488,7 @@ def _by_width(
     ):
         return PartVerdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
-    return PartVerdict((USED, reason) if better is one else (reason, USED), bias)
+    return PartVerdict((USED, reason) if better is first else (reason, USED), bias)
 
 
 def _by_place(

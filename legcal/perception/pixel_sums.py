@@ -24,10 +24,10 @@ from legcal.perception.light import Samples
 
 BINS_PER_BLUR = 3.0
 STEP_END = (1.0, 2.5)  # distance from an outline at which the step is over: [px] and in blurs
-N_SMOOTH = 3  # of the polynomial that describes a side of a block: constant to quadratic
+N_SMOOTH = 3  # coefficients of the polynomial on a side of a block: constant to quadratic
 SIDE_PIXELS = (5.0, 15.0)  # on a side of a block, from where on it says how noisy that is, and all
-MIN_NOISE = 0.3  # of rounded grey levels: their standard deviation
-MAX_NOISE_RATIO = 8.0  # of the noise on both sides
+MIN_NOISE = 0.3  # standard deviation of rounding to grey levels
+MAX_NOISE_RATIO = 8.0  # largest ratio of the noise on both sides
 MIN_BLOCKS = 3  # blocks of an outline that give its noise
 
 
@@ -74,9 +74,9 @@ class PixelSums:
         Functions of the distance have values and slopes [1/px] (n_groups, m, k) in the middles of
         bins; each group is for the blocks between two successive bounds (n_groups + 1,).
         """
-        one, other, pair = _pairs(values.shape[-1])
-        left, right = values[..., one], values[..., other]
-        rise, fall = slopes[..., one], slopes[..., other]
+        i, j, pair = _pairs(values.shape[-1])
+        left, right = values[..., i], values[..., j]
+        rise, fall = slopes[..., i], slopes[..., j]
         pairs = np.concatenate([left * right, rise * right + left * fall, rise * fall], axis=1)
         return _by_groups(self.weight, pairs, bounds).take(pair, axis=1)
 
@@ -88,19 +88,19 @@ class PixelSums:
 def _by_groups(sums: Array, functions: Array, bounds: Sequence[int]) -> Array:
     """Return sums (n, i, m) times functions (n_groups, i m, k) of their groups, (n, k)."""
     flat = sums.reshape(len(sums), -1)
-    found = np.empty((len(sums), functions.shape[-1]))
+    products = np.empty((len(sums), functions.shape[-1]))
     for of_group, (first, last) in zip(functions, pairwise(bounds), strict=True):
-        np.matmul(flat[first:last], of_group, out=found[first:last])
-    return found
+        np.matmul(flat[first:last], of_group, out=products[first:last])
+    return products
 
 
 @lru_cache(maxsize=8)
 def _pairs(k: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return the pairs (n,) of k functions, and which pair every two of them are, (k, k)."""
-    one, other = np.triu_indices(k)
+    i, j = np.triu_indices(k)
     pair = np.empty((k, k), dtype=np.intp)
-    pair[one, other] = pair[other, one] = np.arange(len(one))
-    return one, other, pair
+    pair[i, j] = pair[j, i] = np.arange(len(i))
+    return i, j, pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +228,9 @@ def medians(values: Array, edge: IntArray, bounds: Sequence[int]) -> Array:
     ``edge`` (n,) is that of each value, those of an edge between two successive bounds.
     """
     ordered, ends = values[np.lexsort((values, edge))], np.array(bounds)
-    found, some = np.full(len(ends) - 1, np.nan), ends[1:] > ends[:-1]
-    found[some] = ordered[((ends[:-1] + ends[1:]) // 2)[some]]
-    return found
+    middle, has_values = np.full(len(ends) - 1, np.nan), ends[1:] > ends[:-1]
+    middle[has_values] = ordered[((ends[:-1] + ends[1:]) // 2)[has_values]]
+    return middle
 
 
 def applied(matrices: Array, vectors: Array) -> Array:

@@ -40,29 +40,29 @@ COMMON = np.array([[1e3, 0.3, *sigma] for sigma in SURFACE_SIGMA])
 ALONG = np.array([[1.0, 0.3, *(0.3 * sigma)] for sigma in SURFACE_SIGMA])
 OF_BLOCKS = np.array([[2.0, 1.0, *(0.2 * sigma)] for sigma in SURFACE_SIGMA])
 N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
-PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
-BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
+PRIOR_BLUR = 0.7  # prior standard deviation of the logarithm of the blur
+BLUR_SCATTER = 0.05  # scatter of the logarithm of the blur among the outlines of an image
 ROUGHNESS = 0.02  # displacement of single blocks [px]
 # Standard deviation of the lines that it starts from: [px] and in blurs.
 START_SIGMA = (0.1, 1.75)
 BLURS = (0.2, 4.0)  # least and greatest [px]
 MIN_SAMPLES = 30  # pixels of a block
 ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
-MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
+MAX_STEP = (0.7, 0.4)  # largest step of a round: line [blurs], logarithm of the blur
 MAX_MOVE_OF_SUMS = (1.0, 0.08)  # of middle and ends [blurs], to which sums over pixels serve
 MAX_MOVE = (0.1, 0.04)  # of a line [blurs] and of the logarithm of the blur, to which equations do
 CONVERGED = (0.005, 0.015)  # steps of lines [px] and log blurs, below which the last round follows
 ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
 MIN_NOISE = 0.05  # variance of grey levels [grey levels^2]
-NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # of its estimate, at most; and of its logarithm
-MIN_LIGHT = 1e-3  # of the mean light of a block
+NOISE_ROUNDS, NOISE_CONVERGED = 3, 0.2  # most rounds of the noise; change of its logarithm
+MIN_LIGHT = 1e-3  # least light of a pixel, as a part of the mean light of its block
 
 COMMON_BLUR_SIGMA = 0.03  # of the logarithm of the blur of an outline, about that of the image
 # An outline whose light is unusual, or whose blur is not that of the others once both pull at each
 # other, is known less well, and a plain one better: as from a Student t prior of so many degrees of
 # freedom.
 DEGREES, EXPECTED_ODDITY = 5.0, 4.0  # and the sum of squared pulls of outlines where all is well
-BLUR_PULL = 0.01  # of the logarithm of the blur of an outline, where all is well
+BLUR_PULL = 0.01  # usual deviation of the logarithm of the blur of an outline
 ROUNDS, ALL_ROUNDS = 10, 2  # at most; and before those that have converged are left out
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
@@ -185,7 +185,7 @@ class _Pool:
     blur: float  # that bins suit [px]
     depth: float  # distance from the outlines at which blocks end [px]
     seen: BoolArray  # (n_edges,) edges with usable blocks
-    own: Array  # (n, BLUR) how little amplitudes and places of single blocks scatter: precisions
+    block_precision: Array  # (n, BLUR) of the amplitudes and the place of single blocks
     # Sums over pixels by their distances from lines, and of products of powers with a blur.
     bins: PixelBins | None  # None where sums are those over the blocks as they are
     sums: PixelSums
@@ -224,9 +224,11 @@ class _Pool:
         lights, power = total(sums.light[:, 0].sum(axis=1)), total(sums.power.sum(axis=1))
         spread = np.maximum(power - lights**2 / np.maximum(weights, 1e-9), 0.0)
         contrast = 2.0 * np.sqrt(spread / np.maximum(count, 1.0)) + 1.0
-        own = np.empty((len(edge), BLUR))
-        own[:, :N_AMPLITUDES] = (OF_BLOCKS[blocks.finish[edge]] * contrast[edge][:, None]) ** -2
-        own[:, SHIFT] = ROUGHNESS**-2
+        block_precision = np.empty((len(edge), BLUR))
+        block_precision[:, :N_AMPLITUDES] = (
+            OF_BLOCKS[blocks.finish[edge]] * contrast[edge][:, None]
+        ) ** -2
+        block_precision[:, SHIFT] = ROUGHNESS**-2
         nowhere = np.zeros((n_edges, 2)), np.full(n_edges, np.nan)
         return cls(
             blocks,
@@ -246,7 +248,7 @@ class _Pool:
             blur,
             depth,
             weights > 0.0,
-            own,
+            block_precision,
             None,
             sums,
             nowhere[0],
@@ -282,24 +284,24 @@ class _Pool:
 
     def part(self, edges: BoolArray) -> "_Pool":
         """Return the blocks of some edges."""
-        own, rows = edges[self.edge], edges[self.row_edge]
+        is_kept, rows = edges[self.edge], edges[self.row_edge]
         usable, number = self.usable.copy(), np.cumsum(edges) - 1
         usable[usable] = rows
-        edge = number[self.edge[own]]
+        edge = number[self.edge[is_kept]]
         values, slopes, widenings = self.functions
         return replace(
             self,
             usable=usable,
-            joined=(np.cumsum(own) - 1)[self.joined[rows]],
+            joined=(np.cumsum(is_kept) - 1)[self.joined[rows]],
             row_edge=number[self.row_edge[rows]],
             edge=edge,
             bounds=np.searchsorted(edge, np.arange(np.count_nonzero(edges) + 1)).tolist(),
-            sums=self.sums.of_blocks(own),
+            sums=self.sums.of_blocks(is_kept),
             at=_Iterate(*(of_all[edges] for of_all in self.at)),
             functions=(values[edges], slopes[edges], widenings[edges]),
             **{
-                name: getattr(self, name)[own]
-                for name in ("gain", "along", "own", "products", "with_light")
+                name: getattr(self, name)[is_kept]
+                for name in ("gain", "along", "block_precision", "products", "with_light")
             },
             **{
                 name: getattr(self, name)[edges]
@@ -341,12 +343,12 @@ class _Pool:
     def first_amplitudes(self, at: _Iterate) -> _Iterate:
         """Return the amplitudes that an outline has in common, with its line where it is."""
         self.look(at)
-        values, one = self.functions[0], np.ones((len(self.edge), 1))
-        of_edge = values @ self._of_edges(self.products, one)[:, 0] @ values.swapaxes(1, 2)
+        values, ones = self.functions[0], np.ones((len(self.edge), 1))
+        of_edge = values @ self._of_edges(self.products, ones)[:, 0] @ values.swapaxes(1, 2)
         of_edge += _diagonal(
             self.noise[:, None] / (COMMON[self.finish] * self.contrast[:, None]) ** 2 + 1e-9
         )
-        target = values @ self._of_edges(self.with_light, one)[:, 0, :, None]
+        target = values @ self._of_edges(self.with_light, ones)[:, 0, :, None]
         amplitude = np.zeros_like(at.amplitude)
         amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
         return at._replace(amplitude=amplitude)
@@ -367,10 +369,10 @@ class _Pool:
         # A block's own amplitudes and place are eliminated, its blur is that of the edge:
         # what is left is known of what the edge has in common.
         for _ in range(NOISE_ROUNDS):
-            own = self.noise[edge][:, None] * self.own
-            free = np.asarray(np.linalg.inv(within + _diagonal(own)), dtype=np.float64)
+            precision = self.noise[edge][:, None] * self.block_precision
+            free = np.asarray(np.linalg.inv(within + _diagonal(precision)), dtype=np.float64)
             pull = right[:, :BLUR].copy()
-            pull[:, :N_AMPLITUDES] += own[:, :N_AMPLITUDES] * amplitude
+            pull[:, :N_AMPLITUDES] += precision[:, :N_AMPLITUDES] * amplitude
             fitted = applied(free, pull)
             explained = fitted * (2.0 * right[:, :BLUR] - applied(within, fitted))
             before = self.noise
@@ -378,9 +380,9 @@ class _Pool:
             if np.all(np.abs(np.log(self.noise / before)) < NOISE_CONVERGED):
                 break
         weight /= self.noise[edge]
-        # N - N (N + P)^-1 N = P (N + P)^-1 N, where P is the own precision.
+        # N - N (N + P)^-1 N = P (N + P)^-1 N, where P is the precision of blocks.
         elimination = np.zeros((len(edge), N_UNKNOWNS, N_UNKNOWNS))
-        elimination[:, :BLUR, :BLUR] = own[..., None] * free
+        elimination[:, :BLUR, :BLUR] = precision[..., None] * free
         elimination[:, BLUR, :BLUR] = -(normal[:, None, BLUR, :BLUR] @ free)[:, 0]
         elimination[:, BLUR, BLUR] = 1.0
         elimination *= weight[:, None, None]
@@ -444,18 +446,18 @@ class _Pool:
 
         What the blocks say of the surface that they have in common, whatever it was taken for.
         """
-        own = slice(SURFACE, N_AMPLITUDES)
+        of_surface = slice(SURFACE, N_AMPLITUDES)
         contrast = self.contrast[:, None]
-        after = np.linalg.inv(covariance[:, own, own]) * contrast[..., None] ** 2
-        before = self.precision[:, 0, own] * contrast**2
-        surface = at.amplitude[:, 0, own] / contrast
+        after = np.linalg.inv(covariance[:, of_surface, of_surface]) * contrast[..., None] ** 2
+        before = self.precision[:, 0, of_surface] * contrast**2
+        surface = at.amplitude[:, 0, of_surface] / contrast
         right = (after @ surface[..., None])[..., 0]
         ratio = polish_evidence(self.finish, after - _diagonal(before), right)
         return np.where(self.seen, ratio, np.nan)
 
     @cached_property
     def precision(self) -> Array:
-        """Return what is known beforehand of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
+        """Return the prior precision of the unknowns of edges, (n_edges, N_ALONG, N_UNKNOWNS).
 
         Lines are known by where they start, and the blur roughly.
         """
@@ -476,9 +478,9 @@ class _Pool:
         blocks = self.blocks
         if self.bins is None:
             first = np.flatnonzero(np.diff(self.joined, prepend=-1))
-            own = blocks.bins(self.blur).light(change)[self.usable]
-            own *= self.share[self.usable, None, None]
-            changed = np.add.reduceat(own, first, axis=0) if len(first) else own
+            light = blocks.bins(self.blur).light(change)[self.usable]
+            light *= self.share[self.usable, None, None]
+            changed = np.add.reduceat(light, first, axis=0) if len(first) else light
         else:
             changed = self.bins.light(change[self.usable])
         share = even_weights(self.sums.grid, self.noise_ratio[self.edge], self.blur)
@@ -491,8 +493,8 @@ class _Pool:
         widened = float(counts @ np.sum(apart * target, axis=1) / counts.sum())
         of_blur = covariance[:, :, BLUR]
         shared = 1.0 / of_blur[:, BLUR] - 1.0 / apart[:, BLUR] + PRIOR_BLUR**-2
-        found = applied(covariance, target) + widened * shared[:, None] * of_blur
-        return np.where(self.seen, found[:, SHIFT], np.nan)
+        moved = applied(covariance, target) + widened * shared[:, None] * of_blur
+        return np.where(self.seen, moved[:, SHIFT], np.nan)
 
     def _eliminated(self, equations: _Equations, left: Array) -> Array:
         """Return right sides (n_edges, N_ALONG, N_UNKNOWNS) by what is left of light (n, k)."""
@@ -520,7 +522,7 @@ class _Pool:
 
 
 def _changed_by_gamma(blocks: Blocks) -> Samples:
-    """Return how the light of all pixels changes with ln gamma, (n, m)."""
+    """Return the derivative of the light of all pixels by ln gamma, (n, m)."""
     light = blocks.light + blocks.level.astype(np.float32)[blocks.edge][:, None]
     weights = np.maximum(blocks.weight.sum(axis=1), np.float32(1e-9))
     of_block = np.einsum("nm,nm->n", light, blocks.weight) / weights

@@ -77,10 +77,12 @@ def read_profiles(
         first = np.searchsorted(edge, np.arange(len(edges) + 1))
         step = np.maximum(np.diff(first) // most, 1)
         free = (np.arange(len(edge)) - first[edge]) % step[edge] == 0
-    for k, one in enumerate(edges):
-        if np.any(one.hidden):
-            n, own = len(one.hidden), slice(*np.searchsorted(edge, [k, k + 1]))
-            free[own] &= ~one.hidden[np.clip((position[own] * n).astype(np.intp), 0, n - 1)]
+    for k, searched in enumerate(edges):
+        if np.any(searched.hidden):
+            n, blocks = len(searched.hidden), slice(*np.searchsorted(edge, [k, k + 1]))
+            free[blocks] &= ~searched.hidden[
+                np.clip((position[blocks] * n).astype(np.intp), 0, n - 1)
+            ]
     kept = np.repeat(free, n_rows)
     rows = _Rows(rows.edge[kept], rows.along[kept], rows.node[kept], rows.part[kept])
     edge = edge[free]

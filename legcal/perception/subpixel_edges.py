@@ -23,9 +23,9 @@ from legcal.vision.image_file import Grey
 
 FIRST_BLUR = 1.0  # [px]
 MIN_CHI2_GAIN = 30  # by an edge, from which on a block shows one
-FIRST_BLOCKS = 16  # of an outline
+FIRST_BLOCKS = 16  # most blocks of an outline in the first rounds
 ROUNDS, ROUNDS_NEAR = (1, 2), (2,)  # of estimates of the blur, and of one near a rough one
-LAST_ROUNDS = 2  # of lines, at most
+LAST_ROUNDS = 2  # most rounds of lines
 MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
@@ -115,7 +115,7 @@ def _measured(
     joint: PooledLines | None,
 ) -> list[MeasuredEdge | LostEdge]:
     """Return the lines of edges by their blocks, one by one or all together."""
-    found: list[MeasuredEdge | LostEdge] = []
+    lines: list[MeasuredEdge | LostEdge] = []
     kept = blocks.kept()
     edge_of = blocks.edge[kept]
     bounds = np.searchsorted(edge_of, np.arange(len(edges) + 1)).tolist()
@@ -127,7 +127,7 @@ def _measured(
         if line is None:
             depths = (blocks.clipped - blocks.moved)[blocks.edge == i]
             clipped = float(np.median(depths)) / blur if len(depths) else -math.inf
-            found.append(LostEdge(blur, clipped))
+            lines.append(LostEdge(blur, clipped))
             continue
         is_step = sharp > MIN_CHI2_GAIN
         # How far shading moves an outline: its grey levels over the slope of the step.
@@ -135,7 +135,7 @@ def _measured(
         moved = _moved(edge, at, line)
         if joint is None:
             covariance = line.covariance + bias**2
-            found.append(MeasuredEdge(moved, line, contrast, is_step, blur, covariance))
+            lines.append(MeasuredEdge(moved, line, contrast, is_step, blur, covariance))
             continue
         to_piece = np.array([[1.0 - place, place] for place in (line.first, line.last)])
         covariance = WIDENING**2 * to_piece @ joint.covariance[i] @ to_piece.T
@@ -143,7 +143,7 @@ def _measured(
         covariance += POOLED_COMMON_BIAS**2 + POOLED_TILT_BIAS**2 * np.eye(2) + bias**2
         ends = joint.ends[i]
         depth = (clipped - float(ends.mean())) / blur
-        found.append(
+        lines.append(
             MeasuredEdge(
                 moved + edge.epsilon * ends,
                 line,
@@ -156,7 +156,7 @@ def _measured(
                 float(joint.polish[i]),
             )
         )
-    return found
+    return lines
 
 
 def _moved(edge: Edge, v: Array, line: BlockLine | None) -> Array:
