@@ -21,14 +21,14 @@ class Reason(StrEnum):
     """Why an outline, a corner or an image is not used."""
 
     NONE = ""
-    # What the camera cannot see
+    # Out of sight of the camera
     OUTSIDE = "outside"
     HIDDEN = "hidden"
     NARROW = "narrow"
     SHORT = "short"
     NOT_PLACED = "not_placed"
     UNUSED_LEG = "unused_leg"
-    # What was not measured well enough
+    # Not measured well enough
     NO_PAIR = "no_pair"
     NO_EDGE = "no_edge"
     FAINT = "faint"
@@ -39,7 +39,7 @@ class Reason(StrEnum):
     UNCERTAIN = "uncertain"
     WIDTH = "width"
     PARTNER = "partner"
-    # What contradicts other measurements
+    # Contradicting other measurements
     VIEW_DISAGREES = "view_disagrees"
     DISAGREES = "disagrees"
     ARM_LEFT_OUT = "arm_left_out"
@@ -47,7 +47,7 @@ class Reason(StrEnum):
     NO_BOARD_POSE = "no_board_pose"
     CORNER_OFF = "corner_off"
     NOT_BEFORE = "not_before"
-    # What is wrong with a whole image
+    # Problems of a whole image
     BLACK = "black"
     OVEREXPOSED_IMAGE = "overexposed_image"
     EMPTY = "empty"
@@ -58,7 +58,7 @@ class Reason(StrEnum):
     OTHER_READING = "other_reading"
     OTHER_VIEW = "other_view"
     OTHER_SCENE = "other_scene"
-    # What people decide
+    # Decisions of people
     BY_HAND = "by_hand"
     OTHER = "other"
 
@@ -128,7 +128,7 @@ _PARTNER = "its other outline: "
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Why something is not used; false for what is used.
+    """The reason why an observation is not used; false for a used one.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class Rejection:
 
     @property
     def as_stored(self) -> Rejection:
-        """The same with the detail as tables have it: in words."""
+        """The same rejection with its detail in words, as stored in tables."""
         return replace(self, detail=str(self.detail))
 
     def __str__(self) -> str:
@@ -172,7 +172,7 @@ USED = Rejection()  # not rejected
 
 
 def have_reason(rejections: Sequence[Rejection], *reasons: Reason) -> BoolArray:
-    """Return a mask (n,) of the rejections for one of some reasons."""
+    """Return a mask (n,) of the rejections for any of some reasons."""
     return np.array([rejection.reason in reasons for rejection in rejections], dtype=np.bool_)
 
 
@@ -182,19 +182,19 @@ def reason_in_words(code: str) -> str:
 
 
 _CODES = frozenset(map(str, Reason))
-_SENTENCES = [  # of versions that stored sentences; the ones with a detail first
+_SENTENCES = [  # patterns of tables with sentences in place of codes; first those with a detail
     (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), Reason(code))
     for k in (1, 0)
-    for code, both in WORDS_BY_CODE.items()
-    if (words := both[k]) not in ("", "{}")
+    for code, forms in WORDS_BY_CODE.items()
+    if (words := forms[k]) not in ("", "{}")
 ]
 
 
 def read_rejection(code: str, detail: str) -> Rejection:
     """Return the rejection of the columns ``reason`` and ``detail`` of a table.
 
-    A sentence in place of a code, as earlier versions wrote, is recognised; another text is what
-    somebody noted (``OTHER``).
+    A sentence in place of a code, as earlier versions wrote, is recognised; any other text is a
+    remark of a person (``OTHER``).
     """
     if code in _CODES:
         return Rejection(Reason(code), detail)
