@@ -1,4 +1,4 @@
-"""The options of ``legcal simulate``, as people write them, made into settings."""
+"""The options of ``legcal simulate``, parsed into settings."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def requested(
 
 
 def _camera(choices: Sequence[str], level: str) -> tuple[Path | None, Appearance]:
-    """Return the camera file, and what the kind of camera does to photographs."""
+    """Return the camera file, and the appearance of photographs for the kind of camera."""
     files, looks = list[Path](), list[Appearance]()
     for choice in choices:
         kind, colon, quality = choice.partition(":")
