@@ -50,16 +50,16 @@ def export(
     from legcal.exports.subject import ExportOptions
     from legcal.report.render import report
 
-    found = formats.export(
+    exported = formats.export(
         source,
         to,
         output,
         options=ExportOptions(inertia=inertia, nodes=nodes),
         force=force,
     )
-    lines = [f"written: {path}" for path in found.paths] + list(found.notes)
+    lines = [f"written: {path}" for path in exported.paths] + list(exported.notes)
     show(
         as_json,
-        found.document,
+        exported.document,
         lambda: report([Text(line, overflow="fold") for line in lines]),
     )

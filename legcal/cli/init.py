@@ -68,11 +68,11 @@ def init(
     options = SheetOptions(
         cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
     )
-    found = plan_new_dataset(folder, readings, model, output, options)
+    dataset = plan_new_dataset(folder, readings, model, output, options)
     if not as_json:
-        print_table(matching_table(found))
-    written = write_new_dataset(found, force=force)
+        print_table(matching_table(dataset))
+    written = write_new_dataset(dataset, force=force)
     if as_json:
-        print_json(found.document(written))
+        print_json(dataset.document(written))
     else:
-        print_table(written_lines(output, written, found.machine))
+        print_table(written_lines(output, written, dataset.machine))

@@ -1,4 +1,4 @@
-"""Commands and options of earlier versions: refused with what does the same now."""
+"""Commands and options of earlier versions: refused, with their replacements."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _TABLE = "write it in the table, for which legcal new --template makes one to st
 
 
 def _setting(text: str) -> str:
-    """Return how a setting of a simulated dataset is chosen in Python."""
+    """Return in words the Python for a setting of a simulated dataset."""
     return f"call legcal.simulate(MODEL, FOLDER, legcal.SimulationSettings({text})) in Python"
 
 
@@ -134,13 +134,13 @@ def refuse_retired(words: Sequence[str]) -> None:
         if name in COMMANDS:
             raise UsageError(f"legcal {name} is gone: {COMMANDS[name]}.")
     instead = OPTIONS.get(command, {})
-    given = dict[str, None]()
+    words_given = dict[str, None]()
     for word, following in zip(words[1:], [*words[2:], ""], strict=False):
         name, equals, value = word.partition("=")
-        given |= {name: None, f"{name} {value if equals else following}": None}
+        words_given |= {name: None, f"{name} {value if equals else following}": None}
     problems = [
         f"{option} of legcal {command} is gone: {instead[option]}."
-        for option in given
+        for option in words_given
         if option in instead
     ]
     if problems:

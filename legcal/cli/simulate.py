@@ -1,4 +1,4 @@
-"""``legcal simulate``: a dataset of a machine whose truth is known."""
+"""``legcal simulate``: a dataset of a machine with known truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legcal.cli.options import (
 
 
 class _Level(StrEnum):
-    """What a dataset gives a calibration to work on."""
+    """The kind of observations in a dataset."""
 
     PHOTOGRAPHS = "photographs"
     OUTLINES = "outlines"
@@ -59,7 +59,7 @@ def simulate(
         list[str] | None,
         typer.Option(
             metavar="KIND=SIZE",
-            help="How far the true machine is from the model: joints, base-joints, "
+            help="Errors of the true machine relative to the model: joints, base-joints, "
             "platform-joints, offsets, lengths (2mm), axes, twists (0.1deg), radii (0mm); uniform "
             "in +-SIZE, or SIZE:normal; none for no errors. May be repeated.",
             show_default="joints, offsets, lengths=2mm; axes, twists=0.1deg",
@@ -77,7 +77,7 @@ def simulate(
     hand_held: Annotated[
         bool,
         typer.Option(
-            "--hand-held", help="Every image from another camera position, with the board in it."
+            "--hand-held", help="A new camera pose for every image, with the board in view."
         ),
     ] = False,
     plan: Annotated[
@@ -96,7 +96,7 @@ def simulate(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a dataset of a machine whose true model is known, and write it with the truth.
+    """Simulate a dataset of a machine with a known true model, and write it with the truth.
 
     The default is 45 photographs: 3 views of 15 extreme poses each. Python has more choices
     (legcal.SimulationSettings).

@@ -65,7 +65,7 @@ def open_browser(address: str) -> None:
 
 
 def _has_screen() -> bool:
-    """Say whether a browser with windows can be opened."""
+    """Return whether a browser with windows can be opened."""
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
