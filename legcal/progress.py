@@ -15,7 +15,7 @@ Report = Callable[[str, int, int], None]
 """Called as ``report(stage, done, total)``."""
 
 Progress = Report | bool
-"""What public functions take: True shows bars, in terminals and notebooks; False shows nothing."""
+"""True shows bars, in terminals and notebooks; False shows nothing; a function is called."""
 
 _REFRESH = 0.1  # [s] minimum time between two drawings of a bar
 

@@ -136,7 +136,7 @@ def run(*, as_json: bool) -> int:
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error
-    except Exception as error:  # the one place that may: the boundary to the shell
+    except Exception as error:  # allowed only here, at the boundary to the shell
         raise_if_stopped()  # libraries turn interrupts into other errors
         if isinstance(error, LegcalError):
             kind = type(error).__name__

@@ -42,8 +42,8 @@ def camera(
         typer.Option(
             metavar="SPEC",
             help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
-            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a block "
-            "board.",
+            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
+            "block board.",
         ),
     ],
     output: Annotated[

@@ -40,7 +40,7 @@ def export(
         int | None,
         typer.Option(help="correction: nodes along each coordinate; by default by freedoms."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a calibration or a model for another program or a controller."""

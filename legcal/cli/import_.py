@@ -48,10 +48,10 @@ def import_(
         float | None,
         typer.Option(
             metavar="SECONDS",
-            help="The clock of the camera less that of the readings; by default found from motion.",
+            help="Camera clock minus reading clock; by default estimated from the motion.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:

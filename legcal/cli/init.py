@@ -44,8 +44,8 @@ def init(
     unit: Annotated[
         str | None,
         typer.Option(
-            help="Unit of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg, us; by "
-            "default as the headings say, else the one in which they lie in the travel."
+            help="Unit of the readings: m, cm, mm, um; rad, mrad, deg, us for motors that turn; by "
+            "default from the headings, else the unit that puts them in the travel."
         ),
     ] = None,
     lengths: Annotated[
@@ -54,11 +54,11 @@ def init(
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, of "
-            "pulses of servos 0.5deg."
+            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, or "
+            "0.5deg for pulses of servos."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""

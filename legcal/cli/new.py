@@ -30,7 +30,7 @@ def new(
             "--template", help="Write a commented table to start from, of --family or a hexapod."
         ),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
     **options: Any,
 ) -> None:

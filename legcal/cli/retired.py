@@ -8,7 +8,7 @@ from legcal.errors import UsageError
 
 
 def _benchmark(program: str) -> str:
-    """Return where a study is that was a command."""
+    """Return in words the place of a study that was a command."""
     return f"run python benchmarks/{program} of the source tree"
 
 
@@ -118,7 +118,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--merge": "the same command goes on from the runs in its folder",
     },
 }
-"""What stands in place of options, or of a choice, by command: the rest of a sentence."""
+"""Replacements of options, or of a choice, by command: the rest of a sentence."""
 
 
 def refuse_retired(words: Sequence[str]) -> None:

@@ -39,9 +39,8 @@ def simulate(
         list[str] | None,
         typer.Option(
             metavar="FILE|KIND",
-            help="Camera file (ROS, OpenCV, Kalibr); or what it does to photographs: machine-jpeg, "
-            "webcam, phone, action or industrial, webcam:60 for another JPEG quality. Once for "
-            "each.",
+            help="Camera file (ROS, OpenCV, Kalibr), or kind of camera: machine-jpeg, webcam, "
+            "phone, action or industrial, webcam:60 for another JPEG quality. Once for each.",
             show_default="1024 x 768 px, slight distortion; industrial",
         ),
     ] = None,
@@ -84,12 +83,12 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="SESSION",
-            help="Instead of poses and cameras: a session that legcal plan wrote, with tripods as "
-            "far off as it allows for.",
+            help="Instead of poses and cameras: a session from legcal plan, with tripods off by "
+            "its tolerances.",
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(help="The same seed gives the same dataset, to the last bit.")
+        int, typer.Option(help="Random seed; equal seeds give equal datasets, to the last bit.")
     ] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,

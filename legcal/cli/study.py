@@ -28,7 +28,7 @@ OutputFolder = Annotated[
         "-o",
         metavar="OUT",
         help="Folder for the runs, the document and the figures. A study that was stopped "
-        "goes on from what is there.",
+        "is continued.",
     ),
 ]
 

@@ -126,7 +126,7 @@ class Dataset:
         return self.measurements.views[int(self.measurements.view[row])].camera
 
     def _where(self, row: int) -> Place:
-        """Return where a row is named."""
+        """Return the place of a row in its table."""
         return Place(str(self.table_path), row + 1)
 
 

@@ -59,7 +59,7 @@ def _can_be_fixed(text: str) -> str:
 
 
 class ParametersEntry(FileSchema):
-    """What is known of parameters, which are left as they are and which are looked for."""
+    """Priors of parameters, and the parameters to fix or to free."""
 
     priors: dict[
         Name, Annotated[Quantity, BeforeValidator(read_prior), WithJsonSchema(PRIOR_SCHEMA)]

@@ -168,5 +168,5 @@ def measurements_at(measurements: Measurements, rows: IntArray) -> Measurements:
 
 
 def inverse(permutation: IntArray) -> IntArray:
-    """Return where each original element went: ``inverse(p)[p[k]] == k``."""
+    """Return the inverse of a permutation: ``inverse(p)[p[k]] == k``."""
     return np.argsort(permutation)

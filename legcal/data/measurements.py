@@ -84,7 +84,7 @@ class Measurements:
     # zero for other constant-length legs, NaN for passive ones
     q: Array
     sigma_q: float  # of a reading [m]
-    pose_labels: tuple[str, ...] = ()  # of each pose, "" without; empty without that column
+    pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @property
@@ -594,7 +594,7 @@ def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
 def _shared_readings(
     table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: Array
 ) -> Array:
-    """Return the readings with those of one pose replaced by their mean."""
+    """Replace the readings of each pose by their mean."""
     joints = [column.name for column in reading_columns(legs)]
     units = [leg.reading_unit for leg in legs_with_readings(legs)]
     labels = table.text("pose")

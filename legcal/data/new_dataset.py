@@ -73,7 +73,7 @@ class MatchedImage(Document):
 
 
 class NewDatasetDocument(Document):
-    """What ``legcal init --json`` prints."""
+    """The document of ``legcal init --json``."""
 
     dataset: str
     mechanism: str

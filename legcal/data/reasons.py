@@ -63,7 +63,7 @@ class Reason(StrEnum):
     OTHER = "other"
 
 
-# In words: without a detail, and with one.
+# In words: without a detail, and with a detail.
 WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.NONE: ("", ""),
     Reason.OUTSIDE: ("outside the image", ""),
@@ -74,7 +74,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.UNUSED_LEG: ("its view does not use this leg", "view {} does not use this leg"),
     Reason.NO_PAIR: ("no convincing pair of edges", ""),
     Reason.NO_EDGE: ("no convincing edge", ""),
-    Reason.FAINT: ("edge hardly visible", "edge hardly visible, found on {} % of it"),
+    Reason.FAINT: ("edge barely visible", "edge barely visible, detected on {} % of it"),
     Reason.OVEREXPOSED: (
         "the background is overexposed",
         "the background is overexposed, {} px of the step are left",
@@ -87,7 +87,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
         "width inconsistent with the radius",
         "width inconsistent with the radius, {}",
     ),
-    Reason.PARTNER: ("other outline fails", "its other outline: {}"),
+    Reason.PARTNER: ("partner outline rejected", "its other outline: {}"),
     Reason.VIEW_DISAGREES: ("disagrees with the other legs of its view", ""),
     Reason.DISAGREES: ("disagrees with the fit", "disagrees with the fit by {}"),
     Reason.ARM_LEFT_OUT: ("the arm is left out as a whole", ""),
@@ -100,7 +100,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
         "far from where the other corners put it",
         "{} px from where the other corners put it",
     ),
-    Reason.NOT_BEFORE: ("not used before", ""),
+    Reason.NOT_BEFORE: ("not used in the previous measurement", ""),
     Reason.BLACK: ("the image is black", "the image is black, at most {} of 255 grey levels"),
     Reason.OVEREXPOSED_IMAGE: (
         "the image is overexposed",
@@ -114,16 +114,28 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.MIRRORED: ("the image is mirrored", ""),
     Reason.UPSIDE_DOWN: ("the image is upside down", ""),
     Reason.ZOOMED: (
-        "it shows the legs in another size: zoom, or a crop scaled",
-        "it shows the legs about {} times as large as the others: zoom, or a crop scaled",
+        "it shows the legs in another size: zoomed, or cropped and rescaled",
+        "it shows the legs about {} times as large as the others: zoomed, or cropped and rescaled",
     ),
     Reason.OTHER_READING: ("it shows another reading", "{}"),
     Reason.OTHER_VIEW: ("it was taken by another camera", "{}"),
-    Reason.OTHER_SCENE: ("it does not show the legs where its reading has them", ""),
+    Reason.OTHER_SCENE: ("its legs are not where its readings predict them", ""),
     Reason.BY_HAND: ("rejected by hand", ""),
     Reason.OTHER: ("no reason given", "{}"),
 }
 _PARTNER = "its other outline: "
+# Sentences of earlier versions with other words
+_EARLIER_WORDS = {
+    "edge hardly visible, found on {} % of it": Reason.FAINT,
+    "edge hardly visible": Reason.FAINT,
+    "other outline fails": Reason.PARTNER,
+    "not used before": Reason.NOT_BEFORE,
+    "it shows the legs about {} times as large as the others: zoom, or a crop scaled": (
+        Reason.ZOOMED
+    ),
+    "it shows the legs in another size: zoom, or a crop scaled": Reason.ZOOMED,
+    "it does not show the legs where its reading has them": Reason.OTHER_SCENE,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,11 +194,15 @@ def reason_in_words(code: str) -> str:
 
 
 _CODES = frozenset(map(str, Reason))
-_SENTENCES = [  # patterns of tables with sentences in place of codes; first those with a detail
-    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), Reason(code))
-    for k in (1, 0)
+_WORDS = [
+    (forms[k], Reason(code))
+    for k in (1, 0)  # first the sentences with a detail
     for code, forms in WORDS_BY_CODE.items()
-    if (words := forms[k]) not in ("", "{}")
+]
+_SENTENCES = [  # patterns of tables with sentences in place of codes
+    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), reason)
+    for words, reason in (*_WORDS, *_EARLIER_WORDS.items())
+    if words not in ("", "{}")
 ]
 
 

@@ -52,14 +52,14 @@ class Column:
     kind: Literal["text", "number", "whole"] = "number"
     what: str = ""  # noun for a number in messages; "" for the noun of the row
     unit: str = ""  # in words, for messages
-    least: float = -math.inf  # of a number
+    least: float = -math.inf  # limits of a number
     most: float = math.inf
     needed: str = ""  # the range in words
     remedy: str = "correct it or remove the row"
     choices: tuple[str, ...] = ()  # the only texts
     required: bool = True  # in the header
     blank: bool = False  # a cell may be empty; a number is then NaN
-    group: str = ""  # columns of a group stand together, in the header and in each row
+    group: str = ""  # columns of a group are complete or absent, in the header and in each row
 
     def problem(self, text: str) -> str:
         """Return the needed content of an invalid cell in words, or "" if it is valid."""
@@ -91,7 +91,7 @@ class Table:
     def __init__(self, path: Path, thing: str, columns: Sequence[Column]) -> None:
         self.path = path
         self.thing = thing  # noun for a row in messages
-        self.columns = {column.name: column for column in columns}  # that the header has
+        self.columns = {column.name: column for column in columns}  # in the order of the header
         self._rows: list[int] = []
         self._lines: list[int] = []
         self._cells: list[list[str]] = []

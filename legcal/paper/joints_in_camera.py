@@ -365,7 +365,7 @@ class AcrossAxes:
         return Term(leg_across_axis(), index, observed, self.covariance)
 
     def solve(self, *, weighted: bool) -> tuple[Array, Array, Array]:
-        """Return where axes v begin (n_axes, 3), turns (n_axes, 2) from there and covariances."""
+        """Return start axes v (n_axes, 3), rotations (n_axes, 2) from there, and covariances."""
         v = np.linalg.eigh(self.scatter)[1][:, :, 0]  # the unweighted solution
         n = len(v)
         problem = LeastSquares("The revolute axes (eq 7)", (self.term(v),), np.zeros(2 * n))

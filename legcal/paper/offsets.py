@@ -126,7 +126,7 @@ def identify_offsets(
 
 
 def build_consecutive(machine: NominalMachine, directions: LegDirections) -> LeastSquares:
-    """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
+    """Build the criterion C_2 of (14): distances are equal in consecutive positions of a view."""
     pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     last: dict[tuple[int, ...], int] = {}
     consecutive = []

@@ -75,7 +75,7 @@ class Unknowns:
 
     @cached_property
     def place(self) -> IntArray:
-        """Where each leg's numbers (LegColumns) are among the unknowns, (n_legs, 21), or -1."""
+        """Indices of each leg's numbers (LegColumns) among the unknowns, (n_legs, 21), or -1."""
         place = np.full(len(self.parametrization) + 1, -1, dtype=np.intp)
         place[self.parameters] = np.arange(len(self))
         return np.asarray(place[self.parametrization.place])

@@ -240,7 +240,7 @@ class ViewSummary(Document):
 
 
 class SimulationDocument(Document):
-    """What ``legcal simulate --json`` prints."""
+    """The document of ``legcal simulate --json``."""
 
     dataset: str
     level: str

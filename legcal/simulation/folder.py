@@ -45,7 +45,7 @@ def write_session(
     m: Measurements,
     *,
     groups: Sequence[str] = (),  # view of the file of each view, where cameras are in the hand
-    board: Any = None,  # the block of one, or of several
+    board: Any = None,  # the block of a board, or of several
     lengths: Mapping[str, str] | None = None,  # measured distances of joints
 ) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""

@@ -54,7 +54,7 @@ class Scene:
 class OutlineNoise:
     """White noise of the edge points of an outline, to which a line is fitted."""
 
-    sigma_px: float = 0.1  # of each point [px]
+    sigma_px: float = 0.1  # standard deviation of each point [px]
     n_points: int | None = 300  # equally spaced; None for a point in every pixel
 
     def covariance(self, length_px: float) -> Array:

@@ -117,7 +117,7 @@ class Means:
         """Root mean square of d' inv(C) d / n for errors d of the n parameters, and its sigma.
 
         C is the covariance of the Cramer-Rao bound of the same run: 1 for an estimator that reaches
-        it. Its spread is far smaller than that of dX.
+        it. Its spread is far smaller than the spread of dX.
         """
         ratio = float(np.sqrt(self.scalars[3]))
         return ratio, float(self.uncertainties[3]) / (2.0 * ratio) if ratio else 0.0

@@ -35,7 +35,7 @@ class PlannedSession:
     measurements: Measurements  # one row an image, with planned poses of views
     setting: Setting  # tolerances of tripods
     board: PlacedBoard | None  # on the base
-    hand: str  # the view of a camera in the hand; empty if cameras stand
+    hand: str  # name of the view of a hand-held camera; "" for fixed cameras
 
     @property
     def poses_of(self) -> list[list[int]]:

@@ -58,7 +58,7 @@ Streams = Mapping[str, np.random.Generator]
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
              "corners", "lengths")  # fmt: skip
 _MIN_SIGMA_Q = 1e-9  # [m] stated standard deviation of readings without noise
-_MIN_SEEN = 0.5  # minimum share of photographs of a view with a leg that its hint names
+_MIN_SEEN = 0.5  # minimum share of photographs of a view that show a leg named in its hint
 
 
 def streams(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
@@ -85,7 +85,7 @@ class SimulatedSession:
     scene: Scene
     left_out: int  # images without a leg, for which a table of outlines or axes has no row
     boards: tuple[FixedBoard, ...]
-    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
 
 def simulate_session(
@@ -109,7 +109,7 @@ class _Setup:
     posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     boards: tuple[FixedBoard, ...]
     views: tuple[Viewpoint, ...]
-    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the th
 _DEFAULT_RADIUS = 0.02  # radius of a leg without a cylinder, in distances between its joints
 _GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
 _GRAZING = 1e-5  # sine of the angle of a ray to a face up to which the face hides nothing
-_FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
+_FLAT = 0.2  # maximum cosine between legs and the normal of plates that are parallel to the legs
 
 _SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
 _SUBDIVISIONS = 2  # of an icosahedron in place of a sphere
@@ -371,7 +371,7 @@ def _away(joints_base: Array, machine: Machine, side: float) -> Array | None:
     normal = axes[2]
     legs = vectors_A_to_B(machine, machine.home).mean(axis=0)
     cosine = float(normal @ legs) / max(float(np.linalg.norm(legs)), 1e-12)
-    if abs(cosine) < _FLAT:  # the legs lie along the plates: one on each side
+    if abs(cosine) < _FLAT:  # the legs are parallel to the plates: one plate on each side
         cosine = float(normal[np.argmax(np.abs(normal))])
     return np.asarray(side * np.sign(cosine) * normal)
 

@@ -39,7 +39,7 @@ _MANY = 64  # assumed number of workers of a cluster
 _CHUNKS = 16  # chunks for each process, so that the work is shared evenly to the end
 
 Record = dict[str, Any]
-"""What one run found, as a JSON document: numbers, texts, lists, null; never NaN."""
+"""The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
 
 
 class Summary(Protocol):

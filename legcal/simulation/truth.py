@@ -200,7 +200,7 @@ def write_model_with(
 
 
 def _places(nominal: Machine, folder: Path) -> tuple[Path, Path]:
-    """Return where the files of the true model stand."""
+    """Return the paths of the files of the true model."""
     name = model_name(nominal)
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
 

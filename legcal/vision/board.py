@@ -21,7 +21,7 @@ class Board:
     """A flat calibration board."""
 
     kind: BoardKind
-    columns: int  # along x: squares, black and white ones (chessboard, ChArUco), or tags
+    columns: int  # along x: squares, black and white (chessboard, ChArUco), or tags
     rows: int  # along y, the same
     side: float  # side of a square, or of the black frame of a tag (AprilGrid) [m]
     marker: float = 0.0  # side of a marker of a ChArUco board [m]; zero for other kinds

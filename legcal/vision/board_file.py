@@ -59,7 +59,7 @@ Count = Annotated[
 
 
 class _BoardEntry(FileSchema):
-    """What every board has."""
+    """The common entries of all boards."""
 
     on: Literal["base", "platform"] = "base"
     T_base_board: MotionEntry | None = None

@@ -65,7 +65,7 @@ _Positive = Annotated[float, Field(gt=0.0)]
 
 
 class PhotographsEntry(_OpenSchema):
-    """What the files of the photographs of the board said: the distinct values of each fact."""
+    """Metadata of the photographs of the board: the distinct values of each fact."""
 
     device: list[_Text] = Field(default_factory=list)
     serial: list[_Text] = Field(default_factory=list)
@@ -79,7 +79,7 @@ class PhotographsEntry(_OpenSchema):
 
 
 class CalibratedEntry(_OpenSchema):
-    """What legcal adds to a camera that it calibrated: how well its intrinsics are known."""
+    """The uncertainty of the intrinsics, added by legcal to a camera that it calibrated."""
 
     version: Literal[1]
     sigma: dict[str, Sigma]

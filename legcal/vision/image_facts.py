@@ -26,7 +26,7 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 PILLOW_ERRORS = (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError,
                  AttributeError, EOFError, struct.error)  # fmt: skip
-"""What Pillow raises of damaged files."""
+"""The exceptions of Pillow for damaged files."""
 
 _MOST_TEXT = 60  # maximum number of characters shown
 # Sum of the steps of table K.1 of ITU-T T.81, which is quality 50 on the scale of the IJG

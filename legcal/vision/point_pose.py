@@ -23,7 +23,7 @@ MAX_SUBSETS, SEED = 120, 1965  # maximum number of subsets of four points, and s
 N_REFINED = 8
 TRUNCATION = 4.0  # standard deviations from which on a point counts as wrong
 SAME_ANGLE = np.deg2rad(3.0)
-MAX_STEPS, SMALL_STEP = 60, 1e-10  # maximum number of steps, and the relative size of the last one
+MAX_STEPS, SMALL_STEP = 60, 1e-10  # maximum number of steps, and relative size of the last step
 LINE = 0.02  # maximum ratio of width to length of collinear points
 
 

@@ -107,7 +107,7 @@ def divided(camera: Camera, fineness: int) -> Camera:
 
 @lru_cache(maxsize=4)
 def _offsets(samples: int) -> tuple[Single, Single]:
-    """Return where in each pixel of a tile the rays are, (_TILE * _TILE, samples) [px]."""
+    """Return the positions of rays in each pixel of a tile, (_TILE * _TILE, samples) [px]."""
     before, now = 1, 1
     while now < samples:
         before, now = now, before + now
@@ -159,7 +159,7 @@ def holding_sphere(shape: Shape) -> tuple[Array, float]:
 def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tuple[Single, IntArray]:
     """Return depth [m] and index of the first triangle on rays (x, y, 1); infinite for a miss.
 
-    Embree finds the triangle in single precision; the depth is that of its plane.
+    Embree finds the triangle in single precision; the depth is computed from its plane.
     """
     rays = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float64) @ solid.R
     origin = -solid.R.T @ solid.w
@@ -191,7 +191,7 @@ def _caster(mesh: Mesh) -> Any:
 
 
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
-    """Return where rays enter a solid."""
+    """Return the depths and faces of the entry points of rays into a solid."""
     shape = solid.shape
     if isinstance(shape, SolidCylinder):
         return _cylinder(solid, shape, x, y)
