@@ -292,7 +292,7 @@ def write_axis_table(
     measurements: Measurements,
     leg_names: Sequence[str],
 ) -> None:
-    """Write axes that are given as the table has them, the file complete or not at all."""
+    """Write axes in the columns of the table, the file complete or not at all."""
     names = places(measurements)
     numbers = np.hstack([values, sigmas]).tolist()
     rows = (

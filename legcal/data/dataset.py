@@ -73,7 +73,7 @@ MIN_CORNERS = 4  # corners in an image that must place its camera
 @brief
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Everything that a calibration starts from."""
+    """The input of a calibration."""
 
     folder: Path  # the dataset folder
     yaml_path: Path  # ``dataset.yaml``
@@ -639,7 +639,7 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
 def expand_hand_held(
     path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
 ) -> tuple[Measurements, tuple[int, ...], list[Problem]]:
-    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
+    """Give every image of a hand-held view a separate view: NAME-1, NAME-2, ... by rows."""
     new: list[View] = []
     origin: list[int] = []
     problems: list[Problem] = []

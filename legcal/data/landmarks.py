@@ -69,7 +69,7 @@ class Landmarks(ImageTable):
 
 
 def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """Return leg and end of each joint, by the name that the table has for it."""
+    """Return leg and end of each joint, by its name in the table."""
     return {joint_name(leg, end): (j, end) for end in (0, 1) for j, leg in enumerate(leg_names)}
 
 

@@ -185,7 +185,7 @@ def few(names: Sequence[str]) -> str:
 
 
 def few_views(names: Sequence[str]) -> str:
-    """Return views as a sentence names them: ``views c1, c2``, not more than a few."""
+    """Return views in words, at most a few names: ``views c1, c2``."""
     return f"view{'s' * (len(names) > 1)} {few(names)}"
 
 

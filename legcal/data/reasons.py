@@ -1,4 +1,4 @@
-"""Why an outline, a corner or an image is not used: a code, and a detail for the reader.
+"""Reasons for not using an outline, a corner or an image: a code, and a detail for the reader.
 
 Programs compare codes (:class:`Reason`); tables store code and detail in two columns; sentences are
 made where people read them. Tables of earlier versions hold sentences, which are read as well.
@@ -18,7 +18,7 @@ from legcal.geometry.types import BoolArray
 
 
 class Reason(StrEnum):
-    """Why an outline, a corner or an image is not used."""
+    """A reason for not using an outline, a corner or an image."""
 
     NONE = ""
     # Out of sight of the camera

@@ -60,7 +60,7 @@ class Pose(Document):
         return cls(**motion_to_xyz_quat(T))
 
     def motion(self) -> RigidTransform:
-        """Return the motion; ValueError if its quaternion is none of a turn."""
+        """Return the motion; ValueError if its quaternion is not of unit norm."""
         return MotionEntry(**self.model_dump()).motion()
 
 

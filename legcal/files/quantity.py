@@ -137,7 +137,7 @@ def read_value(text: str) -> Quantity:
 
 
 def _in_si(number: float, unit: str) -> float:
-    """Return a number in SI units or pixels, 350 mm as the same number that 0.35 m is."""
+    """Return a number in SI units or pixels; 350 mm is exactly equal to 0.35 m."""
     size = _SIZES.get(unit, 1.0)
     per_one = round(1.0 / size)
     return number / per_one if math.isclose(per_one * size, 1.0, rel_tol=1e-12) else number * size

@@ -130,7 +130,7 @@ class Document(BaseModel):
 
 
 class SparseDocument(Document):
-    """A document without the keys that are null by default: what a machine or session lacks."""
+    """A document without the null keys of absent parts of a machine or session."""
 
     @model_serializer(mode="wrap")
     def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -271,7 +271,7 @@ def validate(
 
 
 class _Short(reprlib.Repr):
-    """Values as YAML writes them where Python does otherwise."""
+    """Short representations with the YAML forms of values."""
 
     def repr_NoneType(self, value: None, level: int) -> str:
         return "null"

@@ -263,7 +263,7 @@ def _joints_of_base(
 def _points_on_rays(
     machine: NominalMachine, joints: JointsInCamera, cameras: Cameras
 ) -> tuple[SeenPoints, tuple[Array, Array], IntArray]:
-    """Return base joints as placed cameras see them, R and t of R_b in these, and their views."""
+    """Return the base joints in placed cameras, R and t of R_b in these, and their views."""
     poses = {v: T.inv() for v, T in enumerate(cameras) if T is not None}
     placed = np.array(list(poses), dtype=np.intp)
     group, leg = np.nonzero(joints.located[placed])

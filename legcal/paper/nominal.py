@@ -93,5 +93,5 @@ class NominalMachine:
 
 
 def nominal_machine(machine: Machine) -> NominalMachine:
-    """Return a machine as the steps take it."""
+    """Return the nominal machine of the steps."""
     return NominalMachine(machine.leg_names, geometries(machine), machine.frame_legs)

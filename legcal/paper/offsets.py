@@ -37,7 +37,7 @@ _APART = 1e-3  # [mean leg lengths] minimum distance of separate platform joints
 
 @dataclass(frozen=True, eq=False)
 class LegDirections:
-    """Legs of (13) as steps 3 and 4 see them: by group, then by leg."""
+    """Legs of (13), the input of steps 3 and 4: by group, then by leg."""
 
     group: IntArray  # (n,): index of the pose and view of each leg
     view: IntArray  # (n,)
@@ -60,7 +60,7 @@ class LegDirections:
 
     @property
     def columns(self) -> Array:
-        """The legs as (13) takes them, (n, 13)."""
+        """The legs in the form of (13), (n, 13)."""
         basis = self.basis.reshape(-1, 6)
         return np.hstack([self.A, self.u, self.reading[:, None], basis])
 
@@ -196,7 +196,7 @@ def _check_identifiable(
     pairs: IntArray,
     loose: BoolArray,
 ) -> None:
-    """Refuse when an offset can change without any distance noticing."""
+    """Refuse offsets that can change without changing any distance."""
     with_offset = np.flatnonzero(np.isfinite(machine.offsets))
     loose = loose & ~machine.on_platform[with_offset]
     if not loose.any():

@@ -33,7 +33,7 @@ _FLAT = 1e-3  # maximum deviation of collinear points, relative to their distanc
 
 @dataclass(frozen=True, eq=False)
 class PlatformPoses:
-    """Poses of R_e in the frames of the groups of legs that fix them."""
+    """Poses of R_e in the frames of the groups of legs that determine them."""
 
     pose: IntArray  # (n,): the pose of each leg of the directions; -1 where its group fixes none
     R: Array  # (n_poses, 3, 3)

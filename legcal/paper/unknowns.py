@@ -92,12 +92,12 @@ class Unknowns:
 
     @property
     def known_A(self) -> Array:
-        """Coordinates of A that are no unknowns, zero for the others, (n_legs, 3) [m]."""
+        """Known coordinates of A, zero for unknown ones, (n_legs, 3) [m]."""
         return np.where(self.place[:, LegColumns.A] < 0, [leg.A for leg in self.start], 0.0)
 
     @property
     def known_B(self) -> Array:
-        """The same of B."""
+        """Known coordinates of B, zero for unknown ones, (n_legs, 3) [m]."""
         return np.where(self.place[:, LegColumns.B] < 0, [leg.B for leg in self.start], 0.0)
 
     @cached_property

@@ -419,7 +419,7 @@ def _hides(
 
 
 def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:
-    """Return that a board has no place."""
+    """Return the error of a board without a suitable place."""
     width, height = np.ptp(board.extent, axis=0)[:2].tolist()
     return NotVisible(
         f"The board could not be placed: found no place near the {link} at which {who} would see a "

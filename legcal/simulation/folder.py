@@ -124,7 +124,7 @@ def write_truth(
 
 
 def _plain(value: Any) -> Any:
-    """Return settings as JSON can hold them."""
+    """Convert settings to values of JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):

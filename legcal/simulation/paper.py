@@ -316,7 +316,7 @@ def expected_norm(covariance: Array) -> Array:
 def four_steps(
     session: SimulatedSession, initial: Sequence[Leg], criteria: Criteria
 ) -> tuple[Leg, ...]:
-    """Return the legs that the four steps find."""
+    """Return the legs of the four steps."""
     truth = session.truth
     machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
     return run_steps(machine, _axes(session), session.measurements, criteria=criteria).legs
@@ -374,11 +374,11 @@ def bound_covariance(session: SimulatedSession, noise: TableNoise) -> Array:
 
 
 def _axes(session: SimulatedSession) -> LegAxes:
-    """Return the axes that were measured."""
+    """Return the measured axes of a session."""
     assert session.axes is not None
     return axes_of_table(*session.axes)
 
 
 def _fitted(truth: Machine, legs: Sequence[Leg]) -> FittedLegs:
-    """Return legs as the fit sees them."""
+    """Return legs in the form of the joint fit."""
     return FittedLegs(truth.leg_names, tuple(legs), truth.frame_legs, {}, truth.home_of_frames)

@@ -348,7 +348,7 @@ def _beside(
 
 
 def exact_outlines(scene: Scene) -> Outlines:
-    """Return the outlines of a scene as they are, with next to no noise claimed."""
+    """Return the exact outlines of a scene, with a negligible stated noise."""
     return outlines_of(scene, replace(EVERY_PIXEL, sigma_px=0.0))
 
 

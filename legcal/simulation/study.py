@@ -201,7 +201,7 @@ def _write(
 
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
-    """Refuse numbers that make no sense."""
+    """Refuse numbers out of range."""
     if n_runs > _MOST_RUNS:
         raise UsageError(
             f"The study could not be run: found runs = {n_runs}, needed {_MOST_RUNS} at most; give "

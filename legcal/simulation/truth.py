@@ -90,7 +90,7 @@ def _spread(errors: ParameterErrors, name: str) -> Spread:
 
 
 def _check(errors: ParameterErrors) -> None:
-    """Refuse sizes that are no sizes."""
+    """Refuse sizes out of range."""
     problems = []
     for kind in KINDS:
         size = getattr(errors, kind).size
@@ -131,7 +131,7 @@ def draw_radii(
 
 
 def _check_radii(spread: Spread, thinnest: float) -> None:
-    """Refuse errors that may leave nothing of a leg."""
+    """Refuse errors as large as the thinnest radius."""
     most = _MAX_RADIUS_ERROR[Distribution(spread.distribution)] * thinnest
     if not spread.size <= most:
         raise UsageError(

@@ -164,7 +164,7 @@ def differences(
             for name, image_facts, value in with_value:
                 if all(fact.differ(value, board_value, image_facts) for board_value in of_board):
                     by_words.setdefault(fact.words(value, size), []).append(name)
-            if by_words and not _said(result, by_words):
+            if by_words and not _is_listed(result, by_words):
                 result.append(Difference(fact, by_words, needed))
             continue
         groups: list[tuple[Any, list[str]]] = []
@@ -185,17 +185,19 @@ def differences(
             if silent:
                 by_words["that say nothing of it"] = silent
             by_words = dict(sorted(by_words.items(), key=lambda item: len(item[1])))
-            if not _said(result, by_words):
+            if not _is_listed(result, by_words):
                 result.append(Difference(fact, by_words, ""))
     return result
 
 
 def _comparable(values: Sequence[Any]) -> list[Any]:
-    """Return recorded values as photographs have them."""
+    """Return recorded values in the types of photographs: lists as tuples."""
     return [tuple(x) if isinstance(x, list) else x for x in values]
 
 
-def _said(known_differences: Sequence[Difference], by_words: Mapping[str, Sequence[str]]) -> bool:
+def _is_listed(
+    known_differences: Sequence[Difference], by_words: Mapping[str, Sequence[str]]
+) -> bool:
     """Return whether there is a difference between the same images already: one is enough."""
     parts = sorted(map(tuple, by_words.values()))
     return any(

@@ -29,7 +29,7 @@ LINE = 0.02  # maximum ratio of width to length of collinear points
 
 @dataclass(frozen=True, eq=False)
 class PointPose:
-    """A pose of a camera before points."""
+    """A camera pose from points, with cost and covariance."""
 
     T_camera_base: RigidTransform
     cost: float  # half the sum of squares of distances [sigma], none larger than the truncation

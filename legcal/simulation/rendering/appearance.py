@@ -195,7 +195,7 @@ class Appearance:
 
 
 def _check_number(name: str, value: float) -> None:
-    """Refuse a number that makes no sense."""
+    """Refuse a number out of range."""
     most = _MAX.get(name, 1e6)
     least = _MIN.get(name, 0.0)
     words = "above" if name in _POSITIVE else "of at least"

@@ -103,7 +103,7 @@ class CameraPipeline:
         return light
 
     def _refracted(self, light: Single, blur: float, fineness: int) -> Single:
-        """Return light as the lens spreads it."""
+        """Return light after the lens: chromatic aberration and blur."""
         if self.chromatic > 0.0 and light.ndim == 3:
             light = np.stack(
                 [

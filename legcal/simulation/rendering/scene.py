@@ -161,7 +161,7 @@ def _cable(
 
 
 def _placed(name: str, shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
-    """Return a solid that is no part of the machine."""
+    """Return a placed solid outside the machine."""
     return PlacedSolid(Solid(name, None, shape, T, material), T)
 
 
@@ -480,7 +480,7 @@ def _lighting(
 def _empty(
     rays: PixelRays, light: Lighting, appearance: Appearance, rng: np.random.Generator
 ) -> FrameBuffer:
-    """Return the background alone."""
+    """Return a frame buffer with the background only."""
     n = rays.width * rays.height
     terms = np.zeros((1 + len(light.lamps), light.n_channels, n), dtype=np.float32)
     terms[0] = appearance.background
