@@ -247,11 +247,11 @@ def score_test(
     element_products = np.zeros((problem.n_elements, problem.d_element, c))
     for name, v in columns.items():
         _add_products(problem.sparsity[name], linear[name], v, kept_products, element_products)
-        score += np.einsum("nqc,nq->c", v, linear[name].r)
-        projected += np.einsum("nqc,nqd->cd", v, v)
-    kept = kept_products[:-1] + np.einsum(
-        "kda,kdc->ac", _element_derivatives(normal), element_products, optimize=True
-    )
+        flat = v.reshape(-1, c)
+        score += flat.T @ linear[name].r.ravel()
+        projected += flat.T @ flat
+    following = _element_derivatives(normal).reshape(-1, problem.n_kept)
+    kept = kept_products[:-1] + following.T @ element_products.reshape(-1, c)
     by_element = element_products
     if normal.tangent is not None:
         by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ element_products
@@ -262,10 +262,12 @@ def score_test(
     score = (
         score
         - kept_response.T @ g_kept
-        - np.einsum("kpc,kp->c", element_response, normal.g_elements)
+        - element_response.reshape(-1, c).T @ normal.g_elements.ravel()
     )
     projected = (
-        projected - kept_response.T @ kept - np.einsum("kpc,kpd->cd", element_response, by_element)
+        projected
+        - kept_response.T @ kept
+        - element_response.reshape(-1, c).T @ by_element.reshape(-1, c)
     )
     return score, projected
 

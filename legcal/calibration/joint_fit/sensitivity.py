@@ -99,7 +99,7 @@ def sensitivities(
         steps = response(problem, linear, normal, residual_changes_of)
         steps += normal.kept_covariance() @ linear.prior_J.T @ np.column_stack(pulls)
         result = [
-            Sensitivity(what, _kinematic_steps(problem, steps[:, [i]]))
+            Sensitivity(what, kinematic_steps(problem, steps[:, [i]]))
             for i, what in enumerate(names)
         ]
     parametrization, choices = problem.legs.parametrization, problem.choices
@@ -142,7 +142,7 @@ def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[st
     return error
 
 
-def _kinematic_steps(problem: FitProblem, steps: Array) -> Array:
+def kinematic_steps(problem: FitProblem, steps: Array) -> Array:
     """Extract the steps (p, c) of all kinematic parameters from steps (n_kept, c)."""
     kinematic = np.zeros((len(problem.free), steps.shape[1]))
     kinematic[problem.free] = steps[: problem.n_kinematic]
@@ -167,7 +167,7 @@ def _twist_steps(
         for factor in problem.factors
         if factor.element is not None  # corners on the base do not depend on poses
     }
-    steps = _kinematic_steps(problem, response(problem, linear, normal, changes))[:, 0]
+    steps = kinematic_steps(problem, response(problem, linear, normal, changes))[:, 0]
     steps[problem.legs.parametrization.place[leg, LegColumns.TWIST]] = _TWIST_ERROR
     return steps
 

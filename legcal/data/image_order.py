@@ -1,0 +1,60 @@
+"""Order in which images were taken: by their times, else by the numbers in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from legcal.data.measurements import Measurements, row_names
+from legcal.geometry.types import Array, IntArray
+
+_NUMBER = re.compile(r"\d+")
+_EXIF_TIME = "%Y:%m:%d %H:%M:%S"
+
+
+def image_sequences(
+    measurements: Measurements, taken_at: Mapping[str, str]
+) -> tuple[IntArray, ...]:
+    """Return the rows in the order of their images, one array for each order that is known.
+
+    Times order the images of all views; *taken_at* has those of files by image, as EXIF writes
+    them. Numbers in names order the images of one view: nothing says which view came first.
+    The order of rows in the table has no meaning.
+    """
+    times = _times(measurements, taken_at)
+    if times is not None:
+        return (np.argsort(times, kind="stable"),)
+    names = row_names(measurements)
+    sequences = []
+    for v in range(len(measurements.views)):
+        rows = np.flatnonzero(measurements.view == v)
+        numbers = _numbers([names[row] for row in rows.tolist()])
+        if numbers is not None:
+            sequences.append(rows[np.argsort(numbers)])
+    return tuple(sequences)
+
+
+def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | None:
+    """Return the time of each row [s], None unless all are known and most differ."""
+    times = np.full(measurements.n_rows, np.nan)
+    for row, image in enumerate(measurements.image):
+        try:
+            moment = datetime.strptime(taken_at.get(image, ""), _EXIF_TIME)
+        except ValueError:
+            return None
+        times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
+    n_moments = len(np.unique(times))
+    return times if 2 * n_moments > min(measurements.n_rows, 2 * measurements.n_poses) else None
+
+
+def _numbers(names: Sequence[str]) -> IntArray | None:
+    """Return the last number in the stem of each name, None unless all have another one."""
+    found = [_NUMBER.findall(PurePosixPath(name).stem) for name in names]
+    if len(names) < 2 or not all(found):
+        return None
+    numbers = np.array([int(digits[-1]) for digits in found])
+    return numbers if len(np.unique(numbers)) == len(numbers) else None
