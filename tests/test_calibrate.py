@@ -191,16 +191,6 @@ def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
         assert judged(scaled).verdict.trustworthy is trusted
 
 
-def test_a_contradicted_camera_counts_in_the_verdict(
-    planar: tuple[Path, Calibration],
-) -> None:
-    assert _judged(planar[1]).verdict.trustworthy
-    every = planar[1].solution.sensitivities
-    focal = next(s for s in every if "focal" in s.what)
-    wrong = Sensitivity(FITTED_CAMERA, 1e3 * focal.steps)
-    assert not _judged(planar[1], sensitivities=(*every, wrong)).verdict.trustworthy
-
-
 # Recovery from outlines and axes.
 
 
