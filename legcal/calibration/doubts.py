@@ -15,6 +15,7 @@ import numpy as np
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import DoubtBlock
+from legcal.calibration.joint_fit.cross_validation import cross_validate
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.platform import (
@@ -35,9 +36,13 @@ from legcal.geometry.types import BoolArray
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
+CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
-MOST_OFF = 2.0  # times what was expected of held-out images
+MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
+MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sigmas
+_SURE = 5.0  # standard deviations of these squares
+MIN_GAIN = 0.5  # of what a change claims to predict better
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
 MOST_NOISE = 2.0  # times the standard deviations that outlines came with
 
@@ -117,6 +122,7 @@ def doubts_of(
         *_few_outlines(solution.outlines),
         *_moved_parameters(dataset, solution, platform),
         *_held_out(held_out),
+        *_left_out(solution, platform),
         *_noise(solution),
     )
 
@@ -215,12 +221,14 @@ def _cameras(solution: Solution, platform: PlatformAccuracy | None) -> list[Doub
         "calibrate it again at the same focus and zoom, and look for photographs that were zoomed, "
         "scaled or cropped"
     )
-    return [Doubt("camera", what, remedy, *_mean(errors[0] if errors else None))]
+    return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
 
 
-def _mean(error: PlatformError | None) -> tuple[float | None, float | None]:
-    """Return the mean displacement and rotation of the platform, where they are known."""
-    return (None, None) if error is None else (error.mean_displacement, error.mean_rotation)
+def _mean(error: PlatformError | None, part: float = 1.0) -> tuple[float | None, float | None]:
+    """Return a part of the mean displacement and rotation of the platform, where known."""
+    if error is None:
+        return None, None
+    return part * error.mean_displacement, part * error.mean_rotation
 
 
 def used_share(outlines: Outlines) -> float:
@@ -269,6 +277,37 @@ def _few_outlines(outlines: Outlines) -> list[Doubt]:
         "legs, and improve light and background"
     )
     return [Doubt("few_outlines", what, remedy)]
+
+
+def _left_out(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return whether images without a part in the fit are predicted as well as it claims."""
+    found = cross_validate(solution.posterior.problem, solution.posterior.state)
+    if found is None:
+        return []
+    doubts = list[Doubt]()
+    most = np.maximum(MOST_SQUARES, 1.0 + _SURE * np.sqrt(2.0 / np.maximum(found.dof, 1)))
+    of_blocks = found.squares / np.maximum(found.dof, 1)
+    ratio = max(found.ratio, float(of_blocks.max()) if np.any(of_blocks > most) else 0.0)
+    if ratio > MOST_SQUARES:
+        what = (
+            f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
+            "by the others as is stated"
+        )
+        remedy = (
+            "the session does not agree with itself: look for what changed or moved between "
+            "images, for play and bending, and at the worst outlines"
+        )
+        error = _mean(None if platform is None else platform.sigma, float(np.sqrt(ratio - 1.0)))
+        doubts.append(Doubt("left_out", what, remedy, *error))
+    if found.gain is not None and found.gain < MIN_GAIN:
+        what = (
+            "images that are left out are predicted better than by the nominal model by "
+            f"{100.0 * max(found.gain, 0.0):.0f} % of what the change of the model claims"
+        )
+        remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
+        error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
+        doubts.append(Doubt("no_better", what, remedy, *error))
+    return doubts
 
 
 def _moved_parameters(

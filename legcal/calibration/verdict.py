@@ -9,7 +9,14 @@ import numpy as np
 from legcal.calibration.clicks import click_notes
 from legcal.calibration.closeness import closeness
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.doubts import Doubt, doubts_of, model_error, no_improvement, worst_first
+from legcal.calibration.doubts import (
+    CAMERA,
+    Doubt,
+    doubts_of,
+    model_error,
+    no_improvement,
+    worst_first,
+)
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
@@ -39,8 +46,8 @@ def judge(
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
-    What speaks against the result (:mod:`legcal.calibration.doubts`) adds its effect on the
-    platform to these, and any doubt keeps it from being trusted.
+    Cameras that the measurements contradict count there with what they do to the platform. What
+    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted.
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
@@ -68,7 +75,8 @@ def judge(
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
         found += f"; what is in doubt may add {_mm_deg(displacement, rotation)}"
-    if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, displacement)):
+    of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
+    if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
         doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
     verdict = _verdict(worst_first(doubts), found, remedy)
     return Calibration(
