@@ -23,7 +23,6 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_resul
 from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, Sensitivity
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge

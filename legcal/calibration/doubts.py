@@ -16,8 +16,8 @@ from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import DoubtBlock
 from legcal.calibration.joint_fit.cross_validation import cross_validate
+from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import HeldOut
-from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     PlatformError,
@@ -32,7 +32,6 @@ from legcal.data.measurements import few, few_views
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.types import BoolArray
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
@@ -44,7 +43,6 @@ MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sig
 _SURE = 5.0  # standard deviations of these squares
 MIN_GAIN = 0.5  # of what a change claims to predict better
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
-MOST_NOISE = 2.0  # times the standard deviations that outlines came with
 
 
 @dataclass(frozen=True)
@@ -355,25 +353,17 @@ def _moved_parameters(
 
 def _noise(solution: Solution) -> list[Doubt]:
     """Return whether outlines scatter more than they claim: all, or those of a view or a leg."""
-    problem, state = solution.posterior.problem, solution.posterior.state
-    o, whitening = problem.outlines, np.asarray(problem.factor("outlines").whitening)
-    used: BoolArray = whitening[:, 0, 0] > 0.0
-    squares = NoiseModel().squared_norms(problem.offsets(state), o.covariance) / 2.0
-
-    def ratio(of: BoolArray) -> float:
-        """Return the scatter of outlines over what they claim."""
-        return float(np.sqrt(np.mean(squares[of]))) if of.any() else 0.0
-
-    groups = {"all views": used}
-    if ratio(used) <= MOST_NOISE:
-        groups = {f"view {name}": used & (o.view == v) for v, name in enumerate(o.views)}
-        groups |= {name: used & (o.leg == j) for j, name in enumerate(problem.legs.names)}
-    worst = max(groups, key=lambda name: ratio(groups[name]))
-    times = ratio(groups[worst])
-    if times <= MOST_NOISE:
+    problem = solution.posterior.problem
+    o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
+    times = {"all views": scatter.ratio()}
+    if times["all views"] <= MOST_SCATTER:
+        times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
+        times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
+    worst = max(times, key=times.__getitem__)
+    if times[worst] <= MOST_SCATTER:
         return []
     what = (
-        f"the outlines of {worst} scatter about the fit {times:.1f} times as much as their "
+        f"the outlines of {worst} scatter about the fit {times[worst]:.1f} times as much as their "
         "standard deviations"
     )
     remedy = (
