@@ -184,10 +184,10 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
     """
     m, machine = dataset.measurements, dataset.machine
     shown = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
-    cameras = solution.cameras_in_base(machine.T_base_Rb)
+    places = solution.cameras_in_base(machine.T_base_Rb)
     strayed = far_from_hints(
         [None if view.name in m.clicked_views else view.T_base_camera for view in m.views],
-        [T if v in shown else None for v, T in enumerate(cameras)],
+        [T if v in shown else None for v, T in enumerate(places)],
     )
     if not strayed:
         return []
@@ -240,7 +240,10 @@ def used_share(outlines: Outlines) -> float:
 
 
 def _views(dataset: Dataset, solution: Solution, corners: Corners | None) -> list[Doubt]:
-    """Return views without an image in the fit, and many images left out of the others."""
+    """Return views without an image in the fit, and many images left out of the others.
+
+    Views of one image, as a camera in the hand has, count as images.
+    """
     m, outlines = dataset.measurements, solution.outlines
     chosen = outlines.rejected_for(Reason.BY_HAND, Reason.UNUSED_LEG)
     asked = set(m.view[outlines.row[~chosen]].tolist())
@@ -249,14 +252,16 @@ def _views(dataset: Dataset, solution: Solution, corners: Corners | None) -> lis
         rows = np.concatenate([rows, corners.row[corners.used]])
     fitted = set(m.view[rows].tolist())
     doubts = list[Doubt]()
-    if unplaced := sorted(asked - fitted):
+    lone = set(np.flatnonzero(np.bincount(m.view, minlength=len(m.views)) == 1).tolist())
+    if unplaced := sorted(asked - fitted - lone):
         names = few_views([m.views[v].name for v in unplaced])
         n = len(unplaced)
         what = f"no image of {names} could be used: {n} of {len(asked)} views have no part in it"
         remedy = "see in the notes why, take these images again, or leave the view out"
         doubts.append(Doubt("view_left_out", what, remedy))
-    left_out = [row for row in images_left_out(outlines) if int(m.view[row]) in fitted]
-    images = int(np.isin(m.view, list(fitted)).sum())
+    counted = fitted | (asked & lone)
+    left_out = [row for row in images_left_out(outlines) if int(m.view[row]) in counted]
+    images = int(np.isin(m.view, list(counted)).sum())
     if len(left_out) > MAX_LEFT_OUT * images:
         what = f"{len(left_out)} of {images} images were left out"
         remedy = "see in the notes why, and take them again, or leave them out"

@@ -290,7 +290,8 @@ def squares_of_left_out(
     n_blocks = int(block.max(initial=-1)) + 1
     squares, dof = np.zeros(n_blocks), np.zeros(n_blocks, dtype=np.intp)
     everything = normal_equations(problem, state, linear)
-    gradient, rank = _reduced_gradient(everything), _rank(everything)
+    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
+    rank_of_elements = _ranks(everything.V)
     for b in range(n_blocks):
         rows = dict(linear.rows)
         for factor in problem.factors:
@@ -309,7 +310,7 @@ def squares_of_left_out(
         rest = normal_equations(problem, state, replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
         squares[b] += pull @ rest.moved_by(pull[:, None])[:, 0]
-        dof[b] -= rank - _rank(rest) + int(np.sum(block == b)) * everything.V.shape[1]
+        dof[b] -= rank - int(_ranks(rest.reduced())) + rank_of_elements[block == b].sum()
     return squares, dof
 
 
@@ -319,11 +320,12 @@ def _reduced_gradient(normal: NormalEquations) -> Array:
     return np.asarray(normal.g_kept - np.einsum("akp,kp->a", normal.W, elements))
 
 
-def _rank(normal: NormalEquations) -> int:
-    """Return how many directions of the kept unknowns are determined."""
-    R = normal.reduced()
-    scale = np.sqrt(np.maximum(np.diagonal(R), np.finfo(np.float64).tiny))
-    return int(np.linalg.matrix_rank(R / scale[:, None] / scale, tol=_ROUNDING, hermitian=True))
+def _ranks(matrices: Array) -> IntArray:
+    """Return the ranks of information matrices (..., n, n), whatever their units."""
+    diagonal = np.einsum("...ii->...i", matrices)
+    scale = np.sqrt(np.maximum(diagonal, np.finfo(np.float64).tiny))
+    scaled = matrices / scale[..., :, None] / scale[..., None, :]
+    return np.asarray(np.linalg.matrix_rank(scaled, tol=_ROUNDING, hermitian=True), dtype=np.intp)
 
 
 def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple[Array, Array]:
