@@ -61,6 +61,10 @@ def _yaml(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
     return changed
 
 
+def _update(folder: Path, keys: dict[str, Any]) -> None:
+    _yaml(lambda found: found.update(keys))(folder)
+
+
 def _rejected(is_out: Callable[[dict[str, str]], bool]) -> Callable[[Path], None]:
     def change(row: dict[str, str]) -> None:
         if is_out(row):
@@ -163,7 +167,7 @@ def test_exit_code_document_summary_and_page_agree(
     code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
     printed = json.loads(capsys.readouterr().out)
     written = load_result(out).result
-    page = html.document_fromstring((out / "report.html").read_text())
+    page: Any = html.document_fromstring((out / "report.html").read_text())
     light, first = (
         page.xpath("//section[@id='verdict']/@class")[0],
         page.xpath("string((//section[@id='next']//li)[1])"),
@@ -190,7 +194,7 @@ def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
 ) -> None:
     folder = _copy(session, tmp_path)
     stated = {"joints": "0.3 mm", "axes": "0.5 deg", "lengths": 1e-4, "zeros": "5 deg"}
-    _yaml(lambda found: found.update(tolerance=stated))(folder)
+    _update(folder, {"tolerance": stated})
     tolerance = load_dataset(folder).machine.tolerance
     assert tolerance == Tolerance(3e-4, np.radians(0.5), 1e-4, None, np.radians(5.0))
     model = next((folder / "models").glob("*.yaml"))
@@ -200,13 +204,14 @@ def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
     assert load_dataset(folder).machine.tolerance == tolerance
     _yaml(lambda found: found.pop("tolerance"))(folder)
     assert load_dataset(folder).machine.tolerance == TYPICAL["printed"]
-    for wrong, sentence in (
+    refused: list[tuple[dict[str, Any], str]] = [
         ({"tolerance": {"joints": "1 deg"}}, "tolerance.joints.*needed a value in m"),
         ({"tolerance": {"joints": -1.0}}, "tolerance.joints.*above zero"),
         ({"machine_kind": "wooden"}, "machine_kind.*printed"),
         ({"tolerance": {"joints": 1e-3}, "machine_kind": "bought"}, "needed one of them"),
-    ):
-        other = _copy(folder, tmp_path / str(len(sentence)))
-        _yaml(lambda found, wrong=wrong: found.update(wrong))(other)
+    ]
+    for n, (wrong, sentence) in enumerate(refused):
+        other = Path(shutil.copytree(folder, tmp_path / str(n)))
+        _update(other, wrong)
         with pytest.raises(DatasetError, match=sentence):
             load_dataset(other)
