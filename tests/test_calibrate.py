@@ -23,7 +23,6 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism, load_resul
 from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, Sensitivity
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
@@ -189,16 +188,6 @@ def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
     for factor, trusted in ((0.99, True), (1.01, False)):
         scaled = of_one | {part: (0.5 * factor * sigmas) ** 2 * of_one[part]}
         assert judged(scaled).verdict.trustworthy is trusted
-
-
-def test_a_contradicted_camera_counts_in_the_verdict(
-    planar: tuple[Path, Calibration],
-) -> None:
-    assert _judged(planar[1]).verdict.trustworthy
-    every = planar[1].solution.sensitivities
-    focal = next(s for s in every if "focal" in s.what)
-    wrong = Sensitivity(FITTED_CAMERA, 1e3 * focal.steps)
-    assert not _judged(planar[1], sensitivities=(*every, wrong)).verdict.trustworthy
 
 
 # Recovery from outlines and axes.

@@ -17,7 +17,7 @@ from legcal.estimation.problem import (
     linearize,
 )
 from legcal.estimation.solver import information, minimise, normal_equations, robust_cost
-from legcal.estimation.uncertainty import named_covariance
+from legcal.estimation.uncertainty import named_covariance, squares_of_left_out
 from legcal.estimation.variances import Effects, estimate_variances, expected_variances
 from legcal.geometry.types import Array, IntArray
 
@@ -100,6 +100,34 @@ def test_elimination_gives_the_covariance_of_the_whole_system(n_open: int) -> No
     normal = information(problem, AWAY, linear)
     mine = named_covariance(problem, AWAY, normal.kept_covariance())
     np.testing.assert_allclose(mine, covariance, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n_open", [0, 2])
+def test_blocks_that_are_left_out_are_predicted_as_by_the_rest_alone(n_open: int) -> None:
+    problem = waves(np.random.default_rng(4), all_free(N_SHARED, 1), 0.1, n_open)
+    state = minimise(problem, AWAY).state
+    linear, block = linearize(problem, state), np.array([0, 1, 0, 2, 1])
+    squares, dof = squares_of_left_out(problem, state, linear, block)
+    rows, element = linear["values"], np.repeat(np.arange(N_ELEMENTS), N_EACH)
+    J = np.zeros((len(element) + 1, problem.size))
+    J[:-1, :N_SHARED] = rows.J[:, 0]
+    for i, k in enumerate(element.tolist()):
+        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_element[i, 0]
+    J[-1, 0] = 0.5**-1
+    r = np.append(rows.r[:, 0], linear.prior_r)
+    for b in range(3):
+        is_inside = np.append(block[element] == b, False)
+        rest, own = J[~is_inside], np.repeat(block == b, 2)
+        x = -np.linalg.pinv(rest) @ r[~is_inside]
+        known, offsets = ~np.append(np.zeros(N_SHARED, dtype=bool), own), J[is_inside]
+        covariance = np.linalg.pinv((rest.T @ rest)[np.ix_(known, known)], hermitian=True)
+        covariance = offsets[:, known] @ covariance @ offsets[:, known].T + np.eye(len(offsets))
+        innovation, by_own = r[is_inside] + offsets[:, known] @ x[known], offsets[:, ~known]
+        weight = np.linalg.inv(covariance)
+        cross = by_own.T @ weight
+        weight -= cross.T @ np.linalg.pinv(cross @ by_own, hermitian=True) @ cross
+        assert squares[b] == pytest.approx(innovation @ weight @ innovation, rel=1e-6)
+        assert dof[b] == np.linalg.matrix_rank(weight, tol=1e-9)
 
 
 def _with_prior(

@@ -66,6 +66,7 @@ PUBLIC: dict[str, set[str]] = {
         "solver",
         "table_template",
         "ties",
+        "tolerance",
         "urdf",
     },
     "vision": {
@@ -137,6 +138,7 @@ PUBLIC: dict[str, set[str]] = {
         "detection",
         "doctor",
         "documents",
+        "doubts",
         "evaluation",
         "examination",
         "examination_page",

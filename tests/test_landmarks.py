@@ -13,8 +13,9 @@ from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
 from legcal import calibrate
+from legcal.calibration.clicks import click_notes
 from legcal.calibration.result import Verdict
-from legcal.calibration.verdict import click_notes, judge
+from legcal.calibration.verdict import judge
 from legcal.data.dataset import load_dataset
 from legcal.data.landmarks import Landmarks, joint_name
 from legcal.errors import DatasetError

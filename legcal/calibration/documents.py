@@ -402,6 +402,16 @@ class DiagnosisBlock(Document):
     remedy: str
 
 
+class DoubtBlock(Document):
+    """What speaks against a result; effects are null where they cannot be computed."""
+
+    code: str
+    what: str
+    sigma_dX_m: float | None
+    sigma_dE_rad: float | None
+    remedy: str
+
+
 class Heading(Document):
     """What a result is worth, and the order of its legs."""
 
@@ -409,6 +419,7 @@ class Heading(Document):
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
+    doubts: list[DoubtBlock] = Field(default_factory=list)  # left out by earlier versions
     legs: list[str]  # the order of what follows
 
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
+from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -60,7 +61,7 @@ from legcal.files.folder import check_destination, output_path
 from legcal.geometry.types import IntArray
 from legcal.machine.parameter_id import ParameterId
 from legcal.paper.criteria import Criteria
-from legcal.perception.diagnostics import hint_notes, is_measurable
+from legcal.perception.diagnostics import hint_notes
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -73,7 +74,6 @@ from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
-MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
 
 
 def calibrate(
@@ -260,7 +260,7 @@ def _estimate(
             estimate,
             image_notes=data.plan.notes,
             fit_notes=_notes_on_images(estimate),
-            diagnosis=diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else (),
+            diagnosis=diagnosed(data) if _leaves_out_many(estimate) else (),
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
@@ -301,14 +301,13 @@ def _estimate(
         ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
-        diagnosis=diagnosis or (diagnosed(data) if _unused_share(estimate) > MAX_LEFT_OUT else ()),
+        diagnosis=diagnosis or (diagnosed(data) if _leaves_out_many(estimate) else ()),
     )
 
 
-def _unused_share(estimate: Estimate) -> float:
-    """Return the share of the measurable outlines that the fit does not use."""
-    shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
-    return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
+def _leaves_out_many(estimate: Estimate) -> bool:
+    """Whether the fit uses so few outlines that common mistakes are tried."""
+    return used_share(estimate.solution.outlines) < 1.0 - MAX_LEFT_OUT
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:

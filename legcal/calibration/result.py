@@ -35,6 +35,7 @@ from legcal.calibration.documents import (
     WorkspaceAccuracy,
     left_out_blocks,
 )
+from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
@@ -66,9 +67,19 @@ if TYPE_CHECKING:
 class Verdict:
     """Whether the calibrated model should replace the nominal one."""
 
-    trustworthy: bool  # the predicted improvement exceeds two sigma, and nothing speaks against it
-    sentence: str  # the same, for people
+    doubts: tuple[Doubt, ...]  # what speaks against it, the worst first
+    sentence: str  # the verdict for people
     remedy: str = ""  # what would tell more than further images, as a sentence goes on
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether nothing speaks against it: the improvement is larger than two sigma as well."""
+        return not self.doubts
+
+    @property
+    def is_to_be_refused(self) -> bool:
+        """Whether it is not to be loaded into a controller: a doubt is grave."""
+        return any(doubt.is_grave for doubt in self.doubts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +121,11 @@ class Calibration(Summarised):
     corners: Corners | None = None
     diagnosis: tuple[Diagnosis, ...] = ()
     overlays: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What speaks against the result, the worst first; empty where it is trusted."""
+        return self.verdict.doubts
 
     @cached_property
     def result(self) -> Result:
@@ -156,6 +172,7 @@ def _result_of(calibration: Calibration) -> Result:
         status="converged",
         verdict=calibration.verdict.sentence,
         trustworthy=calibration.verdict.trustworthy,
+        doubts=[doubt.document() for doubt in calibration.doubts],
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,

@@ -227,6 +227,7 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
     *verbose* says how the fit went too, and names what moves the platform by nothing.
     """
     return [
+        *_doubt_lines(result),
         *(f"Note: {note}" for note in result.notes),
         *(result.details if verbose else ()),
         *_observation_lines(result),
@@ -242,6 +243,7 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
 def brief_sentences(result: Result) -> list[str]:
     """Return what the first screen says beside the verdict and the platform error."""
     return [
+        *_doubt_lines(result),
         *_direction_lines(result, 1),
         *_observation_lines(result),
         *([] if result.holdout is None else _holdout_lines(result.holdout)),
@@ -320,6 +322,20 @@ class Summarised:
 
 def _mm_deg(dX_m: float, dE_rad: float) -> str:
     return f"{1e3 * dX_m:.3f} mm / {np.degrees(dE_rad):.4f} deg"
+
+
+def _doubt_lines(result: Result) -> list[str]:
+    """Return what speaks against the result, each with its effect on the platform and its remedy.
+
+    One doubt alone stands in the verdict.
+    """
+    lines = []
+    for doubt in result.doubts if len(result.doubts) > 1 else ():
+        effect = ""
+        if doubt.sigma_dX_m is not None and doubt.sigma_dE_rad is not None:
+            effect = f" ({_mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)} at the platform)"
+        lines.append(f"Doubt: {doubt.what}{effect}; {doubt.remedy}.")
+    return lines
 
 
 def _observation_lines(result: Result) -> list[str]:

@@ -6,29 +6,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from legcal.calibration.clicks import click_notes
 from legcal.calibration.closeness import closeness
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.doubts import (
+    CAMERA,
+    Doubt,
+    doubts_of,
+    model_error,
+    no_improvement,
+    worst_first,
+)
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import SCALE
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.notes import Note, Topic
 from legcal.calibration.result import Calibration, Verdict
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
-from legcal.data.landmarks import Landmarks, joint_name
-from legcal.data.measurements import few_views, row_names
-from legcal.geometry.motions import components
-from legcal.geometry.types import Array
-from legcal.machine.rods import ends_at_poses
-from legcal.perception.diagnostics import far_off
 
-_DO_NOT_LOAD = "Do not load this into the controller"
-# Of half the clicks of a view from where a fit has their joints: hands are steadier
-MAX_CLICK_SIGMAS = 4.0
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
 
@@ -47,9 +46,8 @@ def judge(
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
-    Nothing is trusted that a diagnosis of the session speaks against, nor what left out a leg of a
-    view where other starts do not confirm it: either that is another leg, or the fit is at a wrong
-    minimum.
+    Cameras that the measurements contradict count there with what they do to the platform. What
+    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted.
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
@@ -73,10 +71,14 @@ def judge(
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
-    objection = _objection(dataset, solution, diagnosis, found)
-    verdict = (
-        Verdict(False, objection, remedy) if objection else _verdict(change, sigma, found, remedy)
-    )
+    doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners)
+    displacement, rotation = model_error(doubts)
+    if displacement > 0.0:
+        found += f"; what is in doubt may add {_mm_deg(displacement, rotation)}"
+    of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
+    if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
+        doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
+    verdict = _verdict(worst_first(doubts), found, remedy)
     return Calibration(
         dataset,
         solution,
@@ -94,132 +96,20 @@ def judge(
     )
 
 
-def _objection(
-    dataset: Dataset, solution: Solution, diagnosis: Sequence[Diagnosis], found: str
-) -> str:
-    """Return what speaks against a result, however large its improvement; "" where nothing does."""
-    readings = solution.quality.redundant_readings
-    if diagnosis:
-        return f"{_DO_NOT_LOAD}: {diagnosis[0].sentence} As it is, {found}."
-    if readings is not None and readings.doubts:
-        return f"{_DO_NOT_LOAD}: {found}, but {', and '.join(readings.doubts)}."
-    if solution.left_out:
-        return (
-            f"{_DO_NOT_LOAD}: {found}, but most outlines of a leg that a view shows disagree with "
-            f"that ({', '.join(solution.left_out)}), so that they are of something else or the fit "
-            "is wrong; look at them in the table of observations, and correct them or leave the "
-            "leg out of the legs of that view."
-        )
-    contradicted = [
-        f"{name} ({px:.0f} px)"
-        for name, (px, most) in click_distances(dataset, solution).items()
-        if px > most
-    ]
-    if contradicted:
-        return (
-            f"{_DO_NOT_LOAD}: {found}, but most clicks on joints in {few_views(contradicted)} are "
-            f"that far from where the fit has these joints, so that it is wrong or they are; look "
-            "at the outlines in these images, and at the clicks (legcal detect --edit)."
-        )
-    if strayed := _strayed_cameras(dataset, solution):
-        return (
-            f"{_DO_NOT_LOAD}: {found}, but the fit has {strayed} far from the rough T_base_camera "
-            "near which platform poses were looked for, so that these are wrong or it is; measure "
-            "it again, or take images that show more legs."
-        )
-    return ""
-
-
-def click_distances(dataset: Dataset, solution: Solution) -> dict[str, tuple[float, float]]:
-    """Return how far clicks are from where a fit has their joints, and may be, by view [px].
-
-    Both are medians: a click in two may be on another joint.
-    """
-    if dataset.landmarks is None:
-        return {}
-    clicks, m = dataset.landmarks, dataset.measurements
-    view, off = m.view[clicks.row], _off_clicks(dataset.landmarks, dataset, solution)
-    own, most = off[np.arange(len(clicks)), clicks.leg, clicks.end], MAX_CLICK_SIGMAS
-    return {
-        m.views[v].name: (
-            float(np.median(own[view == v])),
-            most * float(np.median(clicks.sigma_px[view == v])),
-        )
-        for v in np.unique(view).tolist()
-    }
-
-
-def _off_clicks(clicks: Landmarks, dataset: Dataset, solution: Solution) -> Array:
-    """Return how far each click is from all joints as a fit has them, (n, n_legs, 2) [px]."""
-    m = dataset.measurements
-    joints = np.stack(ends_at_poses(solution.legs, *components(solution.T_Rb_Re)), axis=2)
-    off = np.full((len(clicks), *joints.shape[1:3]), np.inf)
-    for of_click, row, px in zip(off, clicks.row.tolist(), clicks.px, strict=True):
-        v = int(m.view[row])
-        P = solution.T_camera_Rb[v].apply(joints[m.pose[row]].reshape(-1, 3))
-        P = P.reshape(*of_click.shape, 3)
-        ahead = P[..., 2] > 0.0
-        of_click[ahead] = np.linalg.norm(solution.cameras[v].project(P[ahead]) - px, axis=-1)
-    return off
-
-
-def click_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return a note on each click that a fit contradicts, in views whose other clicks agree."""
-    if dataset.landmarks is None:
-        return []
-    clicks, m, legs = dataset.landmarks, dataset.measurements, dataset.machine.leg_names
-    agree = [name for name, (px, most) in click_distances(dataset, solution).items() if px <= most]
-    names, notes = row_names(m), list[str]()
-    every = zip(clicks.row_keys(), clicks.sigma_px.tolist(), strict=True)
-    for ((row, leg, end), sigma), off in zip(
-        every, _off_clicks(clicks, dataset, solution), strict=True
-    ):
-        own, most, view = float(off[leg, end]), MAX_CLICK_SIGMAS * sigma, m.views[m.view[row]].name
-        if own <= most or view not in agree:
-            continue
-        near_leg, near_end = np.unravel_index(int(np.argmin(off)), off.shape)
-        near = joint_name(legs[int(near_leg)], int(near_end))
-        perhaps = f"perhaps it shows {near}; " if off.min() <= most else ""
-        notes.append(
-            f"The click on {joint_name(legs[leg], end)} in {names[row]} (view {view}) is {own:.0f} "
-            f"px from where the fit has this joint, needed at most {most:.0f} px; {perhaps}correct "
-            "or remove it."
-        )
-    return notes
-
-
-def _strayed_cameras(dataset: Dataset, solution: Solution) -> str:
-    """Return the views whose cameras left the rough poses by which platforms were found, or ""."""
-    if dataset.machine.is_determined:
-        return ""
-    cameras = solution.cameras_in_base(dataset.machine.T_base_Rb)
-    views = zip(dataset.measurements.views, cameras, strict=True)
-    strayed = [
-        view.name
-        for view, T in views
-        if view.T_base_camera is not None and far_off(view.T_base_camera, T)
-    ]
-    return few_views(strayed) if strayed else ""
-
-
 def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
-    """Return the change of the platform, its uncertainty, both displacements [m], and a clause.
-
-    Cameras that the measurements contradict count with what they do to the platform.
-    """
+    """Return the change of the platform, its uncertainty, both displacements [m], and a clause."""
     change, sigma = platform.change, platform.sigma
     found = (
-        f"the platform moves by {1e3 * change.mean_displacement:.3f} mm / "
-        f"{np.degrees(change.mean_rotation):.4f} deg against the nominal model, known to "
-        f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
+        f"the platform moves by {_mm_deg(change.mean_displacement, change.mean_rotation)} against "
+        f"the nominal model, known to {_mm_deg(sigma.mean_displacement, sigma.mean_rotation)} "
         "(1 sigma)"
     )
-    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == FITTED_CAMERA]
-    effect = max(of_cameras, default=0.0)
-    if effect > 0.0:
-        found += f"; a camera file that the measurements contradict may add {1e3 * effect:.3f} mm"
-    known_to = float(np.hypot(sigma.mean_displacement, effect))
-    return change.mean_displacement, known_to, found
+    return change.mean_displacement, sigma.mean_displacement, found
+
+
+def _mm_deg(displacement: float, rotation: float) -> str:
+    """Return an error of the platform in words."""
+    return f"{1e3 * displacement:.3f} mm / {np.degrees(rotation):.4f} deg"
 
 
 def _share_of_scale(platform: PlatformAccuracy) -> str:
@@ -254,13 +144,11 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
     return change, sigma, clause
 
 
-def _verdict(improvement: float, sigma: float, found: str, remedy: str) -> Verdict:
-    """Return what an improvement with a standard deviation is worth."""
-    if improvement > TRUSTED_SIGMAS * sigma:
-        return Verdict(True, f"Calibrated: {found}.", remedy)
-    return Verdict(
-        False,
-        f"{_DO_NOT_LOAD}: {found}, and a predicted improvement below two sigma is no improvement; "
-        f"{remedy or 'take more images or better ones'}.",
-        remedy,
-    )
+def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
+    """Return the verdict that follows from what was found and from doubts, the worst first."""
+    if not doubts:
+        return Verdict(doubts, f"Calibrated: {found}.", remedy)
+    more = len(doubts) - 1
+    others = f" {more} more doubt{'s' * (more > 1)} beside that." if more else ""
+    heading = "Do not load this into the controller" if doubts[0].is_grave else "In doubt"
+    return Verdict(doubts, f"{heading}: {found}. {doubts[0].sentence}{others}", remedy)

@@ -334,7 +334,7 @@ def load_dataset(
         yaml_path=yaml_path,
         table_path=table_path,
         camera_paths=tuple(camera_paths[v] for v in origin),
-        machine=machine,
+        machine=replace(machine, tolerance=entry.built or machine.tolerance),
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
         table_notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),

@@ -26,6 +26,7 @@ from legcal.files.quantity import PRIOR_SCHEMA, Quantity, read_prior
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.machine.directions import list_in_words
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.tolerance import BuiltEntry
 from legcal.vision.board import Link
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m] plausible standard deviations of an encoder
@@ -104,7 +105,7 @@ def _by_joint_or(of_all: str) -> Discriminator:
     return Discriminator(form)
 
 
-class DatasetEntry(FileSchema):
+class DatasetEntry(BuiltEntry):
     """The whole of ``dataset.yaml``."""
 
     legcal_dataset: Version

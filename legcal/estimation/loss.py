@@ -51,6 +51,10 @@ class PseudoHuber:
             return 0.5 * float(s.sum())
         return float((s / (1.0 + np.sqrt(1.0 + self.k * s))).sum())
 
+    def weights(self, s: Array) -> Array:
+        """Return the weights (n,) of the squares s (n,) that have the gradient of the loss."""
+        return np.asarray(1.0 / np.sqrt(1.0 + self.k * s))
+
     def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
         """Return rows with gradient w r and curvature w (1 - k w^2 r r^T), w = (1 + k s)^-1/2.
 

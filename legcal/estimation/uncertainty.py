@@ -6,7 +6,7 @@ All of them follow from the normal equations at one state, eliminated elements m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
@@ -256,8 +256,7 @@ def score_test(
     if normal.tangent is not None:
         by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ element_products
     element_response = normal.V_inverse @ by_element
-    elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
-    g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
+    g_kept = _reduced_gradient(normal)
     kept_response = normal.moved_by(kept)
     score = (
         score
@@ -270,6 +269,65 @@ def score_test(
         - element_response.reshape(-1, c).T @ by_element.reshape(-1, c)
     )
     return score, projected
+
+
+def squares_of_left_out(
+    problem: EstimationProblem[S], state: S, linear: Linearization, block: IntArray
+) -> tuple[Array, IntArray]:
+    """Return how well blocks of eliminated elements are predicted by all else.
+
+    The block of each element is given, (n_elements,) from 0. The measurements of a block are
+    compared with the fit without them, one Gauss-Newton step from here: the squares are those of
+    their innovations, whitened by the covariance of these. For right models they are as large as
+    their number.
+
+    Returns
+    -------
+    squares : (n_blocks,) array
+        Squared Mahalanobis distance of the measurements of each block.
+    dof : (n_blocks,) array
+        Number of independent innovations; the elements' unknowns and directions that only a block
+        determines are subtracted.
+    """
+    n_blocks = int(block.max(initial=-1)) + 1
+    squares, dof = np.zeros(n_blocks), np.zeros(n_blocks, dtype=np.intp)
+    everything = normal_equations(problem, state, linear)
+    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
+    rank_of_elements = _ranks(everything.V)
+    for b in range(n_blocks):
+        rows = dict(linear.rows)
+        for factor in problem.factors:
+            if factor.element is None:
+                continue
+            is_inside, of_factor = block[factor.element] == b, linear[factor.name]
+            kept = np.where(is_inside, 0.0, 1.0)[:, None]
+            rows[factor.name] = Residuals.of(
+                kept * of_factor.r,
+                kept[..., None] * of_factor.J,
+                kept[..., None] * of_factor.J_element,
+            )
+            inside = of_factor.squared_norms[is_inside]
+            squares[b] += inside.sum()
+            dof[b] += factor.n_rows * int(np.sum(inside > 0.0))
+        rest = normal_equations(problem, state, replace(linear, rows=rows))
+        pull = _reduced_gradient(rest) - gradient
+        squares[b] += pull @ rest.moved_by(pull[:, None])[:, 0]
+        dof[b] -= rank - int(_ranks(rest.reduced())) + rank_of_elements[block == b].sum()
+    return squares, dof
+
+
+def _reduced_gradient(normal: NormalEquations) -> Array:
+    """Return the gradient (n_kept,) of kept unknowns, elements at their minimum."""
+    elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
+    return np.asarray(normal.g_kept - np.einsum("akp,kp->a", normal.W, elements))
+
+
+def _ranks(matrices: Array) -> IntArray:
+    """Return the ranks of information matrices (..., n, n), whatever their units."""
+    diagonal = np.einsum("...ii->...i", matrices)
+    scale = np.sqrt(np.maximum(diagonal, np.finfo(np.float64).tiny))
+    scaled = matrices / scale[..., :, None] / scale[..., None, :]
+    return np.asarray(np.linalg.matrix_rank(scaled, tol=_ROUNDING, hermitian=True), dtype=np.intp)
 
 
 def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple[Array, Array]:
@@ -295,8 +353,7 @@ def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple
     """
     normal = normal_equations(problem, state, linearize(problem, state))
     R = normal.reduced()
-    elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
-    g = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
+    g = _reduced_gradient(normal)
     effects, block = problem.where(name), problem.block(name)
     value = block.read(getattr(state, name))
     others = np.setdiff1d(np.arange(len(R)), effects)

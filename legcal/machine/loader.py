@@ -67,6 +67,7 @@ from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
+from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
     Normals,
     any_joint,
@@ -241,6 +242,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base_normal=base_normal,
         platform_normal=platform_normal,
         occluders=occluders,
+        tolerance=block.built or NOT_STATED,
     )
     _check_frames(machine)
     return machine

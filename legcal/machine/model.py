@@ -32,6 +32,7 @@ from legcal.machine.rods import (
     reading_legs,
     reading_of_rod,
 )
+from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.machine.urdf import Urdf
 
 
@@ -59,6 +60,7 @@ class Machine:
     base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
     platform_normal: Array | None = None  # platform, the same way up; None in space
     occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
+    tolerance: Tolerance = NOT_STATED  # how well it is built
 
     @property
     def upward(self) -> Array:

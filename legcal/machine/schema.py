@@ -21,6 +21,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
+from legcal.machine.tolerance import BuiltEntry
 
 WHAT = "mechanism file"
 MAX_LOOPS = 100
@@ -36,7 +37,7 @@ class MotorEntry(FileSchema):
     us_per_deg: Number | None = None  # negative where longer pulses turn it backwards
 
 
-class LegcalBlock(FileSchema):
+class LegcalBlock(BuiltEntry):
     """The block ``legcal``: what belongs to base, platform and legs.
 
     What is missing is proposed, see :mod:`legcal.machine.topology`.

@@ -529,6 +529,24 @@ def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]
             yield f"its camera has {axes}{both}", pose * turned
 
 
+def far_from_hints(
+    hints: Sequence[RigidTransform | None], cameras: Sequence[RigidTransform | None]
+) -> list[int]:
+    """Return the views whose cameras are far from their rough poses, whatever these may mean.
+
+    Views that suit the camera of another one are left out: they were exchanged.
+    """
+    return [
+        v
+        for v, (hint, T) in enumerate(zip(hints, cameras, strict=True))
+        if hint is not None
+        and T is not None
+        and far_off(hint, T)
+        and not any(other is not None and not far_off(hint, other) for other in cameras)
+        and all(far_off(as_meant, T) for _, as_meant in _other_meanings(hint))
+    ]
+
+
 def hint_notes(
     names: Sequence[str],
     hints: Sequence[RigidTransform | None],

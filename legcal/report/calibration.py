@@ -39,8 +39,11 @@ def summary(calibration: Calibration, output: Path, *, verbose: bool = False) ->
 
     *verbose* adds all parameters in mm, degrees and pixels, and how the fit went.
     """
-    result, good = calibration.result, calibration.verdict.trustworthy
-    verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
+    result = calibration.result
+    colour = "green" if calibration.verdict.trustworthy else "yellow"
+    if calibration.verdict.is_to_be_refused:
+        colour = "red"
+    verdict = Text(calibration.verdict.sentence, style=f"bold {colour}")
     written = f"Written to {output}."
     if not verbose:
         return report(

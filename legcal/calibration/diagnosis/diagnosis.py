@@ -122,19 +122,27 @@ class Diagnosis:
     n_kinds: int = 0
 
     @property
-    def sentence(self) -> str:
-        """The diagnosis for people."""
+    def finding(self) -> str:
+        """What looks wrong and how many images say so, as a clause."""
         more = len(self.same_as) - self.n_kinds
         others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
         others += f", or {more} more that {'is' if more == 1 else 'are'} alike" * (more > 0)
-        what = self.what[0].upper() + self.what[1:]
-        tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
         rest = " (what the others show may have another cause as well)"
         return (
-            f"{what}{others}: {self.mended}, {self.after} of {self.images} images agree"
-            f"{rest * (self.after < _MIN_SHARE * self.images)}, as it is {self.before}; "
-            f"{self.remedy}{tell}."
+            f"{self.what}{others}: {self.mended}, {self.after} of {self.images} images agree"
+            f"{rest * (self.after < _MIN_SHARE * self.images)}, as it is {self.before}"
         )
+
+    @property
+    def remedies(self) -> str:
+        """What to do, and what would tell it from what it is the same as."""
+        tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
+        return f"{self.remedy}{tell}"
+
+    @property
+    def sentence(self) -> str:
+        """The diagnosis for people."""
+        return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
 
     def document(self) -> DiagnosisBlock:
         """Return the entry of documents."""

@@ -20,6 +20,7 @@ nominal or refused, rounds of outlier rejection and noise estimation, checks, th
 ``scale``             the source of the absolute scale: a measured length, or radii alone
 ``sensitivity``       effect of errors of fixed quantities; score tests of cameras
 ``held_out``          prediction errors in held-out images
+``cross_validation``  images without a part in the fit predicted by it and the nominal model
 ``platform``          accuracy at the platform
 ``solution``          the result
 ===================== ==================================================================

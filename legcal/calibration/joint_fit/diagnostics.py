@@ -50,6 +50,7 @@ _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 # cylindrical arms in benchmarks/arm_misfits.py), and [px]
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
+MOST_SCATTER = 2.0  # of outlines, over the standard deviations that they came with
 RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
@@ -345,6 +346,28 @@ def _held_information(problem: FitProblem, held: HeldDirections, length: float) 
     rows, sigma = np.zeros((len(held.basis), n)), _NOMINAL_SIGMA * length * held.unit
     rows[:, np.setdiff1d(np.arange(n), problem.where("biases"))] = held.basis / sigma
     return rows.T @ rows
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Outlines about a fit, over the standard deviations that they came with."""
+
+    squares: Array  # (n,) of each outline, by the number of its residuals
+    used: BoolArray  # (n,) by the fit
+
+    @classmethod
+    def of(cls, problem: FitProblem, state: State) -> Scatter:
+        """Return the scatter at a minimum."""
+        claimed = problem.outlines.covariance
+        squares = NoiseModel().squared_norms(problem.offsets(state), claimed) / 2.0
+        whitening = np.asarray(problem.factor("outlines").whitening)
+        used = np.asarray(np.any(whitening, axis=(1, 2)))
+        return cls(squares, used)
+
+    def ratio(self, of: BoolArray | bool = True) -> float:
+        """Return the root mean square of some outlines, or of all that are used; 0 without any."""
+        squares = self.squares[self.used & of]
+        return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
 
 
 @dataclass(frozen=True)

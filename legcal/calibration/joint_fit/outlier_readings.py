@@ -54,7 +54,7 @@ class JudgedReadings:
     rms: float  # of the residuals of the others, over their standard deviations
     rms_expected: float  # the same for right readings, from their redundancy
     rms_m: float  # of the residuals as displacements of joints [m]
-    doubts: tuple[str, ...]  # reasons to distrust the result, a sentence each
+    doubts: tuple[tuple[str, str], ...]  # reasons to distrust the result, each with its remedy
 
     def renumbered(self, legs: Sequence[int], poses: Mapping[int, int]) -> JudgedReadings:
         """Renumber legs and poses."""
@@ -203,19 +203,19 @@ def _doubts(
     linear: Linearization,
     tests: ReadingTests,
     wrong: list[WrongReading],
-) -> tuple[str, ...]:
-    """Reasons why readings put the result in doubt."""
-    legs, doubts = problem.legs.nominal, list[str]()
+) -> tuple[tuple[str, str], ...]:
+    """Reasons why readings put the result in doubt, each with its remedy."""
+    legs, doubts = problem.legs.nominal, list[tuple[str, str]]()
     for leg in dict.fromkeys(reading.leg for reading in wrong):
         of_motor = [reading for reading in wrong if reading.leg == leg]
         n = len(of_motor) + int(np.sum(tests.leg == leg))
         if len(of_motor) >= max(_MIN_COUNT, _MAX_SHARE_OF_MOTOR * n):
             worst = max(of_motor, key=lambda reading: abs(reading.off))
-            doubts.append(
+            what = (
                 f"{len(of_motor)} of {n} readings of {legs[leg].motor_label} contradict the other "
-                f"measurements, most of all {_in_words(worst)}; this is not an accident; check the "
-                "scale, zero and slip of that motor"
+                f"measurements, most of all {_in_words(worst)}; this is not an accident"
             )
+            doubts.append((what, "check the scale, zero and slip of that motor"))
     undecided = list[str]()
     for pose in np.unique(tests.pose).tolist():
         suspects = _suspects_of_pose(problem, state, linear, tests, pose)
@@ -224,20 +224,25 @@ def _doubts(
             labels = [legs[j].motor_label for j in tests.leg[suspects].tolist()]
             undecided.append(f"{view}, image {image} ({few(labels)})")
     if undecided:
-        doubts.append(
+        what = (
             f"the readings of {few(undecided)} contradict each other, and the measurements do not "
-            "show which motor is wrong; check them, or remove the images"
+            "show which motor is wrong"
         )
+        doubts.append((what, "check them, or remove the images"))
     expected_squares, squares = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if squares > expected_squares + _SIGNIFICANT * np.sqrt(2.0 * expected_squares):
         ratio = np.sqrt(squares / max(expected_squares, 1.0))
         plain = normal_equations(problem, state, linear)
-        doubts.append(
+        what = (
             f"the readings of redundant motors contradict each other and the images {ratio:.1f} "
-            "times as much as their standard deviations allow, "
-            f"{_best_scale(problem, linear, plain)}; check the scale, zero and slip of the motors, "
-            "or state the standard deviations of their readings"
+            f"times as much as their standard deviations allow, "
+            f"{_best_scale(problem, linear, plain)}"
         )
+        remedy = (
+            "check the scale, zero and slip of the motors, or state the standard deviations of "
+            "their readings"
+        )
+        doubts.append((what, remedy))
     return tuple(doubts)
 
 

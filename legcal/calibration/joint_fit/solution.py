@@ -12,7 +12,9 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
 from legcal.calibration.joint_fit.diagnostics import (
+    MOST_SCATTER,
     DoubtedCamera,
+    Scatter,
     contradicted_radii,
     doubted_cameras,
     legs_left_out,
@@ -171,9 +173,22 @@ class CameraDoubts:
     def of(cls, cameras: CameraResiduals, covariance: Array) -> CameraDoubts:
         """Test the cameras at a minimum with the *covariance* of its kept unknowns."""
         tested = cameras.contradicted()
+        if not cls._explain(cameras, tested):
+            return cls((), ())
         views = {test.view for test in tested}
         doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
         return cls(tested, [camera for camera in doubted if camera.view not in views])
+
+    @staticmethod
+    def _explain(cameras: CameraResiduals, tested: Sequence[WrongIntrinsic]) -> bool:
+        """Whether outlines scatter as little as they claim once these cameras are corrected.
+
+        Otherwise something else is wrong, of which cameras take a part.
+        """
+        squares = float(cameras.linear["outlines"].squared_norms.sum())
+        left = 1.0 - sum(test.apart**2 for test in tested) / max(squares, 1e-300)
+        scatter = Scatter.of(cameras.problem, cameras.state).ratio()
+        return scatter <= MOST_SCATTER or np.sqrt(max(left, 0.0)) * scatter <= MOST_SCATTER
 
     @property
     def views(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import shlex
 
 import numpy as np
 
+from legcal.calibration.doubts import Doubt
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.result import Calibration
@@ -14,20 +15,28 @@ from legcal.pages.document import Light, Verdict
 
 _WORDS: dict[Light, str] = {
     "good": "Use it",
-    "doubtful": "Use it with care",
+    "doubtful": "Do not trust it yet",
     "bad": "Do not load it into the controller",
 }
-_MOST_OFF = 2.0  # times what was expected of held-out images
 
 
 def verdict_of(calibration: Calibration) -> Verdict:
-    """Return the verdict: green, amber where something speaks against parts of it, or red."""
-    doubts = _doubts(calibration)
-    light: Light = "bad"
-    if calibration.verdict.trustworthy:
-        light = "doubtful" if doubts else "good"
-    return Verdict(
-        light, _WORDS[light], calibration.verdict.sentence, [*_grounds(calibration), *doubts]
+    """Return the verdict: green, amber where something speaks against it, or red."""
+    verdict = calibration.verdict
+    light: Light = "good"
+    if not verdict.trustworthy:
+        light = "bad" if verdict.is_to_be_refused else "doubtful"
+    doubts = [f"{doubt.sentence}{_effect(doubt)}" for doubt in verdict.doubts]
+    return Verdict(light, _WORDS[light], verdict.sentence, [*doubts, *_grounds(calibration)])
+
+
+def _effect(doubt: Doubt) -> str:
+    """Return how far a doubt would move the platform, in words."""
+    if doubt.sigma_dX_m is None or doubt.sigma_dE_rad is None:
+        return ""
+    return (
+        f" At the platform: {1e3 * doubt.sigma_dX_m:.3f} mm / "
+        f"{np.degrees(doubt.sigma_dE_rad):.4f} deg."
     )
 
 
@@ -55,25 +64,15 @@ def _grounds(calibration: Calibration) -> list[str]:
     return found
 
 
-def _doubts(calibration: Calibration) -> list[str]:
-    """Return what speaks against parts of a result."""
-    result, found = calibration.result, []
-    for view in calibration.solution.camera_doubts.views:
-        found.append(f"The outlines contradict the camera of view {view}.")
-    found += [f"{one.what} The remedy: {one.remedy}" for one in result.diagnosis or ()]
-    held_out = result.holdout
-    if held_out is not None and (held_out.rms_px or 0.0) > _MOST_OFF * (held_out.expected_px or 0):
-        found.append("Images that were kept aside are predicted worse than expected.")
-    return found
-
-
 def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]:
     """Return what to do next, the first thing first; *command* has made the result, if any has."""
     result, steps = calibration.result, list[str]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
-    for one in result.diagnosis or ():
-        steps.append(f"{one.remedy} Then calibrate again.")
-    if remedy := calibration.verdict.remedy:
+    for doubt in calibration.doubts:
+        what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
+        steps.append(f"{what}. {remedy}, and calibrate again.")
+    remedy = calibration.verdict.remedy
+    if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
         steps.append(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again.")
     if calibration.verdict.trustworthy:
         steps.append(
@@ -93,9 +92,9 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]
             "In some months, or after a collision, photograph a few poses and ask whether anything "
             f"moved: legcal calibrate NEW --check {out}."
         )
-    elif not (result.diagnosis or remedy):
-        weak = f" What is known worst: {result.weakest[0].in_words}." if result.weakest else ""
-        steps.append(f"Take more images, at poses further apart and from other places.{weak}")
+    elif not result.diagnosis:
+        if result.weakest:
+            steps.append(f"More images help where least is known: {result.weakest[0].in_words}.")
         steps.append(
             "Look at the worst outlines below: blur, reflections and wrong edges show there."
         )

@@ -1,0 +1,399 @@
+"""What speaks against a calibration: one list, made once, that all answers follow.
+
+A result is trusted where the list is empty. Grave doubts say that the result is wrong or no better
+than the nominal model: it is not to be loaded. Each doubt has its effect on the platform if it were
+true, where that can be computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.calibration.clicks import click_distances
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import DoubtBlock
+from legcal.calibration.joint_fit.cross_validation import cross_validate
+from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
+from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.platform import (
+    PlatformAccuracy,
+    PlatformError,
+    moved_by,
+    platform_by_parameters,
+)
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.data.corners import Corners
+from legcal.data.dataset import Dataset
+from legcal.data.measurements import few, few_views
+from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason
+from legcal.files.quantity import SHOWN_IN
+from legcal.machine.parameters import geometries, vector_of
+from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
+
+CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
+MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
+MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
+MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
+MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sigmas
+_SURE = 5.0  # standard deviations of these squares
+MIN_GAIN = 0.5  # of what a change claims to predict better
+MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something that speaks against a result.
+
+    Attributes
+    ----------
+    code : str
+        What was tested; codes do not change.
+    what : str
+        What was found, as a clause.
+    remedy : str
+        What to do, as a clause.
+    sigma_dX_m, sigma_dE_rad : float or None
+        How far the platform would be displaced and turned if it were true; None where that cannot
+        be computed.
+    is_grave : bool
+        The result is not to be loaded.
+    """
+
+    code: str
+    what: str
+    remedy: str
+    sigma_dX_m: float | None = None
+    sigma_dE_rad: float | None = None
+    is_grave: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+        return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
+
+    def document(self) -> DoubtBlock:
+        """Return the entry of documents."""
+        return DoubtBlock(
+            code=self.code,
+            what=self.what,
+            sigma_dX_m=self.sigma_dX_m,
+            sigma_dE_rad=self.sigma_dE_rad,
+            remedy=self.remedy,
+        )
+
+
+def worst_first(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
+    """Return doubts with grave ones first, then those of known effects, the largest first."""
+    return tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
+
+
+def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:
+    """Return the displacement [m] and rotation [rad] of the platform by all doubts together."""
+    displacement = float(np.hypot.reduce([one.sigma_dX_m or 0.0 for one in doubts] or [0.0]))
+    return displacement, float(
+        np.hypot.reduce([one.sigma_dE_rad or 0.0 for one in doubts] or [0.0])
+    )
+
+
+def doubts_of(
+    dataset: Dataset,
+    solution: Solution,
+    platform: PlatformAccuracy | None,
+    held_out: HeldOut | None,
+    diagnosis: Sequence[Diagnosis],
+    corners: Corners | None,
+) -> tuple[Doubt, ...]:
+    """Return all that speaks against a result but for the size of its improvement."""
+    return (
+        *_mistakes(diagnosis),
+        *_readings(solution),
+        *_legs_left_out(solution),
+        *_clicks(dataset, solution),
+        *_strayed_cameras(dataset, solution),
+        *_cameras(solution, platform),
+        *_views(dataset, solution, corners),
+        *_few_outlines(solution.outlines),
+        *_moved_parameters(dataset, solution, platform),
+        *_held_out(held_out),
+        *_left_out(solution, platform),
+        *_noise(solution),
+    )
+
+
+def no_improvement(remedy: str) -> Doubt:
+    """Return the doubt in a result whose predicted improvement is below two sigma."""
+    what = "a predicted improvement below two sigma is no improvement"
+    return Doubt("no_improvement", what, remedy, is_grave=True)
+
+
+def _mistakes(diagnosis: Sequence[Diagnosis]) -> list[Doubt]:
+    """Return the mistakes that explain the session better than it explains itself."""
+    return [Doubt("mistake", one.finding, one.remedies, is_grave=True) for one in diagnosis]
+
+
+def _readings(solution: Solution) -> list[Doubt]:
+    """Return what redundant motors contradict."""
+    readings = solution.quality.redundant_readings
+    return [
+        Doubt("readings", what, remedy, is_grave=True)
+        for what, remedy in (() if readings is None else readings.doubts)
+    ]
+
+
+def _legs_left_out(solution: Solution) -> list[Doubt]:
+    """Return legs in views most of whose outlines were rejected."""
+    if not solution.left_out:
+        return []
+    what = (
+        "most outlines of a leg that a view shows disagree with the fit "
+        f"({', '.join(solution.left_out)}), so that they are of something else or the fit is wrong"
+    )
+    remedy = (
+        "look at them in the table of observations, and correct them or leave the leg out of the "
+        "legs of that view"
+    )
+    return [Doubt("leg_left_out", what, remedy, is_grave=True)]
+
+
+def _clicks(dataset: Dataset, solution: Solution) -> list[Doubt]:
+    """Return views whose clicks the fit contradicts."""
+    contradicted = [
+        f"{name} ({px:.0f} px)"
+        for name, (px, most) in click_distances(dataset, solution).items()
+        if px > most
+    ]
+    if not contradicted:
+        return []
+    what = (
+        f"most clicks on joints in {few_views(contradicted)} are that far from where the fit has "
+        "these joints, so that it is wrong or they are"
+    )
+    remedy = "look at the outlines in these images, and at the clicks (legcal detect --edit)"
+    return [Doubt("clicks", what, remedy, is_grave=True)]
+
+
+def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
+    """Return cameras far from where they are stated, unless that means another thing.
+
+    It is grave where platform poses were looked for near the stated cameras.
+    """
+    m, machine = dataset.measurements, dataset.machine
+    shown = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
+    places = solution.cameras_in_base(machine.T_base_Rb)
+    strayed = far_from_hints(
+        [None if view.name in m.clicked_views else view.T_base_camera for view in m.views],
+        [T if v in shown else None for v, T in enumerate(places)],
+    )
+    if not strayed:
+        return []
+    of_views = few_views([m.views[v].name for v in strayed])
+    if machine.is_determined:
+        what = f"the fit has the camera of {of_views} far from its T_base_camera"
+        remedy = (
+            "look at the overlays of that view, and measure its place again; correct "
+            "T_base_camera in dataset.yaml if that was wrong"
+        )
+        return [Doubt("strayed_camera", what, remedy)]
+    what = (
+        f"the fit has {of_views} far from the rough T_base_camera near which platform poses were "
+        "looked for, so that these are wrong or it is"
+    )
+    remedy = "measure it again, or take images that show more legs"
+    return [Doubt("strayed_camera", what, remedy, is_grave=True)]
+
+
+def _cameras(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return cameras that the measurements contradict, with what their files do to the platform."""
+    views = solution.camera_doubts.views
+    if not views:
+        return []
+    effects = () if platform is None else platform.effects
+    errors = [effect.error for effect in effects if effect.what == FITTED_CAMERA]
+    what = f"the measurements contradict the camera of {few_views(views)}"
+    remedy = (
+        "calibrate it again at the same focus and zoom, and look for photographs that were zoomed, "
+        "scaled or cropped"
+    )
+    return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
+
+
+def _mean(error: PlatformError | None, part: float = 1.0) -> tuple[float | None, float | None]:
+    """Return a part of the mean displacement and rotation of the platform, where known."""
+    if error is None:
+        return None, None
+    return part * error.mean_displacement, part * error.mean_rotation
+
+
+def used_share(outlines: Outlines) -> float:
+    """Return the share of the outlines of visible legs that are used, 1 without any.
+
+    What people leave out, and arms that are left out as a whole, do not count.
+    """
+    chosen = outlines.rejected_for(Reason.BY_HAND, Reason.UNUSED_LEG, Reason.ARM_LEFT_OUT)
+    shown = outlines.choose(is_measurable(outlines) & ~chosen)
+    return float(shown.used.mean()) if len(shown) else 1.0
+
+
+def _views(dataset: Dataset, solution: Solution, corners: Corners | None) -> list[Doubt]:
+    """Return views without an image in the fit, and many images left out of the others.
+
+    Views of one image, as a camera in the hand has, count as images.
+    """
+    m, outlines = dataset.measurements, solution.outlines
+    chosen = outlines.rejected_for(Reason.BY_HAND, Reason.UNUSED_LEG)
+    asked = set(m.view[outlines.row[~chosen]].tolist())
+    rows = outlines.row[outlines.used]
+    if corners is not None:
+        rows = np.concatenate([rows, corners.row[corners.used]])
+    fitted = set(m.view[rows].tolist())
+    doubts = list[Doubt]()
+    lone = set(np.flatnonzero(np.bincount(m.view, minlength=len(m.views)) == 1).tolist())
+    if unplaced := sorted(asked - fitted - lone):
+        names = few_views([m.views[v].name for v in unplaced])
+        n = len(unplaced)
+        what = f"no image of {names} could be used: {n} of {len(asked)} views have no part in it"
+        remedy = "see in the notes why, take these images again, or leave the view out"
+        doubts.append(Doubt("view_left_out", what, remedy))
+    counted = fitted | (asked & lone)
+    left_out = [row for row in images_left_out(outlines) if int(m.view[row]) in counted]
+    images = int(np.isin(m.view, list(counted)).sum())
+    if len(left_out) > MAX_LEFT_OUT * images:
+        what = f"{len(left_out)} of {images} images were left out"
+        remedy = "see in the notes why, and take them again, or leave them out"
+        doubts.append(Doubt("images_left_out", what, remedy))
+    return doubts
+
+
+def _few_outlines(outlines: Outlines) -> list[Doubt]:
+    """Return whether many outlines of legs that are in sight could not be used."""
+    share = used_share(outlines)
+    if share >= MIN_USED:
+        return []
+    what = f"only {100.0 * share:.0f} % of the outlines of visible legs could be used"
+    remedy = (
+        "look at the overlays (legcal detect) for reflections, shadows and other edges along the "
+        "legs, and improve light and background"
+    )
+    return [Doubt("few_outlines", what, remedy)]
+
+
+def _left_out(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return whether images without a part in the fit are predicted as well as it claims."""
+    found = cross_validate(solution.posterior.problem, solution.posterior.state)
+    if found is None:
+        return []
+    doubts = list[Doubt]()
+    most = np.maximum(MOST_SQUARES, 1.0 + _SURE * np.sqrt(2.0 / np.maximum(found.dof, 1)))
+    of_blocks = found.squares / np.maximum(found.dof, 1)
+    ratio = max(found.ratio, float(of_blocks.max()) if np.any(of_blocks > most) else 0.0)
+    if ratio > MOST_SQUARES:
+        what = (
+            f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
+            "by the others as is stated"
+        )
+        remedy = (
+            "the session does not agree with itself: look for what changed or moved between "
+            "images, for play and bending, and at the worst outlines"
+        )
+        error = _mean(None if platform is None else platform.sigma, float(np.sqrt(ratio - 1.0)))
+        doubts.append(Doubt("left_out", what, remedy, *error))
+    if found.gain is not None and found.gain < MIN_GAIN:
+        what = (
+            "images that are left out are predicted better than by the nominal model by "
+            f"{100.0 * max(found.gain, 0.0):.0f} % of what the change of the model claims"
+        )
+        remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
+        error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
+        doubts.append(Doubt("no_better", what, remedy, *error))
+    return doubts
+
+
+def _moved_parameters(
+    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None
+) -> list[Doubt]:
+    """Return parameters that moved far beyond the tolerance of the machine, as one doubt."""
+    machine, kinematic = dataset.machine, solution.kinematic
+    parametrization, nominal = kinematic.parametrization, geometries(machine)
+    names, priors = parametrization.names, solution.posterior.problem.choices.priors
+    before = vector_of(parametrization, nominal, nominal)
+    expected = [priors[n].mean if n in priors else x for n, x in zip(names, before, strict=True)]
+    change = vector_of(parametrization, solution.legs, nominal) - np.array(expected)
+    sigma = np.sqrt(np.diagonal(kinematic.value_covariance))
+    legs = dict(zip(machine.leg_names, nominal, strict=True))
+    tolerances = machine.tolerance.of_parameters(names, legs, machine.size)
+    tolerance = np.array([tolerances.get(name, np.inf) for name in names])
+    estimated = np.array([solution.estimates.status.get(n) == "estimated" for n in names])
+    times = np.where(estimated, np.abs(change) / np.hypot(sigma, tolerance), 0.0)
+    far = np.flatnonzero(times > MOST_MOVED)
+    if not len(far):
+        return []
+    error = None
+    if platform is not None:
+        steps = np.zeros((len(names), 1))
+        steps[far, 0] = change[far]
+        error = moved_by(
+            platform_by_parameters(
+                solution.legs, parametrization, machine.frame_legs, solution.T_Rb_Re
+            ),
+            steps,
+        )
+    moved = []
+    for i in far[np.argsort(-times[far], kind="stable")].tolist():
+        scale, unit = SHOWN_IN[parametrization.units[i]]
+        moved.append(
+            f"{names[i]} by {scale * change[i]:+.3g} {unit} (tolerance {scale * tolerance[i]:.2g})"
+        )
+    what = f"the fit moved {few(moved)}, far beyond the tolerance of the machine"
+    remedy = (
+        "look at the worst outlines of these legs and at the model there; if the machine may be "
+        "that far off its model, state so (tolerance in dataset.yaml)"
+    )
+    return [Doubt("tolerance", what, remedy, *_mean(error))]
+
+
+def _noise(solution: Solution) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or those of a view or a leg."""
+    problem = solution.posterior.problem
+    o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
+    times = {"all views": scatter.ratio()}
+    if times["all views"] <= MOST_SCATTER:
+        times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
+        times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
+    worst = max(times, key=times.__getitem__)
+    if times[worst] <= MOST_SCATTER:
+        return []
+    what = (
+        f"the outlines of {worst} scatter about the fit {times[worst]:.1f} times as much as their "
+        "standard deviations"
+    )
+    remedy = (
+        "something moves that should not, or edges are not those of the legs: look at the worst "
+        "outlines, for play, bending, a camera or board that moved, and readings of another moment"
+    )
+    return [Doubt("noise", what, remedy)]
+
+
+def _held_out(held_out: HeldOut | None) -> list[Doubt]:
+    """Return whether images that were kept aside are predicted worse than expected."""
+    if held_out is None or held_out.rms_px is None or held_out.expected_px is None:
+        return []
+    if held_out.rms_px <= MOST_OFF * held_out.expected_px:
+        return []
+    what = (
+        f"images that were kept aside lie {held_out.rms_px:.3f} px from their prediction, where "
+        f"{held_out.expected_px:.3f} px were expected"
+    )
+    pair = held_out.at_platform
+    return [
+        Doubt(
+            "held_out",
+            what,
+            "look at the worst outlines, and for play, bending or a camera that moved",
+            *((None, None) if pair is None else (pair.displacement, pair.rotation)),
+        )
+    ]

@@ -1,0 +1,163 @@
+"""How well a machine is built: what its parts may be off their model, stated or assumed.
+
+These are thresholds of doubts and no priors: a fit whose parameters moved far beyond them has
+been led away more likely than the machine was built that badly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, WithJsonSchema, model_validator
+
+from legcal.errors import BadValue
+from legcal.files.quantity import Quantity, read_value
+from legcal.files.schema import FileSchema, describe
+from legcal.machine.leg import Leg
+from legcal.machine.parameter_id import ParameterId
+
+MachineKind = Literal["printed", "machined", "bought"]
+
+# Where nothing is stated: parts of the mean leg length, and angles. The search for legs and the
+# fit rely on a model about that good.
+_PART_OF_SIZE = 0.01
+_PART_OF_ZERO = 0.05
+_ANGLE = float(np.radians(3.0))
+_ANGLE_AT_ZERO = float(np.radians(5.0))
+
+
+def _stated(*dimensions: str) -> BeforeValidator:
+    """Return what reads a standard deviation: a number in SI units, or text with a unit."""
+
+    def read(given: Any) -> Quantity:
+        if isinstance(given, Quantity):
+            return given
+        if isinstance(given, bool) or not isinstance(given, int | float | str):
+            raise ValueError(
+                f"found {describe(given)}, needed one standard deviation; write a number in SI "
+                "units or with its unit."
+            )
+        found = read_value(given if isinstance(given, str) else repr(float(given)))
+        if found.dimension not in ("", *dimensions):
+            raise ValueError(
+                f"found {describe(given)}, needed a value in {' or '.join(dimensions)}; correct "
+                "its unit."
+            )
+        if not found.value > 0.0:
+            raise BadValue(
+                describe(given), "a standard deviation above zero", "state how well it is built"
+            )
+        return found
+
+    return BeforeValidator(read)
+
+
+_SCHEMA = WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]})
+_Length = Annotated[Quantity, _stated("m"), _SCHEMA]
+_Angle = Annotated[Quantity, _stated("rad"), _SCHEMA]
+_Zero = Annotated[Quantity, _stated("m", "rad"), _SCHEMA]
+
+
+class ToleranceEntry(FileSchema):
+    """One standard deviation of each kind of number of a model."""
+
+    joints: _Length | None = None  # coordinates of joint centres
+    axes: _Angle | None = None  # directions of axes
+    lengths: _Length | None = None  # of rods and constant legs
+    zeros: _Zero | None = None  # of motors, in their unit
+
+
+class BuiltEntry(FileSchema):
+    """What a file says of how well its machine is built."""
+
+    tolerance: ToleranceEntry | None = None
+    machine_kind: MachineKind | None = None
+
+    @model_validator(mode="after")
+    def _says_it_once(self) -> BuiltEntry:
+        if self.tolerance is not None and self.machine_kind is not None:
+            raise ValueError(
+                "found tolerance and machine_kind, needed one of them; remove machine_kind."
+            )
+        return self
+
+    @property
+    def built(self) -> Tolerance | None:
+        """The tolerance that is stated; None where nothing is."""
+        if self.machine_kind is not None:
+            return TYPICAL[self.machine_kind]
+        stated = self.tolerance
+        return (
+            None
+            if stated is None
+            else Tolerance(
+                _value(stated.joints),
+                _value(stated.axes),
+                _value(stated.lengths),
+                _value(stated.zeros, "m"),
+                _value(stated.zeros, "rad"),
+            )
+        )
+
+
+def _value(stated: Quantity | None, dimension: str = "") -> float | None:
+    """Return what is stated, None where it is of another dimension."""
+    if stated is None or (dimension and stated.dimension not in ("", dimension)):
+        return None
+    return stated.value
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Standard deviations of the numbers of a model [m, rad]; None where nothing is stated."""
+
+    joints: float | None = None
+    axes: float | None = None
+    lengths: float | None = None
+    zeros: float | None = None  # of motors that read a length
+    angles_at_zero: float | None = None  # of motors that turn
+
+    def of_parameters(
+        self, names: tuple[str, ...], legs: Mapping[str, Leg], size: float
+    ) -> dict[str, float]:
+        """Return the tolerances of kinematic parameters by name [m, rad]; gains have none.
+
+        *size* is the mean leg length. Joints on an actuator at reading zero follow its zero too.
+        """
+        joints, lengths, zeros = (
+            _PART_OF_SIZE * size if self.joints is None else self.joints,
+            _PART_OF_SIZE * size if self.lengths is None else self.lengths,
+            _PART_OF_ZERO * size if self.zeros is None else self.zeros,
+        )
+        axes = _ANGLE if self.axes is None else self.axes
+        turn = _ANGLE_AT_ZERO if self.angles_at_zero is None else self.angles_at_zero
+        found = dict[str, float]()
+        for name in names:
+            number = ParameterId.parse(name)
+            kind, leg = number.kind, legs.get(number.owner)
+            if kind == "base" and leg is not None and leg.actuator is not None:
+                moved = float(np.linalg.norm(leg.actuator.motion(leg.A, np.zeros(1)).by_q))
+                found[name] = float(np.hypot(joints, moved * (turn if leg.reads_angle else zeros)))
+            elif kind in ("base", "platform", "axis_point", "arm_point"):
+                found[name] = joints
+            elif kind in ("base_axis", "platform_axis", "twist", "direction", "axis", "arm_axis"):
+                found[name] = axes
+            elif kind == "length":
+                found[name] = lengths
+            elif kind == "offset":
+                found[name] = zeros
+        return found
+
+
+NOT_STATED = Tolerance()
+
+# Typical machines of each kind: 3D printed parts on a flat board, milled parts on machined plates,
+# a product with a data sheet.
+TYPICAL: Mapping[MachineKind, Tolerance] = {
+    "printed": Tolerance(0.5e-3, float(np.radians(1.0)), 0.5e-3, 5e-3, float(np.radians(5.0))),
+    "machined": Tolerance(0.1e-3, float(np.radians(0.2)), 0.1e-3, 2e-3, float(np.radians(2.0))),
+    "bought": Tolerance(0.2e-3, float(np.radians(0.2)), 0.1e-3, 1e-3, float(np.radians(1.0))),
+}

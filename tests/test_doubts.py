@@ -1,0 +1,217 @@
+"""Each doubt is raised by what it is about, and every answer of a calibration follows the list."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from csv_rows import read_rows, write_rows
+from lxml import html
+from simulated import simulated
+
+from legcal import calibrate, load_dataset, load_result
+from legcal.calibration.doubts import model_error
+from legcal.calibration.joint_fit.cross_validation import cross_validate
+from legcal.calibration.joint_fit.diagnostics import DoubtedCamera
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
+from legcal.calibration.result import Calibration
+from legcal.calibration.verdict import judge
+from legcal.errors import DatasetError
+from legcal.machine.tolerance import TYPICAL, Tolerance
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Outlines of a planar machine in three views."""
+    return simulated(tmp_path_factory.mktemp("doubts") / "set", "3-rpr", poses=10, views=3).folder
+
+
+@pytest.fixture(scope="module")
+def healthy(session: Path) -> Calibration:
+    """The calibration of that session."""
+    return calibrate(session)
+
+
+def _copy(session: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(session, tmp_path / "set"))
+
+
+def _table(name: str, change: Callable[[dict[str, str]], None]) -> Callable[[Path], None]:
+    def changed(folder: Path) -> None:
+        rows = read_rows(folder / name)
+        for row in rows:
+            change(row)
+        write_rows(folder / name, rows)
+
+    return changed
+
+
+def _yaml(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    def changed(folder: Path) -> None:
+        found = yaml.safe_load((folder / "dataset.yaml").read_text())
+        change(found)
+        (folder / "dataset.yaml").write_text(yaml.safe_dump(found, sort_keys=False))
+
+    return changed
+
+
+def _update(folder: Path, keys: dict[str, Any]) -> None:
+    _yaml(lambda found: found.update(keys))(folder)
+
+
+def _rejected(is_out: Callable[[dict[str, str]], bool]) -> Callable[[Path], None]:
+    def change(row: dict[str, str]) -> None:
+        if is_out(row):
+            row |= {"verdict": "rejected", "reason": "faint"}
+
+    return _table("observations.csv", change)
+
+
+def _number(name: str) -> int:
+    return int(name[1:])
+
+
+def _backlash(row: dict[str, str]) -> None:
+    if _number(row["pose"]) % 2:
+        row["leg1_prismatic"] = str(float(row["leg1_prismatic"]) + 1e-3)
+
+
+def _moved_hint(found: dict[str, Any]) -> None:
+    found["views"]["c2"]["T_base_camera"]["xyz"][0] += 0.3
+
+
+@pytest.mark.parametrize(
+    ("code", "spoil", "said"),
+    [
+        ("noise", _table("measurements.csv", _backlash), "all views scatter"),
+        ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
+        ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
+        ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),
+        (
+            "tolerance",
+            _yaml(lambda found: found.update(tolerance={"joints": "20 um"})),
+            "tolerance 0.02",
+        ),
+        ("strayed_camera", _yaml(_moved_hint), "view c2"),
+    ],
+)
+def test_a_doubt_is_raised_by_what_it_is_about(
+    code: str, spoil: Callable[[Path], None], said: str, session: Path, tmp_path: Path
+) -> None:
+    folder = _copy(session, tmp_path)
+    spoil(folder)
+    calibration = calibrate(folder)
+    (doubt,) = [one for one in calibration.doubts if one.code == code]
+    assert said in doubt.what
+    assert not calibration.verdict.trustworthy
+    assert not calibration.verdict.is_to_be_refused
+    assert calibration.verdict.sentence.startswith("In doubt: the platform moves by ")
+    assert "known to " in calibration.verdict.sentence
+
+
+def _judged(calibration: Calibration, **changes: Any) -> Calibration:
+    solution = replace(calibration.solution, **changes)
+    return judge(calibration.dataset, solution, calibration.steps, ())
+
+
+def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
+    solution = healthy.solution
+    focal = next(s for s in solution.sensitivities if "focal" in s.what)
+    wrong = DoubtedCamera("c1", "fx", 500.0, 1.0, 510.0, 7.0)
+    changes = {
+        "camera_doubts": replace(solution.camera_doubts, others=[wrong]),
+        "sensitivities": (*solution.sensitivities, replace(focal, what=FITTED_CAMERA)),
+    }
+    found = _judged(healthy, **changes)
+    (doubt,) = found.doubts
+    assert found.platform is not None
+    effect = found.platform.effects[-1].error
+    assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
+    assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
+    large = replace(focal, what=FITTED_CAMERA, steps=1e3 * focal.steps)
+    found = _judged(healthy, **changes | {"sensitivities": (large,)})
+    assert [one.code for one in found.doubts] == ["no_improvement", "camera"]
+    assert found.verdict.is_to_be_refused
+
+
+def test_left_out_images_contradict_a_model_that_was_led_away(healthy: Calibration) -> None:
+    posterior = healthy.solution.posterior
+    found = cross_validate(posterior.problem, posterior.state)
+    assert found is not None
+    assert 0.7 < found.ratio < 1.2
+    assert found.gain == pytest.approx(1.0, abs=0.4)
+    first, *others = posterior.state.legs
+    away = replace(first, B=first.B + np.array([0.03, 0.0, 0.0]))
+    state = replace(posterior.state, legs=(away, *others))
+    codes = {one.code for one in _judged(healthy, posterior=replace(posterior, state=state)).doubts}
+    assert {"left_out", "no_better"} <= codes
+
+
+@pytest.mark.parametrize("spoil", [None, _table("measurements.csv", _backlash)])
+def test_exit_code_document_summary_and_page_agree(
+    spoil: Callable[[Path], None] | None,
+    session: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder, out = _copy(session, tmp_path), tmp_path / "result"
+    if spoil is not None:
+        spoil(folder)
+    code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
+    printed = json.loads(capsys.readouterr().out)
+    written = load_result(out).result
+    page: Any = html.document_fromstring((out / "report.html").read_text())
+    light, first = (
+        page.xpath("//section[@id='verdict']/@class")[0],
+        page.xpath("string((//section[@id='next']//li)[1])"),
+    )
+    assert written.document() == printed
+    assert printed["verdict"] in page.xpath("string(//section[@id='verdict'])")
+    assert printed["verdict"] in load_result(out).summary()
+    if spoil is None:
+        assert (code, printed["trustworthy"], printed["doubts"]) == (0, True, [])
+        assert "good" in light
+        assert "Load calibrated.urdf" in first
+    else:
+        assert (code, printed["trustworthy"]) == (1, False)
+        doubt = printed["doubts"][0]
+        assert doubt["what"][1:] in first
+        assert doubt["remedy"][1:] in first
+        assert doubt["what"][1:] in printed["verdict"]
+        assert "doubtful" in light
+        assert "Load calibrated.urdf" not in page.xpath("string(//section[@id='next'])")
+
+
+def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
+    session: Path, tmp_path: Path
+) -> None:
+    folder = _copy(session, tmp_path)
+    stated = {"joints": "0.3 mm", "axes": "0.5 deg", "lengths": 1e-4, "zeros": "5 deg"}
+    _update(folder, {"tolerance": stated})
+    tolerance = load_dataset(folder).machine.tolerance
+    assert tolerance == Tolerance(3e-4, np.radians(0.5), 1e-4, None, np.radians(5.0))
+    model = next((folder / "models").glob("*.yaml"))
+    mechanism = yaml.safe_load(model.read_text())
+    mechanism["legcal"]["machine_kind"] = "printed"
+    model.write_text(yaml.safe_dump(mechanism))
+    assert load_dataset(folder).machine.tolerance == tolerance
+    _yaml(lambda found: found.pop("tolerance"))(folder)
+    assert load_dataset(folder).machine.tolerance == TYPICAL["printed"]
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"tolerance": {"joints": "1 deg"}}, "tolerance.joints.*needed a value in m"),
+        ({"tolerance": {"joints": -1.0}}, "tolerance.joints.*above zero"),
+        ({"machine_kind": "wooden"}, "machine_kind.*printed"),
+        ({"tolerance": {"joints": 1e-3}, "machine_kind": "bought"}, "needed one of them"),
+    ]
+    for n, (wrong, sentence) in enumerate(refused):
+        other = Path(shutil.copytree(folder, tmp_path / str(n)))
+        _update(other, wrong)
+        with pytest.raises(DatasetError, match=sentence):
+            load_dataset(other)
