@@ -26,8 +26,10 @@ from legcal.calibration.joint_fit.platform import (
 )
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.session_changes import session_findings
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
+from legcal.data.image_order import image_sequences
 from legcal.data.measurements import few, few_views
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
@@ -120,6 +122,7 @@ def doubts_of(
         *_few_outlines(solution.outlines),
         *_moved_parameters(dataset, solution, platform),
         *_held_out(held_out),
+        *_changes(dataset, solution, platform),
         *_left_out(solution, platform),
         *_noise(solution),
     )
@@ -310,6 +313,41 @@ def _left_out(solution: Solution, platform: PlatformAccuracy | None) -> list[Dou
         remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
         error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
         doubts.append(Doubt("no_better", what, remedy, *error))
+    return doubts
+
+
+def _changes(
+    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None
+) -> list[Doubt]:
+    """Return what changed in the course of the session, and readings that do not follow motors.
+
+    It counts where it displaces the platform by more than that is known to.
+    """
+    measurements, machine, posterior = dataset.measurements, dataset.machine, solution.posterior
+    taken_at = {image: facts.taken_at for image, facts in dataset.facts.items()}
+    sequences = image_sequences(measurements, taken_at)
+    doubts = []
+    for finding in session_findings(posterior, measurements, sequences):
+        error = None
+        if platform is not None:
+            step_of = dict(
+                zip(
+                    posterior.problem.legs.parametrization.names,
+                    finding.steps.tolist(),
+                    strict=True,
+                )
+            )
+            parametrization = solution.kinematic.parametrization
+            steps = np.array([[step_of[name]] for name in parametrization.names])
+            error = moved_by(
+                platform_by_parameters(
+                    solution.legs, parametrization, machine.frame_legs, solution.T_Rb_Re
+                ),
+                steps,
+            )
+            if error.mean_displacement < platform.sigma.mean_displacement:
+                continue
+        doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *_mean(error)))
     return doubts
 
 

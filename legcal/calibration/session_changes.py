@@ -13,6 +13,7 @@ counts in units of its scatter from image to image.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -29,6 +30,7 @@ from legcal.data.measurements import Measurements, row_names
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test
+from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 
 SIGNIFICANCE = 1e-4  # largest probability of a finding by chance, times the number of tests
@@ -36,6 +38,7 @@ MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
 MIN_IMAGES = 3  # on each side of a change
 _MAX_OTHER_VIEWS = 5  # views whose side of a change is tried
+_HUBER = 3.0  # standard deviations from which on outlines count less
 _UNSEEN = 1e-6  # part of the square of a column below which the fit absorbs it
 
 Kind = Literal["encoder", "drift", "camera", "focal_length", "lag", "backlash", "gain"]
@@ -54,13 +57,14 @@ class Finding:
     unit : str
         ``m``, ``rad`` or ``1``.
     amount, sigma : float
-        The number; of a camera the distance or the angle that it moved by.
+        The number; of a camera the angle or the distance, whichever is surer.
     between : (str, str) or None
         The images before and after a change; None where it is of all images.
     p_value : float
         Probability of such a score by chance, times the number of tests.
     steps : (p,) array
-        The error of the kinematic parameters of the fit without the number.
+        The error of the kinematic parameters of the fit without the number, as in the
+        parametrization of its problem.
     """
 
     kind: Kind
@@ -71,6 +75,60 @@ class Finding:
     between: tuple[str, str] | None
     p_value: float
     steps: Array
+
+    @property
+    def size(self) -> str:
+        """The amount with its standard deviation."""
+        scale, unit = (100.0, "%") if self.unit == "1" else SHOWN_IN[self.unit]
+        sigma = scale * self.sigma
+        digits = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0.0 else 3
+        sign = "" if self.kind in ("camera", "backlash") else "+"
+        return f"{scale * self.amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+    @property
+    def what(self) -> str:
+        """What was found, as a clause."""
+        between = "" if self.between is None else f" between {' and '.join(self.between)}"
+        return f"{_WORDS[self.kind][0].format(subject=self.subject, size=self.size)}{between}"
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a clause."""
+        return _WORDS[self.kind][1].format(subject=self.subject)
+
+
+_WORDS: Mapping[Kind, tuple[str, str]] = {
+    "encoder": (
+        "the zero of the encoder of {subject} changed by {size}",
+        "look for a slipped coupling or a lost home there, and calibrate the images before and "
+        "after it on their own, or take them again",
+    ),
+    "drift": (
+        "the zero of the encoder of {subject} drifts by {size} from the first image to the last",
+        "look for a loose coupling or warming up there, and take the images again",
+    ),
+    "camera": (
+        "the camera of {subject} moved by {size}",
+        "make the images after it a view of their own in dataset.yaml and measurements.csv",
+    ),
+    "focal_length": (
+        "the focal length of {subject} changed by {size}",
+        "switch off autofocus and zoom; make the images after it a view of their own, with a "
+        "camera file of their own",
+    ),
+    "lag": (
+        "readings are ahead of the platform by {size} of the last move",
+        "wait until the platform stands still before each photograph, and read the encoders then",
+    ),
+    "backlash": (
+        "readings of {subject} differ by {size} with the direction of approach",
+        "approach all poses from one side, and look for backlash there",
+    ),
+    "gain": (
+        "readings of {subject} are {size} too large",
+        "check the pitch or gear ratio of that motor, and its counts per turn",
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +166,10 @@ def session_findings(
         Rows in the order of their images, as of
         :func:`legcal.data.image_order.image_sequences`.
     """
-    problem, state = posterior.problem, posterior.state
-    if not len(problem.outlines) or not len(sequences):
+    if not len(posterior.problem.outlines) or not len(sequences):
         return ()
+    posterior = replace(posterior, problem=_with_rejected(posterior))
+    problem, state = posterior.problem, posterior.state
     course = _Course.of(posterior, measurements, sequences)
     linear = linearize(problem, state)
     normal = normal_equations(problem, state, linear)
@@ -154,10 +213,21 @@ def session_findings(
     return tuple(findings)
 
 
+def _with_rejected(posterior: Posterior) -> FitProblem:
+    """Return the problem with rejected outlines, those far off with the weights of Huber's loss.
+
+    A fit rejects the images on one side of a change where the other side has more.
+    """
+    problem, noise = posterior.problem, posterior.noise
+    offsets, claimed = problem.offsets(posterior.state), problem.outlines.covariance
+    distance = np.sqrt(noise.squared_norms(offsets, claimed))
+    return problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
+
+
 def _size(hypothesis: _Hypothesis, amount: Array, covariance: Array) -> tuple[str, float, float]:
     """Return the unit, the amount and its standard deviation.
 
-    Of a camera, which moves by a rotation vector and a displacement: of the more certain one.
+    Of a camera, which moves by a rotation vector and a displacement: those of the surer one.
     """
     if hypothesis.kind != "camera":
         return hypothesis.unit, float(amount[0]), float(np.sqrt(covariance[0, 0]))
@@ -348,7 +418,7 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
                 ("encoder", unit, once),
                 ("drift", unit, course.drift(e.row)),
                 ("gain", "1", e.reading[:, None]),
-                ("backlash", unit, np.sign(last_move)[:, None]),
+                ("backlash", unit, 0.5 * np.sign(last_move)[:, None]),
             ]
             for kind, of_unit, by in numbers:
                 wrong = (e.by_reading * (e.leg == j))[:, None, None] * by[:, None]
@@ -390,13 +460,13 @@ def _of_views(problem: FitProblem, state: State, course: _Course) -> Iterator[_H
     for v, name in enumerate(o.views):
         own = (o.view == v)[:, None]
         moved = []
-        for k in range(6):
+        for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
             error = np.zeros((len(o.views), 6))
-            error[v, k] = 1.0
+            error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
             moved.append(residual_changes(problem, linear, "camera_pose", error)["outlines"])
         blocks = {"outlines": block}
         yield _Hypothesis("camera", name, "", {"outlines": np.stack(moved, axis=-1)}, blocks, True)
-        focal = np.where(own, by_focal, 0.0)[..., None]
+        focal = np.where(own, -by_focal, 0.0)[..., None]
         yield _Hypothesis("focal_length", name, "1", {"outlines": focal}, blocks, True)
 
 

@@ -39,7 +39,9 @@ def image_sequences(
 
 
 def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | None:
-    """Return the time of each row [s], None unless all are known and most differ."""
+    """Return the time of each row [s], None unless all are known and most poses differ in it."""
+    if measurements.time is not None and np.isfinite(measurements.time).all():
+        return measurements.time
     times = np.full(measurements.n_rows, np.nan)
     for row, image in enumerate(measurements.image):
         try:
@@ -48,7 +50,7 @@ def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | N
             return None
         times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
     n_moments = len(np.unique(times))
-    return times if 2 * n_moments > min(measurements.n_rows, 2 * measurements.n_poses) else None
+    return times if 2 * n_moments > measurements.n_poses else None
 
 
 def _numbers(names: Sequence[str]) -> IntArray | None:

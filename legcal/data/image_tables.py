@@ -163,6 +163,7 @@ def measurements_at(measurements: Measurements, rows: IntArray) -> Measurements:
         view=measurements.view[rows],
         pose=np.argsort(appearance)[pose],
         q=measurements.q[rows],
+        time=None if measurements.time is None else measurements.time[rows],
         pose_labels=tuple(labels[p] for p in poses[appearance].tolist()) if labels else (),
     )
 

@@ -86,6 +86,7 @@ class Measurements:
     sigma_q: float  # of a reading [m]
     pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+    time: Array | None = None  # (n_rows,) when images were taken [s], NaN where unknown
 
     @property
     def n_rows(self) -> int:
@@ -516,6 +517,7 @@ def read_measurements(
     texts = [
         *(Column(name, "text", required=name != "pose") for name in _TEXTS),
         *(Column(name, "text", blank=True) for name in unread),
+        Column("time", unit="seconds", required=False, blank=True),
     ]
     table = read_table(
         path,
@@ -546,6 +548,7 @@ def read_measurements(
         sigma_q=sigma_q,
         pose_labels=labels if "pose" in table else (),
         sigma_by_joint=sigma_by_joint,
+        time=table.number("time") if "time" in table else None,
     )
     shared = _shared_readings(table, legs, pose, readings, sigma)
     column = {leg.prismatic: i for i, leg in enumerate(motors)}

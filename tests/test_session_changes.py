@@ -1,0 +1,156 @@
+"""What changed in the course of a session is named with its moment and amount, and nothing else."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from csv_rows import read_rows, write_rows
+from scipy.spatial.transform import Rotation
+from simulated import simulated
+
+from legcal import calibrate, load_dataset
+from legcal.calibration.session_changes import Finding, session_findings
+from legcal.data.dataset import Dataset
+from legcal.data.image_order import image_sequences
+from legcal.geometry.types import Array, BoolArray
+
+CHANGED_AT = 7  # of the 12 images of the second view
+SLIP, LAG, GAIN, BACKLASH, DRIFT = 3e-4, 4e-3, 2e-3, 2e-4, 4e-4
+TURN, ZOOM = 4e-4, 1e-3
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Outlines of a hexapod in two views."""
+    folder = simulated(tmp_path_factory.mktemp("course") / "set", "hexapod", poses=12).folder
+    return load_dataset(folder)
+
+
+def _findings(dataset: Dataset) -> tuple[Finding, ...]:
+    m = dataset.measurements
+    return session_findings(calibrate(dataset).solution.posterior, m, image_sequences(m, {}))
+
+
+def _with_readings(change: Callable[[Array], Array]) -> Callable[[Dataset], Dataset]:
+    def changed(dataset: Dataset) -> Dataset:
+        m = dataset.measurements
+        return replace(dataset, measurements=replace(m, q=change(m.q)))
+
+    return changed
+
+
+def _later(n: int) -> BoolArray:
+    """Rows of the second view from a change on; the first view was photographed before."""
+    return np.arange(n) >= 12 + CHANGED_AT
+
+
+def _slipped(q: Array) -> Array:
+    return q + SLIP * np.outer(_later(len(q)), np.arange(6) == 1)
+
+
+def _moves(q: Array) -> Array:
+    moves = np.diff(q, axis=0, prepend=q[:1])
+    moves[12] = 0.0
+    return moves
+
+
+def _drifting(q: Array) -> Array:
+    return q + DRIFT * np.outer(np.tile(np.linspace(0.0, 1.0, 12), 2), np.arange(6) == 5)
+
+
+def _with_outlines(change: Callable[[Array], Array]) -> Callable[[Dataset], Dataset]:
+    """Change the rays through outlines of later images of the second view."""
+
+    def changed(dataset: Dataset) -> Dataset:
+        o, m = dataset.observations, dataset.measurements
+        assert o is not None
+        camera, later = m.views[1].camera, _later(m.n_rows)[o.row]
+        xy = camera.undistort(o.ends[later].reshape(-1, 2))
+        rays = change(np.column_stack([xy, np.ones(len(xy))]))
+        ends = o.ends.copy()
+        ends[later] = camera.project(rays).reshape(-1, 2, 2)
+        h = o.h.copy()
+        first, second = np.moveaxis(rays.reshape(-1, 2, 3), 1, 0)
+        normal = np.cross(first, second)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        h[later] = normal * np.sign(np.sum(normal * h[later], axis=1))[:, None]
+        return replace(dataset, observations=replace(o, h=h, ends=ends))
+
+    return changed
+
+
+def _turned(rays: Array) -> Array:
+    return np.asarray(Rotation.from_rotvec([0.0, TURN, 0.0]).apply(rays))
+
+
+def _zoomed(rays: Array) -> Array:
+    return rays * np.array([1.0 + ZOOM, 1.0 + ZOOM, 1.0])
+
+
+CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {
+    "encoder": (_with_readings(_slipped), "leg2", SLIP),
+    "lag": (_with_readings(lambda q: q + LAG * _moves(q)), "", LAG),
+    "gain": (
+        _with_readings(lambda q: q * np.where(np.arange(6) == 3, 1 + GAIN, 1.0)),
+        "leg4",
+        GAIN,
+    ),
+    "backlash": (
+        _with_readings(lambda q: q + 0.5 * BACKLASH * np.sign(_moves(q)) * (np.arange(6) == 2)),
+        "leg3",
+        BACKLASH,
+    ),
+    "drift": (_with_readings(_drifting), "leg6", DRIFT),
+    "camera": (_with_outlines(_turned), "c2", TURN),
+    "focal_length": (_with_outlines(_zoomed), "c2", ZOOM),
+}
+
+
+def test_nothing_is_found_in_a_healthy_session(healthy: Dataset) -> None:
+    assert _findings(healthy) == ()
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_the_first_finding_is_what_was_done_with_its_amount(healthy: Dataset, kind: str) -> None:
+    change, subject, amount = CASES[kind]
+    finding = _findings(change(healthy))[0]
+    assert (finding.kind, finding.subject) == (kind, subject)
+    assert abs(finding.amount - amount) < 4.0 * finding.sigma < 0.6 * amount
+    if kind in ("encoder", "camera", "focal_length"):
+        assert finding.between is not None
+        labels = healthy.measurements.pose_labels
+        assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
+
+
+def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
+    healthy: Dataset, tmp_path: Path
+) -> None:
+    folder = healthy.folder
+    rows = read_rows(folder / "measurements.csv")
+    slipped = next(name for name in rows[0] if name.startswith("leg2"))
+    for row, is_later in zip(rows, _later(len(rows)), strict=True):
+        row[slipped] = repr(float(row[slipped]) + SLIP * bool(is_later))
+    copy = Path(shutil.copytree(folder, tmp_path / "set"))
+    write_rows(copy / "measurements.csv", rows[::-1])
+    result = calibrate(copy)
+    assert not result.verdict.trustworthy
+    assert result.doubts[0].code == "encoder"
+    assert "leg2" in result.doubts[0].sentence
+
+
+def test_images_are_ordered_by_times_then_by_the_numbers_of_a_view(healthy: Dataset) -> None:
+    m = healthy.measurements
+    by_numbers = image_sequences(m, {})
+    assert [rows.tolist() for rows in by_numbers] == [list(range(12)), list(range(12, 24))]
+    times = np.arange(24.0)[::-1]
+    (by_times,) = image_sequences(replace(m, time=times), {})
+    assert by_times.tolist() == list(range(24))[::-1]
+    names = tuple(f"images/{row}.jpg" for row in range(24))
+    taken = {name: f"2026:11:23 10:{59 - row:02d}:00" for row, name in enumerate(names)}
+    (by_exif,) = image_sequences(replace(m, image=names), taken)
+    assert by_exif.tolist() == list(range(24))[::-1]
+    unnamed = replace(m, image=tuple("a" * (row + 1) for row in range(24)))
+    assert image_sequences(unnamed, {}) == ()
