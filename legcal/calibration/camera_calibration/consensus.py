@@ -1,11 +1,11 @@
-"""Which images of a board agree on a camera, and what is the matter with the others.
+"""The largest group of images of a board that agree on a camera, and the faults of the others.
 
-An image says little of a camera alone; it contradicts a group of images by its score and
-information (``Clusters``), along all numbers of the camera and of the sheet,
-along the focal length, the principal point, and along the sheet. The group begins as the half of
-the images that is cheapest together (least trimmed squares from many random starts, on the
-quadratic costs of all images), takes in whatever does not contradict it, and is fitted again until
-it stays. Images that are wrong alike, as a third that was taken at another zoom, cannot move it.
+A single image hardly determines a camera. It contradicts a group of images by its score and
+information (``Clusters``): along all parameters of camera and sheet together, along the focal
+length, the principal point, and the sheet. The group starts as the half of the images with the
+least total cost (least trimmed squares from many random starts, on quadratic costs), grows by all
+images that do not contradict it, and is fitted again until it is stable. Images with a common
+fault, such as a third of them at another zoom, cannot move it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
-from legcal.calibration.camera_calibration.starts import again, from_scratch, part_of
+from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
 from legcal.estimation.clusters import Clusters
 from legcal.estimation.solver import COST_TOLERANCE
 from legcal.geometry.types import Array, BoolArray
@@ -34,38 +34,38 @@ from legcal.vision.camera import intrinsic_names, intrinsic_values
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize
 
-_SIGNIFICANCE = 1e-5  # of a contradiction
-_FEW = 5  # images of which none can be outvoted
-_STARTS, _OF_START = 100, 4  # random groups, and the images of each
+_SIGNIFICANCE = 1e-5  # significance level of a contradiction
+_FEW = 5  # smallest number of images with a majority
+_STARTS, _OF_START = 100, 4  # number of random groups, images of each
 _ROUNDS = 8
-_FIRST_RATIO = 3.0  # by which errors of the cheapest half are smaller than those of all
-_CLEAR = 0.6  # part of the images, from which a group is not searched further
-_MORE_STARTS = 4  # fits of random images, then
-_EXPLAINED = 0.6  # part of what is wrong with an image, from which it is the reason
-_NEGLIGIBLE = 1e-3  # part of what is wrong with an image that is not searched for
-_ALMOST = 0.9  # part of the best explanation, from which a simpler one is the reason
-_ALIKE = 0.2  # part by which changes of both focal lengths, or in images, may differ from a mean
-_PAIR = 2  # images that have a change in common by chance
-_TWO = 0.85  # part of the scatter between two values, of a normal distribution 0.64
-_RIVAL = 4  # images that make another group
+_FIRST_RATIO = 3.0  # scatter of all images, relative to that of the half with the least cost
+_CLEAR = 0.6  # share of the images in a group that ends the search
+_MORE_STARTS = 4  # fits of random images if the first fit has no clear group
+_EXPLAINED = 0.6  # smallest share of the excess cost that a fault has to explain
+_NEGLIGIBLE = 1e-3  # tolerance of the fits, relative to the excess cost
+_ALMOST = 0.9  # explained share of a simpler fault that is preferred, relative to the best
+_ALIKE = 0.2  # largest relative difference of two changes that are equal
+_PAIR = 2  # images with a common change by chance
+_TWO = 0.85  # smallest share of scatter between two clusters (0.64 for a normal distribution)
+_RIVAL = 4  # smallest size of another group
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """Images that agree on a camera."""
 
-    adjusted: AdjustedBoard  # to these; poses and residuals of all images before this camera
-    left_out: dict[int, str]  # images that contradict it, and how
-    rival: tuple[int, ...]  # those of them that agree among themselves
+    adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
+    left_out: dict[int, str]  # the other images with their faults
+    rival: tuple[int, ...]  # other images that agree among themselves
 
 
 def agreeing_images(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Agreement | None:
-    """Return the largest group of images that agree on a camera; None if nothing can be fitted."""
+    """Return the largest group of images that agree on a camera; None if no fit succeeds."""
     n = int(seen.image[-1]) + 1
-    found = _largest(seen, size, model)
-    if found is None:
+    largest = _largest(seen, size, model)
+    if largest is None:
         return None
-    adjusted, group = found
+    adjusted, group = largest
     others = np.flatnonzero(~group)
     if not len(others):
         return Agreement(adjusted, {}, ())
@@ -81,15 +81,15 @@ def agreeing_images(seen: BoardImages, size: ImageSize, model: DistortionModel) 
 def _largest(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[AdjustedBoard, BoolArray] | None:
-    """Return the largest group of images that agree, and the adjustment to it."""
+    """Return the adjustment to the largest group of agreeing images, and the group."""
     n = int(seen.image[-1]) + 1
     rng = np.random.default_rng(0)
     best: tuple[AdjustedBoard, BoolArray] | None = None
     first = from_scratch(seen, size, model)
     if first is not None:
-        every = np.ones(n, dtype=np.bool_)
+        all_images = np.ones(n, dtype=np.bool_)
         if n < _FEW:
-            return first, every
+            return first, all_images
         group = _grown(first, _cheapest(first, seen, rng))
         if group.all():
             return first, group
@@ -98,31 +98,31 @@ def _largest(
     for _ in range(_MORE_STARTS if n >= _FEW else 0):
         if best is not None and np.count_nonzero(best[1]) >= _CLEAR * n:
             break
-        some = rng.choice(n, _OF_START, replace=False)
-        part, _ = part_of(seen, np.isin(seen.image, some), n)
+        chosen = rng.choice(n, _OF_START, replace=False)
+        part, _ = part_of(seen, np.isin(seen.image, chosen), n)
         rough = from_scratch(part, size, model)
         if rough is None:
             continue
         start = first or rough
-        found = _settled(rough, start, None, seen)
-        if found is not None and (
-            best is None or np.count_nonzero(found[1]) > np.count_nonzero(best[1])
+        candidate = _settled(rough, start, None, seen)
+        if candidate is not None and (
+            best is None or np.count_nonzero(candidate[1]) > np.count_nonzero(best[1])
         ):
-            best = found
+            best = candidate
     return best
 
 
 def _settled(
     near: AdjustedBoard, start: AdjustedBoard, group: BoolArray | None, seen: BoardImages
 ) -> tuple[AdjustedBoard, BoolArray] | None:
-    """Return the group that stays when it is fitted, and the adjustment to it."""
+    """Return the adjustment to a group that fitting it does not change, and the group."""
     n = int(seen.image[-1]) + 1
     poses = list(start.T_camera_board)
     settled: tuple[AdjustedBoard, BoolArray] | None = None
     for _ in range(_ROUNDS):
         if group is not None:
             part, images = part_of(seen, group[seen.image], n)
-            fitted = again(near, [poses[k] for k in images], part)
+            fitted = readjust(near, [poses[k] for k in images], part)
             if fitted is None:
                 return None
             near = fitted
@@ -147,7 +147,7 @@ def _settled(
 
 
 def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:
-    """Return squared residuals of images by their degrees of freedom, (n_images,)."""
+    """Return the squared residuals of images over their degrees of freedom, (n_images,)."""
     square = np.sum((adjusted.residual / seen.sigma_px[:, None]) ** 2, axis=1)
     n = len(adjusted.T_camera_board)
     corners = np.bincount(seen.image, minlength=n)
@@ -155,7 +155,7 @@ def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:
 
 
 def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generator) -> BoolArray:
-    """Return the half of the images that is cheapest together, on quadratic costs."""
+    """Return the half of the images with the least total quadratic cost."""
     clusters = adjusted.clusters
     n = len(clusters.score)
     dof = np.maximum(2 * np.bincount(seen.image, minlength=n) - 6, 1)
@@ -178,7 +178,7 @@ def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generat
 
 
 def _grown(adjusted: AdjustedBoard, group: BoolArray) -> BoolArray:
-    """Return a group with all images that do not contradict it, to first order."""
+    """Return the group grown by all images that do not contradict it, to first order."""
     clusters, first = adjusted.clusters, _FIRST_RATIO
     for _ in range(_ROUNDS):
         before = group
@@ -196,7 +196,7 @@ def _grown(adjusted: AdjustedBoard, group: BoolArray) -> BoolArray:
 def _contradicting(
     adjusted: AdjustedBoard, clusters: Clusters, group: BoolArray, ratio: float
 ) -> BoolArray:
-    """Return which images contradict a group at its minimum."""
+    """Return a mask of the images that contradict a group at its minimum."""
     k = clusters.score.shape[1]
     whole = _whole_picture(adjusted)
     limits = [
@@ -213,33 +213,34 @@ def _contradicting(
 
 
 def _of_two_kinds(direction: Array, clusters: Clusters, group: BoolArray) -> BoolArray:
-    """Return which images of a group are the fewer ones of two kinds along a change (k,).
+    """Return a mask of the smaller of two clusters of a group along a change (k,).
 
-    Errors are judged with that change free in each image, so that these do not hide it.
+    The scatter is estimated with the change free in each image, so that the clusters do not
+    inflate it.
     """
-    others, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
+    minority, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
     if n < _FEW:
-        return others
-    left, change, own = clusters.choose(group).freed(direction)
-    weight = own / max(left.ratio(), 1.0)
+        return minority
+    left, change, information = clusters.choose(group).freed(direction)
+    weight = information / max(left.ratio(), 1.0)
     order = np.argsort(change)
     w, z = weight[order], change[order]
     mean = float(w @ z) / float(w.sum())
     spread = float(w @ (z - mean) ** 2)
     if spread < chdtri(n - 1, _SIGNIFICANCE):
-        return others
+        return minority
     low = np.cumsum(w)[:-1]
     between = np.cumsum(w * (z - mean))[:-1] ** 2 * (1.0 / low + 1.0 / (w.sum() - low))
     if between.max() < _TWO * spread:
-        return others
+        return minority
     cut = int(np.argmax(between)) + 1
     fewer = order[:cut] if cut <= n - cut else order[cut:]
-    others[np.flatnonzero(group)[fewer]] = True
-    return others
+    minority[np.flatnonzero(group)[fewer]] = True
+    return minority
 
 
 def _whole_picture(adjusted: AdjustedBoard) -> Array:
-    """Return changes (k, 3) of kept unknowns: the picture larger, moved along x and along y."""
+    """Return changes (k, 3) of the shared unknowns: scaling, and shifts along x and along y."""
     k = adjusted.clusters.score.shape[1]
     zoom = np.concatenate([intrinsic_values(adjusted.camera)[:2], np.zeros(k - 2)])
     return np.column_stack([zoom, np.eye(k)[:, 2:4]])
@@ -247,44 +248,47 @@ def _whole_picture(adjusted: AdjustedBoard) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fault:
-    """What may be the matter with an image."""
+    """A possible fault of an image."""
 
     n_unknowns: int
-    gain: float  # part of what is wrong with the image that it explains
-    change: Array  # (2,) of both focal lengths, as parts, or (shift) of the principal point [px]
+    gain: float  # share of the excess cost of the image that it explains
+    # (2,): relative change of both focal lengths, or shift of the principal point [px]
+    change: Array
 
 
 def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> dict[int, str]:
-    """Return what is the matter with images outside of a group, before the camera of the group."""
+    """Return the likeliest fault of each image outside of a group, in words."""
     usual = float(np.median(_costs(adjusted, seen)[group]))
-    likely: dict[int, dict[str, _Fault]] = {}
+    candidates: dict[int, dict[str, _Fault]] = {}
     for i in np.flatnonzero(~group).tolist():
         faults = _faults(adjusted, seen, i, usual)
-        most = max(fault.gain for fault in faults.values())
-        likely[i] = {
+        max_gain = max(fault.gain for fault in faults.values())
+        candidates[i] = {
             name: fault
             for name, fault in faults.items()
-            if fault.gain > max(_EXPLAINED, _ALMOST * most)
+            if fault.gain > max(_EXPLAINED, _ALMOST * max_gain)
         }
-    # The simplest; of equally simple ones that which would explain most images. What most images
-    # have in common is no unknown of each.
-    names = [name for faults in likely.values() for name in faults]
+    # The simplest fault wins; among equally simple ones, the most frequent. A change that most
+    # images share does not count as an unknown of each.
+    names = [name for faults in candidates.values() for name in faults]
     shared = {
-        name: _shared([f[name].change for f in likely.values() if name in f]) for name in names
+        name: _shared([f[name].change for f in candidates.values() if name in f]) for name in names
     }
 
     def complexity(i: int, name: str) -> tuple[int, int]:
-        fault = likely[i][name]
-        n_known = len(fault.change) if _near(fault.change, shared[name]) else 0
-        return fault.n_unknowns - n_known, -names.count(name)
+        fault = candidates[i][name]
+        n_shared = len(fault.change) if _near(fault.change, shared[name]) else 0
+        return fault.n_unknowns - n_shared, -names.count(name)
 
-    found = {i: min(faults, key=partial(complexity, i)) for i, faults in likely.items() if faults}
+    best_names = {
+        i: min(faults, key=partial(complexity, i)) for i, faults in candidates.items() if faults
+    }
     reasons = {}
-    for i in likely:
-        name = found.get(i, "")
-        alike = [likely[k][name].change for k, other in found.items() if other == name]
+    for i in candidates:
+        name = best_names.get(i, "")
+        alike = [candidates[k][name].change for k, other in best_names.items() if other == name]
         if name == "zoom":
-            longer = likely[i][name].change.mean() > 0.0
+            longer = candidates[i][name].change.mean() > 0.0
             zooms = [change.mean() for change in alike if (change.mean() > 0.0) == longer]
             reasons[i] = (
                 f"another zoom or focus, with a focal length about "
@@ -315,14 +319,14 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
 
 
 def _shared(changes: Sequence[Array]) -> Array:
-    """Return the change (2,) that most of some images have in common; zero if there is none."""
+    """Return the change (2,) of the majority of images; zero without a majority."""
     middle = np.median(changes, axis=0)
     alike = sum(_near(change, middle) for change in changes)
     return np.asarray(middle if alike > max(_PAIR, len(changes) // 2) else np.zeros(2))
 
 
 def _near(change: Array, other: Array) -> bool:
-    """Say whether a change is another one, which is none if it is zero."""
+    """Return whether a change is about equal to another, nonzero one."""
     return bool(np.linalg.norm(change - other) < _ALIKE * np.linalg.norm(other))
 
 
@@ -337,29 +341,31 @@ _IN_WORDS = {
     "mirrored": "mirrored",
     "crop": "a part of the picture that was cut out and scaled",
     "lens": "another distortion of the lens than in the others, as where a program corrects it",
-    "sheet": "the board is bent otherwise in it than in the others",
-    "motion": "camera or board moved while its rows were read out, or stabilisation bent it",
+    "sheet": "the board is bent differently in it than in the others",
+    "motion": "camera or board moved during the readout of its rows, or stabilisation warped it",
 }
 
 
 def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) -> dict[str, _Fault]:
-    """Return what each fault explains of an image, of the usual cost of a degree of freedom."""
-    camera, T, own = adjusted.camera, adjusted.T_camera_board[i], seen.image == i
-    points, sheet = seen.points[own], adjusted.sheet or Sheet.flat(seen.points)
+    """Return the possible faults of an image, given the usual cost of a degree of freedom."""
+    camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], seen.image == i
+    points, sheet = seen.points[of_image], adjusted.sheet or Sheet.flat(seen.points)
     only = np.zeros(len(points), dtype=np.intp)
-    image = BoardImages(only, sheet.placed(points)[0], seen.px[own], seen.sigma_px[own])
+    image = BoardImages(only, sheet.placed(points)[0], seen.px[of_image], seen.sigma_px[of_image])
     plain = adjust_board(camera, [T], image)
     if plain is None:
         return {"motion": _Fault(0, 0.0, np.zeros(2))}
-    wrong = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
-    fine = max(_NEGLIGIBLE * wrong, COST_TOLERANCE)
+    excess = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
+    tolerance = max(_NEGLIGIBLE * excess, COST_TOLERANCE)
 
-    def fault(n_unknowns: int, found: AdjustedBoard | None, change: Array | None = None) -> _Fault:
-        gain = 0.0 if found is None else (plain.cost - found.cost) / wrong
+    def fault(
+        n_unknowns: int, variant: AdjustedBoard | None, change: Array | None = None
+    ) -> _Fault:
+        gain = 0.0 if variant is None else (plain.cost - variant.cost) / excess
         return _Fault(n_unknowns, gain, np.zeros(2) if change is None else change)
 
     faults = {}
-    # The image turned or mirrored back shows the board so, numbered as if it were mirrored.
+    # Undo the rotation or mirroring of the image; corner numbers are those of the mirrored board.
     far = np.array([camera.width - 1.0, camera.height - 1.0])
     for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
         side = np.array(sides)
@@ -370,26 +376,28 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
         px = np.where(side[:2] < 0.0, far - image.px, image.px)
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=fine))
+        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
-        found = adjust_board(camera, [T], image, free, tolerance=fine)
+        variant = adjust_board(camera, [T], image, free, tolerance=tolerance)
         change = np.zeros(2)
-        if found is not None and name == "shift":
-            change = found.camera.K[:2, 2] - camera.K[:2, 2]
-        elif found is not None:
-            change = np.diag(found.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
-        both = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
-        if name == "crop" and not both:
+        if variant is not None and name == "shift":
+            change = variant.camera.K[:2, 2] - camera.K[:2, 2]
+        elif variant is not None:
+            change = np.diag(variant.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
+        is_uniform = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
+        if name == "crop" and not is_uniform:
             continue
-        faults["stretch" if name == "zoom" and not both else name] = fault(len(free), found, change)
-    bent = adjust_board(camera, [T], image, (), Sheet.flat(seen.points), tolerance=fine)
+        faults["stretch" if name == "zoom" and not is_uniform else name] = fault(
+            len(free), variant, change
+        )
+    bent = adjust_board(camera, [T], image, (), Sheet.flat(seen.points), tolerance=tolerance)
     faults["sheet"] = fault(4, bent)
-    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / wrong, np.zeros(2))
+    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / excess, np.zeros(2))
     return faults
 
 
 def _gain_of_motion(adjusted: AdjustedBoard, seen: BoardImages) -> float:
-    """Return by how much a motion of the board from row to row lowers the cost of one image."""
+    """Return the reduction of the cost of an image by a motion of the board during readout."""
     T = adjusted.T_camera_board[0]
     arm = T.rotation.apply(seen.points)
     _, by_point = adjusted.camera.project_with_derivative(arm + T.translation)

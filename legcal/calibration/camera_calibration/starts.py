@@ -1,4 +1,4 @@
-"""Adjustments of a camera and a board to corners: from scratch, and from one nearby."""
+"""Adjustments of a camera and a board to corners: from scratch, and from a nearby adjustment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize, quiet_opencv
 
-_FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
+_FOCAL_LENGTHS = (0.25, 4.0, 13)  # smallest and largest, relative to the longer side; number
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
 _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
 
@@ -25,7 +25,7 @@ _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
 def from_scratch(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> AdjustedBoard | None:
-    """Return the adjustment from where a camera is roughly right, None if none succeeds."""
+    """Return the adjustment without a start; None if no start or adjustment succeeds."""
     start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(seen, size, model)
     start = start or _by_straight_lines(seen, size, model)
     if start is None:
@@ -43,10 +43,10 @@ def _all_adjusted(
     return adjust_board(camera, poses, seen, intrinsic_names(camera), sheet)
 
 
-def again(
+def readjust(
     near: AdjustedBoard, poses: Sequence[RigidTransform], seen: BoardImages
 ) -> AdjustedBoard | None:
-    """Return the adjustment of other corners, from one nearby."""
+    """Return the adjustment to other corners from a nearby one."""
     sheet = near.sheet or Sheet.flat(seen.points)
     return _all_adjusted(near.camera, poses, sheet, seen)
 
@@ -54,7 +54,7 @@ def again(
 def _by_straight_lines(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the camera without distortion before which boards are flattest, of several."""
+    """Return the distortion-free camera and poses with the flattest boards, by grid search."""
     no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
     cameras = []
     for part in np.geomspace(*_FOCAL_LENGTHS).tolist():
@@ -63,22 +63,22 @@ def _by_straight_lines(
     best = min(cameras, key=lambda camera: _non_flatness(camera, seen))
     poses = []
     for a, b in pairwise(_bounds(seen)):
-        found = plane_poses(best, seen.points[a:b], seen.px[a:b], np.ones(b - a))
-        if not found:
+        candidates = plane_poses(best, seen.points[a:b], seen.px[a:b], np.ones(b - a))
+        if not candidates:
             return None
-        poses.append(found[0].T_camera_plane)
+        poses.append(candidates[0].T_camera_plane)
     return best, poses
 
 
 def _matrix(part: float, size: ImageSize) -> Array:
-    """Return the matrix of a camera (3, 3) whose focal length is a part of the longer side."""
+    """Return a camera matrix (3, 3) with a focal length relative to the longer side."""
     f = part * max(size.width, size.height)
     u, v = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
     return np.array([[f, 0.0, u], [0.0, f, v], [0.0, 0.0, 1.0]])
 
 
 def _non_flatness(camera: Camera, seen: BoardImages) -> float:
-    """Return how far the corners of boards are from any plane before a camera (rms) [px]."""
+    """Return the rms residual of the corners from the best homography of each board [px]."""
     angle = np.linalg.norm(seen.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
     if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _MAX_ANGLE:
         return np.inf
@@ -95,17 +95,17 @@ def _non_flatness(camera: Camera, seen: BoardImages) -> float:
 
 
 def _bounds(seen: BoardImages) -> IntArray:
-    """Return where the corners of each image begin, and where those of the last one end."""
+    """Return the index of the first corner of each image, and the number of corners."""
     return np.searchsorted(seen.image, np.arange(seen.image[-1] + 2))
 
 
 def _by_opencv(
     seen: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the camera that OpenCV calibrates, with two coefficients of distortion.
+    """Return OpenCV's calibration with two coefficients of distortion.
 
-    Boards that are tilted alike leave its own first guess of the focal length open, so that it is
-    asked again with a usual one; the answer with the smaller residuals is taken.
+    OpenCV's own start fails for boards with similar tilts, so a usual focal length is tried as
+    well; the answer with the smaller residuals is taken.
     """
     pieces = list(pairwise(_bounds(seen)))
     points = [seen.points[a:b].astype(np.float32) for a, b in pieces]
@@ -143,7 +143,7 @@ def _by_opencv(
 def part_of(
     seen: BoardImages, kept: BoolArray, n_images: int
 ) -> tuple[BoardImages, tuple[int, ...]]:
-    """Return some of the corners, and the numbers that their images had."""
+    """Return a subset of the corners with renumbered images, and their original numbers."""
     images = sorted(set(seen.image[kept].tolist()))
     new = np.full(n_images, -1, dtype=np.intp)
     new[images] = np.arange(len(images))
