@@ -225,7 +225,7 @@ def test_images_choose_the_lens_model() -> None:
     chosen = chosen_lens(seen, SIZE)
     assert chosen is not None
     assert chosen.fit.adjusted.camera.model == "equidistant"
-    assert "plumb_bob" in chosen.why
+    assert "plumb_bob" in chosen.reason
     assert chosen.fit.left_out == {}
     assert np.abs(pulls(chosen.fit, "equidistant")).max() < 3.0
     assert chosen.validated_px is not None
@@ -243,7 +243,7 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     ripple = replace(seen, px=seen.px + 0.02 * bulge * np.cos(18.0 * far) * far)
     given = given_lens(ripple, SIZE, "plumb_bob")
     assert given is not None
-    assert "as given" in given.why
+    assert "as given" in given.reason
     assert "leave out --model" in " ".join(given.warnings)
 
 
