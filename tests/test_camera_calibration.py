@@ -186,7 +186,10 @@ def corrected(seen: BoardImages) -> BoardImages:
     thinned(
         [
             (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
-            (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent differently"),
+            (
+                seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])),
+                "bent differently",
+            ),
             (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
             (turned(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "turned by half a turn"),
             (mirrored(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "mirrored"),
