@@ -124,7 +124,7 @@ def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
         found = fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed, smooth=0.06, sheet=SHEET))
         off = intrinsic_values(found.adjusted.camera) - intrinsic_values(CAMERAS["plumb_bob"])
         squares.append(off @ np.linalg.solve(found.covariance, off) / len(off))
-        assert np.median(found.seen.sigma_px) < 0.1
+        assert np.median(found.corners.sigma_px) < 0.1
     assert 0.4 < np.mean(squares) < 1.8
 
 

@@ -112,7 +112,7 @@ def _weak(ranks: Ranks) -> Table:
     rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
     if len(ranks.weak) > _MAX_WEAK:
         rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
-    return table("undetermined combination", ">unobserved platform error [mm]", ">[deg]", rows=rows)
+    return table("undetermined combination", ">hides [mm]", ">[deg]", rows=rows)
 
 
 def _hidden(weak: WeakDirection) -> tuple[str, str]:
@@ -236,7 +236,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
                     f"largest part of it; better is {', or '.join(ways)}."
                 )
     if any(weak.dX_m is not None and not weak.harmless for weak in report.full.weak):
-        hidden = "The platform error of a direction is that for 1 mm in its largest component."
+        hidden = "hides: unobserved platform error if the largest component is 1 mm."
         lines.append(Text(hidden, style="dim"))
     failed = [CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:

@@ -124,10 +124,10 @@ def calibrate_camera(
     )
     with shown_progress(progress) as report:
         with worker_pool(workers) as run:
-            seen = _search(stated, photographs, run, report)
-        shown = _shown_in(stated, photographs, seen)
+            board_images = _search(stated, photographs, run, report)
+        board_in_images = _shown_in(stated, photographs, board_images)
         report(_ADJUSTING, 0, 1)
-        table, size = shown.table, photographs.size
+        table, size = board_in_images.table, photographs.size
         lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
         report(_ADJUSTING, 1, 1)
     if lens is None:
@@ -135,11 +135,11 @@ def calibrate_camera(
             f"The camera could not be calibrated: found no {model or 'lens model'} that explains "
             "the corners, needed one; check the board and the model of the lens."
         )
-    names = [photographs.paths[k].name for k in shown.images]
+    names = [photographs.paths[k].name for k in board_in_images.images]
     refuse_divided(lens.fit, names)
     left_out = [f"{names[i]}: {reason}" for i, reason in lens.fit.left_out.items()]
     refuse_undetermined(lens.fit, [names[i] for i in lens.fit.images], left_out)
-    result = _result(photographs, shown, lens)
+    result = _result(photographs, board_in_images, lens)
     if output is not None:
         write_camera(result, Path(output))
     if picture is not None:
@@ -225,7 +225,9 @@ def _search(board: Board, photographs: _Photographs, run: Run, progress: Report)
     return results
 
 
-def _shown_in(stated: Board, photographs: _Photographs, seen: Sequence[SeenBoard]) -> _ShownBoard:
+def _shown_in(
+    stated: Board, photographs: _Photographs, board_images: Sequence[SeenBoard]
+) -> _ShownBoard:
     """Return the board with its corners in the images.
 
     Raises
@@ -234,19 +236,19 @@ def _shown_in(stated: Board, photographs: _Photographs, seen: Sequence[SeenBoard
         If no image shows the board, or too few do.
     """
     paths = photographs.paths
-    board, note = shown_board(stated, seen)
+    board, note = shown_board(stated, board_images)
     if board is None:
         raise _not_visible(stated, note)
-    corners_by_image = [board_image.numbered(board) for board_image in seen]
-    shown = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
-    if not shown:
+    corners_by_image = [board_image.numbered(board) for board_image in board_images]
+    usable = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    if not usable:
         raise _not_visible(stated, _shown_instead(stated, photographs))
-    copies = _copies(corners_by_image, shown, paths)
-    distinct = [k for k in shown if k not in copies]
+    copies = _copies(corners_by_image, usable, paths)
+    distinct = [k for k in usable if k not in copies]
     if len(distinct) < MIN_IMAGES:
         same = _by_reason((paths[k].name, reason) for k, reason in copies.items())
         raise too_few_images(len(distinct), [paths[k].name for k in distinct], copies=same)
-    without = set(range(len(paths))).difference(shown) if board.kind != "chessboard" else ()
+    without = set(range(len(paths))).difference(usable) if board.kind != "chessboard" else ()
     mirrored = {
         k: "mirrored, left and right exchanged"
         for k in sorted(without)
@@ -275,16 +277,16 @@ def _not_visible(board: Board, instead: str) -> NotVisible:
 
 
 def _copies(
-    corners: Sequence[NumberedCorners], shown: Sequence[int], paths: Sequence[Path]
+    corners: Sequence[NumberedCorners], usable: Sequence[int], paths: Sequence[Path]
 ) -> dict[int, str]:
     """Return a reason for each image with the board in the pose of an earlier image.
 
     Such images share the errors of corners by lens and print, and add no information.
     """
     copies: dict[int, str] = {}
-    kept: list[int] = []
-    for k in shown:
-        for i in kept:
+    distinct: list[int] = []
+    for k in usable:
+        for i in distinct:
             _, a, b = np.intersect1d(corners[i].number, corners[k].number, return_indices=True)
             if 2 * len(a) < max(len(corners[i].number), len(corners[k].number)):
                 continue
@@ -298,40 +300,42 @@ def _copies(
                 continue
             break
         else:
-            kept.append(k)
+            distinct.append(k)
     return copies
 
 
-def _result(photographs: _Photographs, shown: _ShownBoard, lens: ChosenLens) -> CameraCalibration:
+def _result(
+    photographs: _Photographs, board_in_images: _ShownBoard, lens: ChosenLens
+) -> CameraCalibration:
     """Return the result with its diagnostics."""
     fitted, paths, facts = lens.fit, photographs.paths, photographs.facts
-    adjusted, seen = fitted.adjusted, fitted.seen
-    used = {shown.images[k]: i for i, k in enumerate(fitted.images)}
+    adjusted, corners = fitted.adjusted, fitted.corners
+    used = {board_in_images.images[k]: i for i, k in enumerate(fitted.images)}
     left_out = {
-        **shown.unused,
-        **{shown.images[k]: reason for k, reason in fitted.left_out.items()},
+        **board_in_images.unused,
+        **{board_in_images.images[k]: reason for k, reason in fitted.left_out.items()},
     }
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(shown.corners[k].number)
-        reason = left_out.get(k, "" if k in shown.images else "the board was not found")
+        n = len(board_in_images.corners[k].number)
+        reason = left_out.get(k, "" if k in board_in_images.images else "the board was not found")
         if i is None:
             images.append(ImageResult(path.name, n, 0, None, None, reason))
             continue
-        of_image = seen.image == i
+        of_image = corners.image == i
         n_used = int(np.count_nonzero(of_image))
         images.append(
             ImageResult(path.name, n, n_used, adjusted.rms_px(of_image), float(tilt[i]), "")
         )
-    kept = [k for k, image in enumerate(images) if image.used]
+    used_images = [k for k, image in enumerate(images) if image.used]
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
         covariance=fitted.covariance,
-        board=shown.board,
+        board=board_in_images.board,
         images=tuple(images),
         rms_px=adjusted.rms_px(),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
@@ -341,15 +345,17 @@ def _result(photographs: _Photographs, shown: _ShownBoard, lens: ChosenLens) -> 
         error_ratio=float(np.sqrt(fitted.ratio)),
         lens=lens.reason,
         validated_px=lens.validated_px,
-        corners=np.concatenate([seen.px, adjusted.residual], axis=1),
+        corners=np.concatenate([corners.px, adjusted.residual], axis=1),
         warnings=(
-            *([shown.note] if shown.note else []),
+            *([board_in_images.note] if board_in_images.note else []),
             *_left_out(images),
             *lens.warnings,
             *warnings(fitted),
-            *_changes([paths[k] for k in kept], [facts[k] for k in kept], photographs.size),
+            *_changes(
+                [paths[k] for k in used_images], [facts[k] for k in used_images], photographs.size
+            ),
         ),
-        photographs=recorded([facts[k] for k in kept]),
+        photographs=recorded([facts[k] for k in used_images]),
     )
 
 
@@ -393,8 +399,8 @@ def _matching(name: str) -> list[Path]:
         return []
     path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
-        shown = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
-        return [p for p in shown if p.suffix.lower() in suffixes and p.is_file()]
+        files = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
+        return [p for p in files if p.suffix.lower() in suffixes and p.is_file()]
     if os.path.lexists(path):
         return [path]
     hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
@@ -423,11 +429,11 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
     if len(sizes) > 1:
         by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
         usual = by_count[0][0]
-        first = {size: facts[paths.index(some[0])] for size, some in by_count}
+        first = {size: facts[paths.index(paths_of_size[0])] for size, paths_of_size in by_count}
         sizes_in_words = "; ".join(
-            f"{size.width} x {size.height} px in {few([path.name for path in some])}"
+            f"{size.width} x {size.height} px in {few([path.name for path in paths_of_size])}"
             f"{likely_cause(size, usual, first[size]) if size != usual else ''}"
-            for size, some in by_count
+            for size, paths_of_size in by_count
         )
         raise DatasetError(
             f"The camera could not be calibrated: found images of different sizes, "

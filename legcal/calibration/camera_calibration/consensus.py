@@ -59,10 +59,12 @@ class Agreement:
     rival: tuple[int, ...]  # other images that agree among themselves
 
 
-def agreeing_images(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Agreement | None:
+def agreeing_images(
+    corners: BoardImages, size: ImageSize, model: DistortionModel
+) -> Agreement | None:
     """Return the largest group of images that agree on a camera; None if no fit succeeds."""
-    n = int(seen.image[-1]) + 1
-    largest = _largest(seen, size, model)
+    n = int(corners.image[-1]) + 1
+    largest = _largest(corners, size, model)
     if largest is None:
         return None
     adjusted, group = largest
@@ -71,40 +73,40 @@ def agreeing_images(seen: BoardImages, size: ImageSize, model: DistortionModel) 
         return Agreement(adjusted, {}, ())
     rival: tuple[int, ...] = ()
     if len(others) >= _RIVAL:
-        part, numbers = part_of(seen, np.isin(seen.image, others), n)
+        part, numbers = part_of(corners, np.isin(corners.image, others), n)
         second = _largest(part, size, model)
         if second is not None and np.count_nonzero(second[1]) >= _RIVAL:
             rival = tuple(np.array(numbers)[second[1]].tolist())
-    return Agreement(adjusted, _reasons(adjusted, seen, group), rival)
+    return Agreement(adjusted, _reasons(adjusted, corners, group), rival)
 
 
 def _largest(
-    seen: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[AdjustedBoard, BoolArray] | None:
     """Return the adjustment to the largest group of agreeing images, and the group."""
-    n = int(seen.image[-1]) + 1
+    n = int(corners.image[-1]) + 1
     rng = np.random.default_rng(0)
     best: tuple[AdjustedBoard, BoolArray] | None = None
-    first = from_scratch(seen, size, model)
+    first = from_scratch(corners, size, model)
     if first is not None:
         all_images = np.ones(n, dtype=np.bool_)
         if n < _FEW:
             return first, all_images
-        group = _grown(first, _cheapest(first, seen, rng))
+        group = _grown(first, _cheapest(first, corners, rng))
         if group.all():
             return first, group
         if np.count_nonzero(group) >= _OF_START:
-            best = _settled(first, first, group, seen)
+            best = _settled(first, first, group, corners)
     for _ in range(_MORE_STARTS if n >= _FEW else 0):
         if best is not None and np.count_nonzero(best[1]) >= _CLEAR * n:
             break
         chosen = rng.choice(n, _OF_START, replace=False)
-        part, _ = part_of(seen, np.isin(seen.image, chosen), n)
+        part, _ = part_of(corners, np.isin(corners.image, chosen), n)
         rough = from_scratch(part, size, model)
         if rough is None:
             continue
         start = first or rough
-        candidate = _settled(rough, start, None, seen)
+        candidate = _settled(rough, start, None, corners)
         if candidate is not None and (
             best is None or np.count_nonzero(candidate[1]) > np.count_nonzero(best[1])
         ):
@@ -113,15 +115,15 @@ def _largest(
 
 
 def _settled(
-    near: AdjustedBoard, start: AdjustedBoard, group: BoolArray | None, seen: BoardImages
+    near: AdjustedBoard, start: AdjustedBoard, group: BoolArray | None, corners: BoardImages
 ) -> tuple[AdjustedBoard, BoolArray] | None:
     """Return the adjustment to a group that fitting it does not change, and the group."""
-    n = int(seen.image[-1]) + 1
+    n = int(corners.image[-1]) + 1
     poses = list(start.T_camera_board)
     settled: tuple[AdjustedBoard, BoolArray] | None = None
     for _ in range(_ROUNDS):
         if group is not None:
-            part, images = part_of(seen, group[seen.image], n)
+            part, images = part_of(corners, group[corners.image], n)
             fitted = readjust(near, [poses[k] for k in images], part)
             if fitted is None:
                 return None
@@ -129,39 +131,39 @@ def _settled(
             for k, T in zip(images, fitted.T_camera_board, strict=True):
                 poses[k] = T
         names = intrinsic_names(near.camera)
-        held = adjust_board(near.camera, poses, seen, names, near.sheet, held=True)
-        if held is None:
+        adjusted = adjust_board(near.camera, poses, corners, names, near.sheet, held=True)
+        if adjusted is None:
             return None
-        poses = list(held.T_camera_board)
+        poses = list(adjusted.T_camera_board)
         before = group
         if group is None:
-            cost = _costs(held, seen)
+            cost = _costs(adjusted, corners)
             group = cost <= np.sort(cost)[n // 2]
-        group = _grown(held, group)
+        group = _grown(adjusted, group)
         if np.count_nonzero(group) < _OF_START:
             return None
-        settled = held, group
+        settled = adjusted, group
         if before is not None and np.array_equal(before, group):
             break
     return settled
 
 
-def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:
+def _costs(adjusted: AdjustedBoard, corners: BoardImages) -> Array:
     """Return the squared residuals of images over their degrees of freedom, (n_images,)."""
-    square = np.sum((adjusted.residual / seen.sigma_px[:, None]) ** 2, axis=1)
+    square = np.sum((adjusted.residual / corners.sigma_px[:, None]) ** 2, axis=1)
     n = len(adjusted.T_camera_board)
-    corners = np.bincount(seen.image, minlength=n)
-    return np.bincount(seen.image, square, n) / np.maximum(2 * corners - 6, 1)
+    n_corners = np.bincount(corners.image, minlength=n)
+    return np.bincount(corners.image, square, n) / np.maximum(2 * n_corners - 6, 1)
 
 
-def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generator) -> BoolArray:
+def _cheapest(adjusted: AdjustedBoard, corners: BoardImages, rng: np.random.Generator) -> BoolArray:
     """Return the half of the images with the least total quadratic cost."""
     clusters = adjusted.clusters
     n = len(clusters.score)
-    dof = np.maximum(2 * np.bincount(seen.image, minlength=n) - 6, 1)
-    base = _costs(adjusted, seen) * dof
+    dof = np.maximum(2 * np.bincount(corners.image, minlength=n) - 6, 1)
+    base = _costs(adjusted, corners) * dof
     half = n // 2 + 1
-    best, least = np.ones(n, dtype=np.bool_), np.inf
+    best, least_total = np.ones(n, dtype=np.bool_), np.inf
     for _ in range(_STARTS):
         group = np.isin(np.arange(n), rng.choice(n, _OF_START, replace=False))
         for _ in range(_ROUNDS):
@@ -172,8 +174,8 @@ def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generat
             if np.array_equal(before, group):
                 break
         total = float(cost[group].sum())
-        if total < least:
-            best, least = group, total
+        if total < least_total:
+            best, least_total = group, total
     return best
 
 
@@ -205,11 +207,11 @@ def _contradicting(
         (whole[:, 1:], 2),
         (np.eye(k)[:, k - len(SHEET) :], len(SHEET)),
     ]
-    wrong = np.zeros(len(group), dtype=np.bool_)
+    contradicts = np.zeros(len(group), dtype=np.bool_)
     for directions, dof in limits:
         limit = float(chdtri(dof, _SIGNIFICANCE))
-        wrong |= clusters.contradiction(group, ratio, directions) > limit
-    return wrong
+        contradicts |= clusters.contradiction(group, ratio, directions) > limit
+    return contradicts
 
 
 def _of_two_kinds(direction: Array, clusters: Clusters, group: BoolArray) -> BoolArray:
@@ -221,8 +223,8 @@ def _of_two_kinds(direction: Array, clusters: Clusters, group: BoolArray) -> Boo
     minority, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
     if n < _FEW:
         return minority
-    left, change, information = clusters.choose(group).freed(direction)
-    weight = information / max(left.ratio(), 1.0)
+    freed, change, information = clusters.choose(group).freed(direction)
+    weight = information / max(freed.ratio(), 1.0)
     order = np.argsort(change)
     w, z = weight[order], change[order]
     mean = float(w @ z) / float(w.sum())
@@ -256,12 +258,12 @@ class _Fault:
     change: Array
 
 
-def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> dict[int, str]:
+def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) -> dict[int, str]:
     """Return the likeliest fault of each image outside of a group, in words."""
-    usual = float(np.median(_costs(adjusted, seen)[group]))
+    usual = float(np.median(_costs(adjusted, corners)[group]))
     candidates: dict[int, dict[str, _Fault]] = {}
     for i in np.flatnonzero(~group).tolist():
-        faults = _faults(adjusted, seen, i, usual)
+        faults = _faults(adjusted, corners, i, usual)
         max_gain = max(fault.gain for fault in faults.values())
         candidates[i] = {
             name: fault
@@ -286,23 +288,23 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
     reasons = {}
     for i in candidates:
         name = best_names.get(i, "")
-        alike = [candidates[k][name].change for k, other in best_names.items() if other == name]
+        equal = [candidates[k][name].change for k, other in best_names.items() if other == name]
         if name == "zoom":
             longer = candidates[i][name].change.mean() > 0.0
-            zooms = [change.mean() for change in alike if (change.mean() > 0.0) == longer]
+            zooms = [change.mean() for change in equal if (change.mean() > 0.0) == longer]
             reasons[i] = (
                 f"another zoom or focus, with a focal length about "
                 f"{100.0 * abs(np.median(zooms)):.2g} % {'longer' if longer else 'shorter'} than "
                 "in the others"
             )
         elif name == "stretch":
-            wider, higher = np.median(alike, axis=0)
+            wider, higher = np.median(equal, axis=0)
             reasons[i] = (
                 f"its picture is stretched, {100.0 * abs(wider - higher):.2g} % more "
                 f"{'along x' if wider > higher else 'along y'} than those of the others"
             )
         elif name == "shift":
-            x, y = np.rint(np.median(alike, axis=0)).astype(np.intp)
+            x, y = np.rint(np.median(equal, axis=0)).astype(np.intp)
             reasons[i] = (
                 f"its picture lies about ({x}, {y}) px beside that of the others, as with "
                 "stabilisation or another crop"
@@ -310,7 +312,7 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
         elif name:
             reasons[i] = _IN_WORDS[name]
         else:
-            rms = [adjusted.rms_px(which) for which in (seen.image == i, group[seen.image])]
+            rms = [adjusted.rms_px(mask) for mask in (corners.image == i, group[corners.image])]
             reasons[i] = (
                 f"its corners are {rms[0]:.2f} px off (rms) before the camera of the others, whose "
                 f"own are {rms[1]:.2f} px off"
@@ -346,12 +348,16 @@ _IN_WORDS = {
 }
 
 
-def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) -> dict[str, _Fault]:
+def _faults(
+    adjusted: AdjustedBoard, corners: BoardImages, i: int, usual: float
+) -> dict[str, _Fault]:
     """Return the possible faults of an image, given the usual cost of a degree of freedom."""
-    camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], seen.image == i
-    points, sheet = seen.points[of_image], adjusted.sheet or Sheet.flat(seen.points)
+    camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], corners.image == i
+    points, sheet = corners.points[of_image], adjusted.sheet or Sheet.flat(corners.points)
     only = np.zeros(len(points), dtype=np.intp)
-    image = BoardImages(only, sheet.placed(points)[0], seen.px[of_image], seen.sigma_px[of_image])
+    image = BoardImages(
+        only, sheet.placed(points)[0], corners.px[of_image], corners.sigma_px[of_image]
+    )
     plain = adjust_board(camera, [T], image)
     if plain is None:
         return {"motion": _Fault(0, 0.0, np.zeros(2))}
@@ -390,25 +396,25 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         faults["stretch" if name == "zoom" and not is_uniform else name] = fault(
             len(free), variant, change
         )
-    bent = adjust_board(camera, [T], image, (), Sheet.flat(seen.points), tolerance=tolerance)
+    bent = adjust_board(camera, [T], image, (), Sheet.flat(corners.points), tolerance=tolerance)
     faults["sheet"] = fault(4, bent)
     faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / excess, np.zeros(2))
     return faults
 
 
-def _gain_of_motion(adjusted: AdjustedBoard, seen: BoardImages) -> float:
+def _gain_of_motion(adjusted: AdjustedBoard, corners: BoardImages) -> float:
     """Return the reduction of the cost of an image by a motion of the board during readout."""
     T = adjusted.T_camera_board[0]
-    arm = T.rotation.apply(seen.points)
+    arm = T.rotation.apply(corners.points)
     _, by_point = adjusted.camera.project_with_derivative(arm + T.translation)
     by_pose = np.concatenate([np.cross(arm[:, None, :], by_point), by_point], axis=-1)
-    row = seen.px[:, 1] - seen.px[:, 1].mean()
+    row = corners.px[:, 1] - corners.px[:, 1].mean()
     J = np.concatenate([by_pose, by_pose * row[:, None, None]], axis=-1)
-    J = J / seen.sigma_px[:, None, None]
+    J = J / corners.sigma_px[:, None, None]
     J = J / np.maximum(np.linalg.norm(J, axis=(0, 1)), 1e-300)
-    r = left = adjusted.residual / seen.sigma_px[:, None]
+    r = remaining = adjusted.residual / corners.sigma_px[:, None]
     for _ in range(_ROUNDS):
-        _, weighted = LOSS.softened(left, np.concatenate([J, r[..., None]], axis=-1))
+        _, weighted = LOSS.softened(remaining, np.concatenate([J, r[..., None]], axis=-1))
         rows = weighted.reshape(-1, weighted.shape[-1])
-        left = r - J @ np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
-    return LOSS.cost(np.sum(r * r, axis=1)) - LOSS.cost(np.sum(left * left, axis=1))
+        remaining = r - J @ np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
+    return LOSS.cost(np.sum(r * r, axis=1)) - LOSS.cost(np.sum(remaining * remaining, axis=1))

@@ -51,7 +51,7 @@ def spread(fit: RobustFit) -> float:
 
 def coverage(fit: RobustFit) -> float:
     """Return the share of the image inside the convex hull of all corners."""
-    hull = cv2.convexHull(fit.seen.px.astype(np.float32))
+    hull = cv2.convexHull(fit.corners.px.astype(np.float32))
     camera = fit.adjusted.camera
     return float(cv2.contourArea(hull)) / (camera.width * camera.height)
 
@@ -126,7 +126,7 @@ def too_few_images(
         )
         hint = "see that the board is flat and does not move while it is photographed, and "
     elif copies:
-        reasons = "; ".join(f"{few(same)}: {why}" for why, same in copies.items())
+        reasons = "; ".join(f"{few(same_names)}: {reason}" for reason, same_names in copies.items())
         n_more = sum(map(len, copies.values()))
         others = f"{listed}, and {n_more} more that show the same ({reasons})"
     return NotIdentifiable(
@@ -146,20 +146,20 @@ def warnings(fit: RobustFit) -> list[str]:
             f"{n} images are few: the standard deviations themselves are uncertain; take "
             f"{_FEW_IMAGES} or more."
         )
-    tilt, apart = float(tilts(fit).max()), spread(fit)
+    tilt, largest_angle = float(tilts(fit).max()), spread(fit)
     focal = float(sigma[0] / camera.K[0, 0])
-    if tilt < _MIN_TILT or apart < _MIN_SPREAD or focal > _WEAK_FOCAL_SIGMA:
+    if tilt < _MIN_TILT or largest_angle < _MIN_SPREAD or focal > _WEAK_FOCAL_SIGMA:
         sentences.append(
             f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
             f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
-            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more"
+            f"and {np.degrees(largest_angle):.0f} deg to each other; tilt them by 30 deg and more"
             f"{_missing_tilts(fit)}."
         )
     covered = coverage(fit)
     if covered < _MIN_COVERAGE:
         sentences.append(
             f"Corners cover {100.0 * covered:.0f} % of the image: the distortion outside is "
-            f"extrapolated; bring the board to {_unseen_parts(fit)} of the image."
+            f"extrapolated; bring the board to {_uncovered_parts(fit)} of the image."
         )
     sentences += _sheet(fit)
     ratio = float(camera.K[1, 1] / camera.K[0, 0] - 1.0)
@@ -185,7 +185,7 @@ def warnings(fit: RobustFit) -> list[str]:
             f"The residuals are large, {rms:.2f} px (rms): the board is bent, its dimensions are "
             "wrong, or the model of the lens does not fit."
         )
-    n_all = fit.n_left_out + len(fit.seen.px)
+    n_all = fit.n_left_out + len(fit.corners.px)
     if fit.n_left_out > _MANY_LEFT_OUT * n_all:
         sentences.append(
             f"{fit.n_left_out} of {n_all} corners disagree with the others and were left out; "
@@ -224,12 +224,12 @@ def _sheet(fit: RobustFit) -> list[str]:
     return sentences
 
 
-def _unseen_parts(fit: RobustFit) -> str:
+def _uncovered_parts(fit: RobustFit) -> str:
     """Return the names of the parts of the image with few corners."""
     camera = fit.adjusted.camera
-    part = np.floor(3.0 * (fit.seen.px + 0.5) / [camera.width, camera.height]).astype(np.intp)
+    part = np.floor(3.0 * (fit.corners.px + 0.5) / [camera.width, camera.height]).astype(np.intp)
     number = np.clip(part, 0, 2) @ [1, 3]
-    images = [len(set(fit.seen.image[number == k].tolist())) for k in range(9)]
+    images = [len(set(fit.corners.image[number == k].tolist())) for k in range(9)]
     unseen = [name for name, n in zip(_PARTS, images, strict=True) if n < _IMAGES_OF_PART]
     return ", ".join(unseen) or "every edge and corner"
 
@@ -255,8 +255,8 @@ def _folding(camera: Camera) -> list[str]:
     w, h = camera.width - 1.0, camera.height - 1.0
     corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
     back = camera.distort(camera.undistort(corners))
-    off = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
-    if off < _FOLDED_PX:
+    error = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
+    if error < _FOLDED_PX:
         return []
     return [
         "The lens model folds back before the corners of the image, where no board was seen: "
@@ -273,10 +273,10 @@ def _overfit(fit: RobustFit) -> list[str]:
     zeroed = full.camera.distortion.copy()
     zeroed[5:] = 0.0
     start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
-    plain = adjust_board(start, full.T_camera_board, fit.seen, simple, full.sheet)
+    plain = adjust_board(start, full.T_camera_board, fit.corners, simple, full.sheet)
     if plain is None:
         return []
-    dof = 2 * len(fit.seen.px) - len(full.covariance) - 6 * len(fit.images)
+    dof = 2 * len(fit.corners.px) - len(full.covariance) - 6 * len(fit.images)
     gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
     if gain > 0.0 and fdtrc(3, max(dof, 1), gain) < _OVERFIT:
         return []

@@ -64,14 +64,14 @@ def validated_residuals(fit: RobustFit) -> Array | None:
     folds = min(_FOLDS, n)
     if n < 4:
         return None
-    residual = np.zeros_like(fit.seen.px)
+    residual = np.zeros_like(fit.corners.px)
     fold = np.random.default_rng(0).permutation(n) % folds
     poses, names = fit.adjusted.T_camera_board, intrinsic_names(fit.adjusted.camera)
     for k in range(folds):
-        is_held_out = (fold == k)[fit.seen.image]
-        others, numbers = part_of(fit.seen, ~is_held_out, n)
+        is_held_out = (fold == k)[fit.corners.image]
+        others, numbers = part_of(fit.corners, ~is_held_out, n)
         fitted = readjust(fit.adjusted, [poses[i] for i in numbers], others)
-        held_out, numbers = part_of(fit.seen, is_held_out, n)
+        held_out, numbers = part_of(fit.corners, is_held_out, n)
         if fitted is None:
             return None
         start = fitted.camera, [poses[i] for i in numbers], held_out, names, fitted.sheet
@@ -87,16 +87,16 @@ def radial_trend(fit: RobustFit) -> float:
 
     Zero without a significant one; significance comes from the scatter between images.
     """
-    seen, n = fit.seen, len(fit.images)
-    from_centre = seen.px - fit.adjusted.camera.K[:2, 2]
+    corners, n = fit.corners, len(fit.images)
+    from_centre = corners.px - fit.adjusted.camera.K[:2, 2]
     radius = np.linalg.norm(from_centre, axis=1)
     outwards = np.sum(fit.adjusted.residual * from_centre, axis=1) / np.maximum(radius, 1e-9)
     bounds = np.quantile(radius, np.linspace(0.0, 1.0, _RINGS + 1)[1:-1])
     ring = np.searchsorted(bounds, radius)
     largest = 0.0
     for k in range(_RINGS):
-        count = np.bincount(seen.image[ring == k], minlength=n)
-        total = np.bincount(seen.image[ring == k], outwards[ring == k], n)
+        count = np.bincount(corners.image[ring == k], minlength=n)
+        total = np.bincount(corners.image[ring == k], outwards[ring == k], n)
         mean = total[count >= _OF_RING] / count[count >= _OF_RING]
         if len(mean) < 4:
             continue
@@ -106,9 +106,9 @@ def radial_trend(fit: RobustFit) -> float:
     return largest
 
 
-def given_lens(seen: BoardImages, size: ImageSize, model: DistortionModel) -> ChosenLens | None:
+def given_lens(corners: BoardImages, size: ImageSize, model: DistortionModel) -> ChosenLens | None:
     """Return the fit of a given lens model, with a warning if its residuals have a trend."""
-    fit = robust_fit(seen, size, model)
+    fit = robust_fit(corners, size, model)
     if fit is None:
         return None
     trend, remarks = radial_trend(fit), []
@@ -120,15 +120,15 @@ def given_lens(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Ch
     return ChosenLens(fit, f"{model}: as given", tuple(remarks))
 
 
-def chosen_lens(seen: BoardImages, size: ImageSize) -> ChosenLens | None:
+def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
     """Return the fit of the simplest adequate lens model; None if no adjustment succeeds."""
-    plain, best = robust_fit(seen, size, SIMPLEST), None
+    plain, best = robust_fit(corners, size, SIMPLEST), None
     if plain is not None:
         if not radial_trend(plain) and not plain.left_out:
             return ChosenLens(plain, f"{SIMPLEST}: its residuals do not lean anywhere in the field")
         best = ChosenLens(plain, f"{SIMPLEST}: no richer model predicts images better")
     for model in _RICHER:
-        fit = robust_fit(seen, size, model)
+        fit = robust_fit(corners, size, model)
         if fit is None:
             continue
         rich = ChosenLens(fit, f"{model}: no simpler model fits")
@@ -175,5 +175,5 @@ def _squares(lens: ChosenLens) -> dict[int, float]:
     if lens.validated is None:
         return {}
     square = np.sum(lens.validated**2, axis=1)
-    mean = np.bincount(lens.fit.seen.image, square) / np.bincount(lens.fit.seen.image)
+    mean = np.bincount(lens.fit.corners.image, square) / np.bincount(lens.fit.corners.image)
     return dict(zip(lens.fit.images, mean.tolist(), strict=True))

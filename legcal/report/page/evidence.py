@@ -141,8 +141,8 @@ def note_blocks(calibration: Calibration) -> list[Any]:
         for d in calibration.result.diagnosis or ()
     ]  # fmt: skip
     if diagnosis:
-        columns = ("likely mistake", "indistinguishable from", ">images that agree", ">without it",
-                   "remedy")  # fmt: skip
+        columns = ("likely mistake", "indistinguishable from", ">images that agree",
+                   ">with correction", "remedy")  # fmt: skip
         blocks.append(Table(columns, diagnosis, "Diagnosis"))
     for topic in Topic:
         if topic is Topic.DIAGNOSIS:
