@@ -130,8 +130,8 @@ class BoardViews:
             v = int(view[row])
             frames.setdefault(tied[0] if v in tied else v, []).append(row)
         T_base_platform = data.T_base_platform
-        given = next((b.T_link_board for b in self.boards if b.link == "platform"), None)
-        T_platform_board = given
+        stated = next((b.T_link_board for b in self.boards if b.link == "platform"), None)
+        T_platform_board = stated
         if T_platform_board is None:
             T_platform_board = self.pose_on_platform(data, T_base_camera, T_base_platform)
         if T_platform_board is None and frames:
@@ -164,8 +164,8 @@ class BoardViews:
     def _in_frame(self, row: int, view: IntArray) -> RigidTransform:
         """Return the pose of the platform's board in the base's board, or else in the camera."""
         T_board_camera = self.T_board_camera[view[row]]
-        seen = self.T_camera_board[row]
-        return seen if T_board_camera is None else T_board_camera * seen
+        T_camera_board = self.T_camera_board[row]
+        return T_camera_board if T_board_camera is None else T_board_camera * T_camera_board
 
 
 def _hand_eye(
@@ -207,14 +207,14 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     hand_held = {view.name for view in used if view.hand_held}
-    given = None if dataset.corners is None else data.order.reorder(dataset.corners)
+    corners_in_table = None if dataset.corners is None else data.order.reorder(dataset.corners)
     T_board_camera: tuple[RigidTransform | None, ...] = (None,) * len(measurements.views)
     T_camera_board: dict[int, RigidTransform] = {}
     tables = []
     for fixed in dataset.boards:
         on_base = fixed.link == "base"
-        if given is not None:
-            corners_of_board = given.choose(fixed.has(given.corner))
+        if corners_in_table is not None:
+            corners_of_board = corners_in_table.choose(fixed.has(corners_in_table.corner))
             corners_of_board = replace(
                 corners_of_board, corner=corners_of_board.corner - fixed.first
             )
@@ -226,9 +226,9 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
         shown_in = {
             measurements.views[v].name for v in measurements.view[corners_of_board.row].tolist()
         }
-        few = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
-        needed = hand_held if few else set[str]()
-        if given is None:
+        is_rarely_shown = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
+        needed = hand_held if is_rarely_shown else set[str]()
+        if corners_in_table is None:
             required = needed if len(corners_of_board) else {view.name for view in used}
             require_board(
                 fixed.board, corners_of_board, data.photographs.load, measurements, required
@@ -292,9 +292,11 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
     if fixed is None:
         return _misplaced(dataset, solution)
     on_base = corners.used & fixed.has(corners.corner)
-    shown = set(measurements.view[corners.row[on_base]].tolist())
+    shown_views = set(measurements.view[corners.row[on_base]].tolist())
     without = [
-        measurements.views[v].name for v in np.unique(measurements.view).tolist() if v not in shown
+        measurements.views[v].name
+        for v in np.unique(measurements.view).tolist()
+        if v not in shown_views
     ]
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
@@ -335,11 +337,11 @@ def in_one_camera(
     Returns the axes and measurements, T_first_camera of each original view (None if it does not
     show the board), and the new number of each original view.
     """
-    shown = np.array([T is not None for T in T_board_camera], dtype=np.bool_)
-    first, others = int(np.argmax(shown)), np.flatnonzero(~shown).tolist()
+    is_shown = np.array([T is not None for T in T_board_camera], dtype=np.bool_)
+    first, others = int(np.argmax(is_shown)), np.flatnonzero(~is_shown).tolist()
     from_board = next(T.inv() for T in T_board_camera if T is not None)
     T_first_camera = tuple(None if T is None else from_board * T for T in T_board_camera)
-    new_view = np.zeros(len(shown), dtype=np.intp)
+    new_view = np.zeros(len(is_shown), dtype=np.intp)
     new_view[others] = 1 + np.arange(len(others))
     u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
     view = measurements.view[axes.row]

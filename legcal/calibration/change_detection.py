@@ -188,8 +188,8 @@ def _explain(
     by_change = directions @ change.columns
     inverse = np.linalg.pinv(by_change, rcond=1e-9)
     values = inverse @ residual
-    left = residual - by_change @ values
-    remaining = share * float(left @ left)
+    remainder = residual - by_change @ values
+    remaining = share * float(remainder @ remainder)
     dof = len(residual) - int(np.linalg.matrix_rank(by_change))
     sigma = np.sqrt(np.sum(inverse**2, axis=1))
     return Explanation(change, values, sigma, remaining, _p_value(remaining, dof, noise_dof))
@@ -248,14 +248,14 @@ def possible_changes(
             relative = columns * metre[-len(units) :] / metre[: len(columns), None]
             moves = np.any(np.abs(relative) > _STEP, axis=0)
             if moves.any():
-                kept = np.flatnonzero(moves).tolist()
+                indices = np.flatnonzero(moves).tolist()
                 of_part.append(
                     Change(
                         part,
                         name,
-                        tuple(components[k] for k in kept),
-                        tuple(units[k] for k in kept),
-                        (link,) * len(kept),
+                        tuple(components[k] for k in indices),
+                        tuple(units[k] for k in indices),
+                        (link,) * len(indices),
                         columns[:, moves],
                     )
                 )

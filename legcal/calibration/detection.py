@@ -206,14 +206,14 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         cameras, cylinders = measured.placement.T_base_camera, measured.photographs.cylinders
         placed = np.array([T is not None for T in cameras])
         row = measured.outlines.row
-        kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
-        outlines, unplaced = measured.outlines.choose(kept), measured.placement.unplaced
+        is_kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
+        outlines, unplaced = measured.outlines.choose(is_kept), measured.placement.unplaced
         arms = _nominal_arms(data)
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, measured, arms)])
         image_notes, notes = _image_notes(data, measured.placement), _gamma_notes(data)
-        if wrong := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
-            description = wrong_arms_in_words(wrong, data.machine.legs)
+        if wrong_arms := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
+            description = wrong_arms_in_words(wrong_arms, data.machine.legs)
             notes.append(f"Arms do not look as the model draws them: {description}")
         # Legs of a view that could not be placed are drawn by its rough pose.
         drawn = tuple(

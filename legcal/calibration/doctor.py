@@ -251,14 +251,14 @@ def _look_at_files(checklist: _Checklist, problems: Sequence[tuple[int, Problem]
     of_files = {row: problem for row, problem in problems if row not in missing}
     unread = {row: problem for row, problem in of_files.items() if problem.name}
     causes = {row: Cause("{} {}", (error.found, error.needed)) for row, error in unread.items()}
-    for cause, alike in by_cause(causes):
-        if len(alike) > 1:
-            problem_text = f"{images_in_words(m, alike)} could not be read"
+    for cause, rows in by_cause(causes):
+        if len(rows) > 1:
+            problem_text = f"{images_in_words(m, rows)} could not be read"
             error = replace(
-                unread[alike[0]], what=problem_text, found=str(cause.values[0]), row=None
+                unread[rows[0]], what=problem_text, found=str(cause.values[0]), row=None
             )
-            checklist.add("files", "error", str(error), alike)
-            of_files = {row: problem for row, problem in of_files.items() if row not in alike}
+            checklist.add("files", "error", str(error), rows)
+            of_files = {row: problem for row, problem in of_files.items() if row not in rows}
     for row, problem in of_files.items():
         checklist.add("files", "error", str(problem), [row])
     return [row for row in range(m.n_rows) if row not in bad]
@@ -296,15 +296,15 @@ def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
     for j, column in zip(dataset.machine.motors, reading_columns(legs), strict=True):
         lower, upper = map(float, legs[j].travel)
         has_travel = bool(np.isfinite(upper - lower)) and upper > lower
-        least, greatest = float(q[:, j].min()), float(q[:, j].max())
+        smallest, largest = float(q[:, j].min()), float(q[:, j].max())
         uses.append(
             EncoderUse(
                 column=column.name,
                 unit=legs[j].reading_unit,
-                least=least,
-                greatest=greatest,
+                least=smallest,
+                greatest=largest,
                 travel=(lower, upper) if has_travel else None,
-                used=(greatest - least) / (upper - lower) if has_travel else None,
+                used=(largest - smallest) / (upper - lower) if has_travel else None,
             )
         )
     return uses
@@ -371,8 +371,8 @@ def _last_digit(q: Array) -> float | None:
 def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:
     """Check the metadata of photographs against the camera files and each other."""
     dataset, m = checklist.dataset, checklist.dataset.measurements
-    shown = sorted({int(v) for v in m.view})
-    files = {dataset.camera_paths[v]: m.views[v].camera for v in shown}
+    shown_views = sorted({int(v) for v in m.view})
+    files = {dataset.camera_paths[v]: m.views[v].camera for v in shown_views}
     checklist.checks["camera"] = ", ".join(
         f"{path.name}: {camera.width} x {camera.height} px" for path, camera in files.items()
     )
@@ -432,19 +432,21 @@ def _look_at_photographs(
         checklist.checks["photographs"] += f", blurred by {float(np.median(blurs)):.1f} px"
     for message in defect_notes(m, defects):
         checklist.add("photographs", "warning", message)
-    for same in (rows_of_digest for rows_of_digest in pixels.values() if len(rows_of_digest) > 1):
-        several = len({int(m.pose[row]) for row in same}) > 1
+    for duplicates in (
+        rows_of_digest for rows_of_digest in pixels.values() if len(rows_of_digest) > 1
+    ):
+        several = len({int(m.pose[row]) for row in duplicates}) > 1
         checklist.add(
             "files",
             "error" if several else "warning",
-            f"{_sentence(images_in_words(m, same))} are the same photograph, "
+            f"{_sentence(images_in_words(m, duplicates))} are the same photograph, "
             + (
                 "with different readings: only one of them can be right"
                 if several
                 else "which would count more than once"
             )
             + "; remove the other rows, or name the photographs that belong to them.",
-            same,
+            duplicates,
         )
     _look_at_views(
         checklist, {row: light for row, light in exposures.items() if row not in defects}
@@ -507,15 +509,20 @@ def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
         if checklist.diagnosis
         else "none explains the images better"
     )
-    most = int(np.bincount(data.measurements.view).max())
-    if most < MIN_IMAGES and not checklist.diagnosis and data.dataset.board_on("base") is None:
+    most_images = int(np.bincount(data.measurements.view).max())
+    if (
+        most_images < MIN_IMAGES
+        and not checklist.diagnosis
+        and data.dataset.board_on("base") is None
+    ):
         checklist.checks["mistakes"] = "not tried: too few images of each view"
         checklist.add(
             "mistakes",
             "note",
-            f"Mistakes in readings, model and images could not be looked for: found at most {most} "
-            f"image{'s' * (most > 1)} of a view, needed {MIN_IMAGES} or more, since some camera "
-            "pose suits fewer whatever is wrong; photograph more poses from one place.",
+            "Mistakes in readings, model and images could not be looked for: found at most "
+            f"{most_images} image{'s' * (most_images > 1)} of a view, needed {MIN_IMAGES} or more, "
+            "since some camera pose fits fewer images in any case; photograph more poses from one "
+            "position.",
         )
     for diagnosis in checklist.diagnosis:
         checklist.add("mistakes", "error", diagnosis.sentence)

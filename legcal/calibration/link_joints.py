@@ -91,9 +91,9 @@ class _LinkFrame:
     def points_with(self, values: Mapping[str, float]) -> Array:
         """Return the joint centres (n_legs, 3) in the link at given parameter values [m]."""
         points = self.points.copy()
-        for at in np.argwhere(self.place >= 0).tolist():
-            name = self.names[self.place[tuple(at)]]
-            points[tuple(at)] = values.get(name, points[tuple(at)])
+        for index in np.argwhere(self.place >= 0).tolist():
+            name = self.names[self.place[tuple(index)]]
+            points[tuple(index)] = values.get(name, points[tuple(index)])
         return np.asarray(self.T_link_frame.apply(points))
 
     def defines(self, leg: int) -> FrameMark | None:
@@ -166,9 +166,9 @@ def joints_in_links(
         for j, leg in enumerate(frame.legs):
             names = frame.named(frame.place[j])
             numbered = [i for i, name in enumerate(names) if name in number]
-            at = [number[names[i]] for i in numbered]
+            indices = [number[names[i]] for i in numbered]
             C = np.zeros((3, 3))
-            C[np.ix_(numbered, numbered)] = everything[np.ix_(at, at)]
+            C[np.ix_(numbered, numbered)] = everything[np.ix_(indices, indices)]
             C = frame.R @ C @ frame.R.T
             statuses = frame.statuses(j, status)
             sigma = np.sqrt(np.maximum(np.diagonal(C), 0.0)).tolist()
@@ -213,8 +213,8 @@ def _axes_in_link(
         w = np.array([rows[name].value if name in rows else 0.0 for name in names])
         sigma = None
         if all(name in rows and rows[name].status == "estimated" for name in names):
-            at = [number[name] for name in names]
-            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(at, at)], turns)
+            indices = [number[name] for name in names]
+            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(indices, indices)], turns)
             sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
         axes.append(
             AxisInLink(
@@ -248,11 +248,11 @@ def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakI
                 }
     named_parts |= component
     largest = max(map(abs, named_parts.values()), default=0.0)
-    shown = {name: x for name, x in named_parts.items() if abs(x) > SHOWN * largest}
+    significant = {name: x for name, x in named_parts.items() if abs(x) > SHOWN * largest}
     return WeakInLinks(
-        direction=describe_direction(list(shown), machine.leg_names),
-        parameters=list(shown),
-        components=list(shown.values()),
+        direction=describe_direction(list(significant), machine.leg_names),
+        parameters=list(significant),
+        components=list(significant.values()),
     )
 
 
@@ -267,12 +267,12 @@ def compared_joints(machine: Machine, reference: Machine) -> dict[Link, Compared
         frame, other = _LinkFrame.of(machine, side), _LinkFrame.of(reference, side)
         ours = np.asarray(frame.T_link_frame.apply(frame.points))
         theirs = np.asarray(frame.T_link_frame.apply(other.points))
-        apart = frame.T_link_frame.inv() * other.T_link_frame
+        T_apart = frame.T_link_frame.inv() * other.T_link_frame
         shift = frame.T_link_frame.translation - other.T_link_frame.translation
         links[side] = ComparedLink(
             link=frame.link,
             frames_apart=Distance(
-                dX_m=float(np.linalg.norm(shift)), dE_rad=float(apart.rotation.magnitude())
+                dX_m=float(np.linalg.norm(shift)), dE_rad=float(T_apart.rotation.magnitude())
             ),
             joints=[
                 ComparedJoint(

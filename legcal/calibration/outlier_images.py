@@ -135,24 +135,24 @@ class _Image:
         Rods on an actuator are linearised about the given reading.
         """
         A, B = self._joints
-        at, slope = np.zeros(len(B)), np.ones(len(B))
+        reference, slope = np.zeros(len(B)), np.ones(len(B))
         for j, leg in enumerate(self.solution.legs):
             if leg.actuator is not None:
                 by_q = leg.actuator.motion(leg.A, self.given[j : j + 1]).by_q[0]
                 AB = self.fitted_pose.apply(leg.B) - A[j]
-                at[j], slope[j] = self.given[j], float(by_q @ AB) / float(np.linalg.norm(AB))
-        return at, slope
+                reference[j], slope[j] = self.given[j], float(by_q @ AB) / float(np.linalg.norm(AB))
+        return reference, slope
 
     def readings_at(self, pose: Frames) -> tuple[Array, Array]:
         """Return the readings (n_legs,) at a pose, and their derivatives (n_legs, 6) by it."""
-        (A, B), (at, slope) = self._joints, self._length_laws
+        (A, B), (reference, slope) = self._joints, self._length_laws
         q0 = np.array([leg.q0 for leg in self.solution.legs])
         sign = np.array([leg.sign for leg in self.machine.legs], dtype=np.float64)
         arm = B @ pose.R[0].T
         AB = arm + pose.t - A
         length = np.linalg.norm(AB, axis=1)
         u = (sign / slope)[:, None] * AB / length[:, None]
-        return at + sign * (length - q0) / slope, np.concatenate([cross(arm, u), u], axis=1)
+        return reference + sign * (length - q0) / slope, np.concatenate([cross(arm, u), u], axis=1)
 
     def _distances(self, chosen: IntArray, pose: Frames) -> Residuals:
         """Return the distances of B at a pose from the chosen outlines [m]."""
@@ -174,19 +174,19 @@ class _Image:
 
         None if they do not determine the pose.
         """
-        o, legs, held = self.solution.outlines, self.solution.legs, list(used_readings)
+        o, legs, readings_used = self.solution.outlines, self.solution.legs, list(used_readings)
         chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
-        n, m = len(chosen), len(held)
-        if n + m < MIN_OUTLINES or (not held and len(np.unique(o.leg[chosen])) < MIN_LEGS):
+        n, m = len(chosen), len(readings_used)
+        if n + m < MIN_OUTLINES or (not readings_used and len(np.unique(o.leg[chosen])) < MIN_LEGS):
             return None
         noise = np.maximum(self._by(READING_NOISE), self.measurements.sigma_of(self.machine.legs))
-        white = 1.0 / noise[held]
+        white = 1.0 / noise[readings_used]
         least_noise = MIN_NOISE * self.machine.size
 
         def differences(state: _State) -> Residuals:
             q, J = self.readings_at(state.pose)
-            r = q[held] - self.given[held]
-            return Residuals.of((white * r)[:, None], white[:, None, None] * J[held, None])
+            r = q[readings_used] - self.given[readings_used]
+            return Residuals.of((white * r)[:, None], white[:, None, None] * J[readings_used, None])
 
         zero = np.zeros(max(n, m), dtype=np.intp)
         of_outlines, of_readings = (("pose", zero[:k], slice(None)) for k in (n, m))
@@ -201,7 +201,7 @@ class _Image:
                 robust=True,
             )
         ]
-        if held:
+        if readings_used:
             factors.append(Factor("readings", differences, (of_readings,), m, 1))
         pose = Variables("pose", all_free(1, 6), Frames.moved, max_step=MAX_STEP)
         problem = EstimationProblem[_State]((pose,), None, tuple(factors))
@@ -307,13 +307,13 @@ class _Image:
             (few([str(leg.prismatic) for leg in legs]), *worst.values()),
         )
 
-    def _one_wrong(self, leg: int, shown: float, sigma: float) -> Cause:
+    def _one_wrong(self, leg: int, predicted: float, sigma: float) -> Cause:
         joint, given = self.machine.legs[leg].prismatic, float(self.given[leg])
         size, unit = SHOWN_IN[self.machine.legs[leg].reading_unit]
         return Cause(
             f"it shows a reading of {{}} of {{:.2f}} +- {{:.2f}} {unit}, given {{:.2f}} {unit}; "
             "check that reading",
-            (str(joint), size * shown, size * sigma, size * given),
+            (str(joint), size * predicted, size * sigma, size * given),
         )
 
     def _by(self, distance: float) -> Array:

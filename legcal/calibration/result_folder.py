@@ -188,11 +188,11 @@ class EarlierResult(Summarised):
                 if numbers == camera_numbers(given) and f"{owner}.{name}" in number
             }
             if row_of:
-                covariance, at = np.zeros((len(names), len(names))), list(row_of.values())
-                covariance_of_estimated = np.array(self.result.covariance)[np.ix_(at, at)]
+                covariance, indices = np.zeros((len(names), len(names))), list(row_of.values())
+                covariance_of_estimated = np.array(self.result.covariance)[np.ix_(indices, indices)]
                 covariance[np.ix_(list(row_of), list(row_of))] = covariance_of_estimated
                 mean = intrinsic_values(given)
-                mean[list(row_of)] = [rows[i].value for i in at]
+                mean[list(row_of)] = [rows[i].value for i in indices]
                 return KnownIntrinsics(mean, covariance)
         return None
 
@@ -232,11 +232,11 @@ def load_result(given: str | Path) -> EarlierResult:
     _check_same_model(path, document, values, machine, nominal_legs)
     covariance, held = _kinematic(path, estimated, document, parametrization.names)
     error_names = (*KINDS, *PLACES)
-    others = [name for name in document.residuals.shared_px if name not in error_names]
-    if others:
-        raise unreadable(path, f"the shared errors '{others[0]}'", ", ".join(error_names))
+    unknown = [name for name in document.residuals.shared_px if name not in error_names]
+    if unknown:
+        raise unreadable(path, f"the shared errors '{unknown[0]}'", ", ".join(error_names))
     fixed = {row.name for row in document.parameters if row.status == "fixed"}
-    kept = [i for i, name in enumerate(parametrization.names) if name not in fixed]
+    not_fixed = [i for i, name in enumerate(parametrization.names) if name not in fixed]
     turns = turns_between(parametrization, legs, nominal_legs)
     if document.links is None:
         links = joints_in_links(
@@ -247,9 +247,9 @@ def load_result(given: str | Path) -> EarlierResult:
         folder=path.parent,
         document=document,
         machine=machine,
-        names=tuple(parametrization.names[i] for i in kept),
-        covariance=(turns @ covariance @ turns.T)[np.ix_(kept, kept)],
-        held=(held @ turns.T)[:, kept],
+        names=tuple(parametrization.names[i] for i in not_fixed),
+        covariance=(turns @ covariance @ turns.T)[np.ix_(not_fixed, not_fixed)],
+        held=(held @ turns.T)[:, not_fixed],
         fixed=tuple(name for name in values if name in fixed and name in parametrization.names),
     )
 
@@ -326,10 +326,10 @@ def _kinematic(
     covariance = np.array(kinematic.covariance)[np.ix_(order, order)]
     held = np.array(kinematic.held).reshape(-1, n)[:, order]
     common = [i for i, row in enumerate(estimated) if row.name in names]
-    at = [names.index(estimated[i].name) for i in common]
+    indices = [names.index(estimated[i].name) for i in common]
     of_all = np.array(document.covariance)
     sigma = np.sqrt(np.diagonal(of_all))[common]
-    difference = (covariance[np.ix_(at, at)] - of_all[np.ix_(common, common)]) / np.outer(
+    difference = (covariance[np.ix_(indices, indices)] - of_all[np.ix_(common, common)]) / np.outer(
         sigma, sigma
     )
     is_same = np.abs(difference).max(initial=0.0) <= SYMMETRY_TOLERANCE

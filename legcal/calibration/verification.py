@@ -215,12 +215,12 @@ def check(
 
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     """Return the new images with the calibrated model in place of their own."""
-    given, calibrated = dataset.machine, earlier.machine
-    if sorted(given.leg_names) != sorted(calibrated.leg_names):
-        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
+    named, calibrated = dataset.machine, earlier.machine
+    if sorted(named.leg_names) != sorted(calibrated.leg_names):
+        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(named.leg_names)}"
     else:
-        calibrated = calibrated.with_leg_order(given.leg_names)
-        different = _model_difference(calibrated, given)
+        calibrated = calibrated.with_leg_order(named.leg_names)
+        different = _model_difference(calibrated, named)
     if different:
         raise DatasetError(
             f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
@@ -233,11 +233,11 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
 def _model_difference(calibrated: Machine, given: Machine) -> str:
     """Return the difference of two models with the same legs in words; "" without one."""
     for calibrated_leg, given_leg in zip(calibrated.legs, given.legs, strict=True):
-        here, there = (
+        calibrated_in_words, given_in_words = (
             f"{leg.name} ({leg.kind}, {leg.type})" for leg in (calibrated_leg, given_leg)
         )
-        if here != there:
-            return f"the leg {here}, not {there}"
+        if calibrated_in_words != given_in_words:
+            return f"the leg {calibrated_in_words}, not {given_in_words}"
         if calibrated_leg.prismatic != given_leg.prismatic:
             return f"the joint {calibrated_leg.prismatic}, not {given_leg.prismatic}"
     frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
@@ -345,7 +345,7 @@ def _fits(
     at_places = named_covariance(problem, state, posterior.covariance - normal.kept_covariance())
     at_places = at_places[np.ix_(tested, tested)]
     held = solution.kinematic.of_values(prior.names)[1]
-    more = at_places + prior.held_sigma**2 * held.T @ held
+    additional = at_places + prior.held_sigma**2 * held.T @ held
     earlier = GaussianPrior.from_covariance(number, prior.old, prior.covariance + at_places)
 
     whitening = outlines.whitening / np.sqrt(variance_factor)
@@ -365,7 +365,7 @@ def _fits(
     near, elsewhere = minimum(problem, constrained.state), minimum(problem, state)
     best = elsewhere if near.cost - elsewhere.cost > BETTER else near
     near_earlier, free = (
-        _Free(problem, result, tested, more, prior.sigma) for result in (near, best)
+        _Free(problem, result, tested, additional, prior.sigma) for result in (near, best)
     )
     saved = 2.0 * (constrained.cost - min(near.cost, elsewhere.cost))
     return free, near_earlier, max(saved, 0.0)  # zero for the images of the earlier result
@@ -419,11 +419,11 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
     if len(claimed) == 0:
         return 1.0
     before = NoiseModel(**earlier.document.residuals.noise.document())
-    now, then = (
+    new_variance, earlier_variance = (
         float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
         for noise in (solution.quality.noise, before)
     )
-    return max(then / now, 1.0)
+    return max(earlier_variance / new_variance, 1.0)
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:

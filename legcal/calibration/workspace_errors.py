@@ -125,13 +125,13 @@ def _errors(
     wanted = platforms_in_base(machine, T_base_platform)
     nominal = poses_at_readings(machine, geometries(machine), q, wanted)
     calibrated = poses_at_readings(machine, solution.legs, q, nominal)
-    distance, turned = pose_differences(nominal, wanted)
-    reached = (distance < _CLOSED * machine.size) & (turned < _CLOSED)
+    distance, angle = pose_differences(nominal, wanted)
+    reached = (distance < _CLOSED * machine.size) & (angle < _CLOSED)
     reached &= reach_readings(machine, solution.legs, q, calibrated)
-    kept = np.flatnonzero(reached)
-    if not len(kept):
+    indices = np.flatnonzero(reached)
+    if not len(indices):
         return None
-    reached_poses = [calibrated[k] for k in kept]
+    reached_poses = [calibrated[k] for k in indices]
     try:
         moves = platform_by_parameters(
             solution.legs, solution.kinematic.parametrization, machine.frame_legs, reached_poses
@@ -139,5 +139,5 @@ def _errors(
     except NotIdentifiable:  # a point of the grid is singular
         return None
     sigma = expected_error(moves, solution.kinematic.total_covariance)
-    change = PlatformError(*pose_differences(reached_poses, [nominal[k] for k in kept]))
+    change = PlatformError(*pose_differences(reached_poses, [nominal[k] for k in indices]))
     return reached, change, sigma

@@ -117,18 +117,18 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Rende
     )
 
 
-def _hidden(views: Iterable[dict[str, Any]], of: int) -> str:
+def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
     """Return the legs that few images show, in words; "" without any."""
     images = Counter[str]()
     for view in views:
         images.update(view["legs"])
-    few = {name: n for name, n in images.items() if n < _OFTEN * of}
-    if not few:
+    rarely_shown = {name: n for name, n in images.items() if n < _OFTEN * n_images}
+    if not rarely_shown:
         return ""
-    legs = ", ".join(f"{name} in {n}" for name, n in few.items())
+    legs = ", ".join(f"{name} in {n}" for name, n in rarely_shown.items())
     return (
-        f"Few of the {of} images show these legs: {legs}. Other parts or a board stand before "
-        "them, or they are outside; take other or more --views, or a smaller board."
+        f"Few of the {n_images} images show these legs: {legs}. Other parts or a board hide them, "
+        "or they are outside; use other or more --views, or a smaller board."
     )
 
 

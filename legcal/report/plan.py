@@ -162,14 +162,14 @@ def camera_distances(plan: Plan) -> dict[str, list[float]]:
 
 def checklist(plan: Plan) -> list[str]:
     """Return the checklist for taking the photographs."""
-    held = plan.hand_held
+    hand_held = plan.hand_held
     first = f"Put the file of the calibrated camera in place of camera_info.yaml: it was planned \
 with {plan.camera.width} x {plan.camera.height} px and a focal length of \
 {plan.camera.K[0, 0]:.0f} px."
     cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
     place = (
         "Take each image from about the position in poses.csv; the whole board must be in it."
-        if held
+        if hand_held
         else f"Set the tripod to {cm:g} cm and {deg:g} deg: measure the distances from the lens, "
         "then turn the camera until the picture looks as its preview."
     )
@@ -305,14 +305,14 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
     ax.margins(0.0)
     room = _ROOM * float(np.ptp(ax.get_xlim()))
     joints_of_base = [f"A{k + 1}" for k in range(len(A))]
-    for n, (name, at) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
-        ax.annotate(name, at, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
+    for n, (name, position) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
+        ax.annotate(name, position, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
     lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
-    for n, (name, at) in enumerate(
+    for n, (name, position) in enumerate(
         _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
     ):
-        ax.annotate(name, at, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
+        ax.annotate(name, position, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
                     textcoords="offset points")  # fmt: skip
     for limits, put in ((ax.get_xlim(), ax.set_xlim), (ax.get_ylim(), ax.set_ylim)):
         put(limits[0] - room, limits[1] + room)
@@ -349,9 +349,9 @@ def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
     for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
         ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
                 linewidth=0.6, linestyle=":")  # fmt: skip
-        at = part * lens[:2] + (1.0 - part) * joint[:2]
+        x, y = (part * lens[:2] + (1.0 - part) * joint[:2]).tolist()
         slope = np.degrees(np.arctan2(lens[1] - joint[1], lens[0] - joint[0]))
-        ax.text(at[0], at[1], f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
+        ax.text(x, y, f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
                 fontsize="x-small", ha="center", va="center", rotation_mode="anchor",
                 rotation=(slope + 90.0) % 180.0 - 90.0,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
@@ -360,8 +360,8 @@ def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
 def _draw_growth(plan: Plan) -> Figure:
     """Return a figure of the expected error over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
-    least = 1 if plan.given else min(_LEAST, plan.n_images)
-    is_known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)
+    min_images = 1 if plan.given else min(_LEAST, plan.n_images)
+    is_known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min_images)
     scale, unit = _scaled(plan, 1.0)
     quantity = "expected error of the platform" if unit == "mm" else "determinant's root"
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
@@ -395,5 +395,5 @@ def _svg(figure: Figure) -> str:
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": "legcal plan"})
-    whole = text.getvalue()
-    return whole[whole.index("<svg") :]
+    svg = text.getvalue()
+    return svg[svg.index("<svg") :]

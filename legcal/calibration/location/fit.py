@@ -125,16 +125,16 @@ def fit_at(
     y, A = _whitened(
         *_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented)
     )  # residuals at errors of the model of zero
-    left = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
+    remaining = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
     _, dof = _variances(pairs, frames, replace(noise, stated=(True, True)), motions)
     s = np.linalg.svd(A, compute_uv=False)
     rank = int(np.sum(s > RANK_TOLERANCE * s[0])) - (A.shape[1] - N_STEP)
     return FrameFit(
         frames=frames,
         noise=noise,
-        whitened=left[: 6 * len(pairs)].reshape(-1, 6),
+        whitened=remaining[: 6 * len(pairs)].reshape(-1, 6),
         design=A,
-        chi2=float(left @ left),
+        chi2=float(remaining @ remaining),
         dof=3 * len(pairs) + 3 * int(pairs.oriented.sum()) - rank,
         kind_dof=dof,
     )
@@ -224,10 +224,10 @@ def _variances(
         y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s[0]]
-        left = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
-        back = np.swapaxes(W, 1, 2)
-        Py = (back @ left[:, :, None])[:, :, 0] * base
-        spread = back @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
+        remaining = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
+        W_T = np.swapaxes(W, 1, 2)
+        Py = (W_T @ remaining[:, :, None])[:, :, 0] * base
+        spread = W_T @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
         diagonal = (W**2).sum(axis=1) * base**2 - (spread**2).sum(axis=2)
         squares = (Py**2).reshape(-1, 2, 3).sum(axis=(0, 2))
         traces = diagonal.reshape(-1, 2, 3).sum(axis=(0, 2))
@@ -293,8 +293,8 @@ def hold_tool(
     for _ in range(_MAX_HOLD_ROUNDS):
         basis = open_at(frames)
         turn = Rotation.from_matrix(frames[1, :, :3]).inv().as_rotvec()
-        away = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
-        slide = basis @ np.linalg.lstsq(basis[6:], away, rcond=None)[0]
+        offset = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
+        slide = basis @ np.linalg.lstsq(basis[6:], offset, rcond=None)[0]
         size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
         frames = frames_after(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
         of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
@@ -352,8 +352,8 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
 def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
     """Return the fit of rows with their estimated scatter, or the stated one if it is larger."""
     result = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
-    least = np.where(noise.stated, noise.factor, 0.0)
-    return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, least)))
+    min_factor = np.where(noise.stated, noise.factor, 0.0)
+    return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, min_factor)))
 
 
 def _probability(
@@ -367,7 +367,7 @@ def _probability(
     covariance = J @ np.linalg.solve(H, np.swapaxes(J, 1, 2))
     covariance[:, range(6), range(6)] += sigma**2
     r = residuals(frame_fit.frames, pairs)
-    least = np.ones(len(pairs))
+    smallest = np.ones(len(pairs))
     for kind, rows in enumerate((slice(0, 3), slice(3, 6))):
         dof = float(frame_fit.kind_dof[kind])
         at_stated = stated[kind] and bool(frame_fit.noise.factor[kind] <= noise.factor[kind])
@@ -377,5 +377,5 @@ def _probability(
         distance = (part * r[:, rows]).sum(axis=1)
         # Not F with infinite degrees of freedom: SciPy has no number for that.
         probability = chdtrc(3, distance) if at_stated else fdtrc(3, dof, distance / 3.0)
-        least = np.minimum(least, np.where(pairs.oriented | (kind == 0), probability, 1.0))
-    return np.minimum(1.0, 2.0 * least)
+        smallest = np.minimum(smallest, np.where(pairs.oriented | (kind == 0), probability, 1.0))
+    return np.minimum(1.0, 2.0 * smallest)

@@ -92,8 +92,8 @@ def residuals(frames: Array, pairs: PosePairs) -> Array:
     Both are along world axes; a rotation that was not measured counts as zero.
     """
     M, p = predicted(frames, pairs)
-    away = pairs.M @ np.swapaxes(M, -1, -2)
-    turn = Rotation.from_matrix(away.reshape(-1, 3, 3)).as_rotvec().reshape(p.shape)
+    rotation = pairs.M @ np.swapaxes(M, -1, -2)
+    turn = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(p.shape)
     turn[..., ~pairs.oriented, :] = 0.0
     return np.concatenate([pairs.p - p, turn], axis=-1)
 

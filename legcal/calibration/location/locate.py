@@ -134,14 +134,14 @@ def _check_numbers(
 ) -> None:
     """Refuse implausible options."""
     most_sigma, most_tool = _MAX_SIGMA * size, _MAX_TOOL * size
-    for name, value, least, most, unit in (
+    for name, value, lower, upper, unit in (
         ("position sigma", position_sigma, MIN_SIGMA, most_sigma, "m"),
         ("angle sigma", angle_sigma, MIN_SIGMA, MAX_ANGLE_SIGMA, "rad"),
     ):
-        if value is not None and not least <= value <= most:
+        if value is not None and not lower <= value <= upper:
             raise UsageError(
-                f"The {name} could not be used: found {value:g} {unit}, needed {least:g} to "
-                f"{most:.3g} {unit}; correct it."
+                f"The {name} could not be used: found {value:g} {unit}, needed {lower:g} to "
+                f"{upper:.3g} {unit}; correct it."
             )
     if tool_position is not None and not (
         len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= most_tool))
@@ -194,15 +194,15 @@ def _check_outliers(
 ) -> None:
     """Refuse a table with too many outliers."""
     n, n_out = len(measurements.pairs), int(np.sum(~inliers.is_inlier))
-    most = max(1, n // _MAX_OUTLIERS)
-    if n_out <= most:
+    max_outliers = max(1, n // _MAX_OUTLIERS)
+    if n_out <= max_outliers:
         return
     _refuse_mistakes(measurements, candidates, name)
     rows = ", ".join(str(i) for i in measurements.poses.numbers[~inliers.is_inlier])
     raise DatasetError(
         f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
-        f"the others ({rows}), needed at most {most}; check that readings and poses of these rows "
-        "belong together."
+        f"the others ({rows}), needed at most {max_outliers}; check that readings and poses of "
+        "these rows belong together."
     )
 
 

@@ -222,15 +222,17 @@ def likely_mistake(
     fewest: int,  # rows that determine the frames
 ) -> tuple[str, str] | None:
     """Return a description of the likeliest mistake and its remedy, or None."""
-    best, likely = cost / _spread(pairs) / _BETTER**2, None
-    few = pairs.of(np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp))
-    for changed, looks_like, remedy in _alternatives(few):
+    best, mistake = cost / _spread(pairs) / _BETTER**2, None
+    selected = pairs.of(
+        np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp)
+    )
+    for changed, looks_like, remedy in _alternatives(selected):
         other = float(search(changed, fewest, subsets=_MISTAKE_SUBSETS).cost[0]) / _spread(changed)
         if other < best:
-            best, likely = other / _BETTER**2, (looks_like, remedy)
+            best, mistake = other / _BETTER**2, (looks_like, remedy)
             if other < _CLEAR**2:
                 break
-    return likely
+    return mistake
 
 
 def _spread(pairs: PosePairs) -> float:

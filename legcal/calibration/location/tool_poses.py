@@ -133,11 +133,13 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
             )
         table.need(["angle_sigma"], oriented)
     joints = [column.name for column in reading_columns(machine.legs)]
-    same = table.numbers([*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)])
+    numbers = table.numbers(
+        [*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)]
+    )
     table.once(
         [
             tuple(row) if np.all(np.isfinite(row[: len(joints) + 3])) else None
-            for row in np.where(np.isnan(same), math.inf, same).tolist()
+            for row in np.where(np.isnan(numbers), math.inf, numbers).tolist()
         ],
         "the same readings and the same pose",
     )  # one measurement would count as two
@@ -351,11 +353,11 @@ def _noise(
     """Return the stated standard deviations, and a start for the others."""
     sigma = np.ones((len(poses), 2))
     factor, stated = np.array([_FIRST_FACTOR * length, _FIRST_FACTOR]), [False, False]
-    given = (
+    sources = (
         ("position", poses.position_sigma, position_sigma),
         ("angle", poses.angle_sigma, angle_sigma),
     )
-    for kind, (name_of_kind, column, number) in enumerate(given):
+    for kind, (name_of_kind, column, number) in enumerate(sources):
         if column is not None and number is not None:
             raise UsageError(
                 f"{name}: the {name_of_kind} sigma could not be used: found it in the column "
@@ -420,8 +422,8 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
     R, t = _joint_frames(machine, poses)
     by_parameters = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, R, t)
     values, vectors = np.linalg.eigh(result.covariance)
-    kept = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
-    root = vectors[:, kept] * np.sqrt(values[kept])
+    significant = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
+    root = vectors[:, significant] * np.sqrt(values[significant])
     columns = [parametrization.names.index(name) for name in result.names]
     return _of_link(machine, poses, by_parameters[:, :, columns] @ root)
 

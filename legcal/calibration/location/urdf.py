@@ -152,7 +152,7 @@ def check_same(before: Machine, after: Machine) -> None:
 
     Raises ModelError if its analysis differs by more than rounding.
     """
-    same = (
+    is_same = (
         before.leg_names == after.leg_names
         and before.motors == after.motors
         and before.mobility == after.mobility
@@ -167,7 +167,7 @@ def check_same(before: Machine, after: Machine) -> None:
             )
         )
     )
-    if not same:
+    if not is_same:
         raise ModelError(
             f"{before.urdf_path}: the frames could not be written: found another machine after "
             "it, needed the same one; give other names (--world-link, --tool-link)."

@@ -149,7 +149,7 @@ def _crop(
         ),
         ("predicted", _points(_curve(solution.cameras[v], fit, outlines.ends[i]) - origin)),
     ]
-    off, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
+    offset, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
     name = dataset.machine.leg_names[j]
     rejected = "" if outlines.used[i] else f"; rejected: {outlines.reason[i]}"
     height, width = piece.grey.shape
@@ -159,7 +159,7 @@ def _crop(
         width=width,
         height=height,
         lines=lines,
-        caption=f"{name}, edge {outlines.edge[i]}: {off[0]:+.3f} and {off[1]:+.3f} px",
+        caption=f"{name}, edge {outlines.edge[i]}: {offset[0]:+.3f} and {offset[1]:+.3f} px",
         detail=f"{sigmas:.1f} sigma, {row_names(measurements)[row]}{rejected}",
         link=overlays.get(row, ""),
     )

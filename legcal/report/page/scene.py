@@ -82,7 +82,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         cameras,
         _words([plain(name) for name in machine.leg_names], calibrated.A[0], "#1d2126"),
     ]
-    seen = np.array([[v for v in cameras[a] if v is not None] for a in "xyz"]).T
+    camera_points = np.array([[v for v in cameras[a] if v is not None] for a in "xyz"]).T
     solid = np.concatenate([*calibrated.A, *calibrated.B, *_standing(calibrated, rim)])
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
@@ -92,7 +92,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
-    return Plot("machine-scene", traces, _layout(solid, seen, size), 560, caption, extra)
+    return Plot("machine-scene", traces, _layout(solid, camera_points, size), 560, caption, extra)
 
 
 def _modes(
@@ -149,9 +149,9 @@ def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
     middle = 0.5 * (machine.min(axis=0) + machine.max(axis=0))
     centre = (middle - 0.5 * (low + high)) / size  # scenes measure from the middle of the ranges
 
-    off = (cameras - middle) / size
-    towards = off @ (_EYE / np.linalg.norm(_EYE))
-    aside = np.sqrt(np.maximum(np.sum(off**2, axis=1) - towards**2, 0.0))
+    offsets = (cameras - middle) / size
+    towards = offsets @ (_EYE / np.linalg.norm(_EYE))
+    aside = np.sqrt(np.maximum(np.sum(offsets**2, axis=1) - towards**2, 0.0))
     needed = (towards + aside / _SLOPE).max(initial=0.0) / np.linalg.norm(_EYE)
     eye = centre + float(np.clip(needed, 1.0, _FURTHER)) * _EYE
 
@@ -237,11 +237,11 @@ def _words(words: Sequence[str], at: Array, colour: str) -> dict[str, Any]:
 def _cameras(calibration: Calibration, depth: float) -> dict[str, Any]:
     """Return the cameras of used views as pyramids of their field of view."""
     solution, views = calibration.solution, calibration.dataset.measurements.views
-    frame, shown = calibration.dataset.machine.T_base_Rb, calibration.result.views
+    frame, used_views = calibration.dataset.machine.T_base_Rb, calibration.result.views
     x: list[Any] = []
     names: list[str] = []
     for v, view in enumerate(views):
-        if view.name not in shown or len(names) >= MAX_CAMERAS * 13:
+        if view.name not in used_views or len(names) >= MAX_CAMERAS * 13:
             continue
         camera = solution.cameras[v]
         points = pyramid(camera, frame * solution.T_camera_Rb[v].inv(), depth)

@@ -33,21 +33,23 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
     blocks: list[Any] = [Text([_at_the_platform(before, after), _ORIGIN])]
     for unit_of_chart in ("m", "rad"):
         # Coordinates that the frame makes zero are not parameters.
-        kept = [
+        indices = [
             i
             for i, name in enumerate(after.names)
             if after.units[i] == unit_of_chart and name in sigma
         ]
-        if not kept:
+        if not indices:
             continue
         scale, unit, _ = UNITS[unit_of_chart]
-        off, left = (
-            (scale * np.abs(evaluation.values - evaluation.references))[kept].tolist()
+        before_errors, after_errors = (
+            (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
             for evaluation in (before, after)
         )
-        names = [after.names[i] for i in kept]
+        names = [after.names[i] for i in indices]
         scaled = [None if sigma[n] is None else scale * float(sigma[n] or 0.0) for n in names]
-        blocks.append(Drawing(error_bars(names, off, left, scaled, unit), _CAPTION))
+        blocks.append(
+            Drawing(error_bars(names, before_errors, after_errors, scaled, unit), _CAPTION)
+        )
     return blocks
 
 
