@@ -211,11 +211,11 @@ class _Checklist:
     encoders: list[EncoderUse] = field(default_factory=list)
     diagnosis: tuple[Diagnosis, ...] = ()
 
-    def add(self, check: str, severity: Severity, what: str, rows: Sequence[int] = ()) -> None:
+    def add(self, check: str, severity: Severity, message: str, rows: Sequence[int] = ()) -> None:
         """Add a finding; rows are in the order of the dataset's files."""
         names = row_names(self.dataset.measurements)
         images = tuple(names[row] for row in rows)
-        self.findings.append(Finding(check=check, severity=severity, what=what, images=images))
+        self.findings.append(Finding(check=check, severity=severity, what=message, images=images))
 
     def state(self, check: str) -> Severity | Literal["ok"]:
         """Return the severity of the worst finding of a check."""

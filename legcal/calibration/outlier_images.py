@@ -112,7 +112,7 @@ class _Image:
     row: int
 
     @property
-    def given(self) -> Array:
+    def given_readings(self) -> Array:
         """The readings of its row, (n_legs,) [m or rad]."""
         return np.asarray(self.measurements.q[self.row])
 
@@ -126,7 +126,9 @@ class _Image:
         """A and B of the fit, (n_legs, 3), in R_b and R_e [m]."""
         legs, on = self.solution.legs, actuator_index(self.solution.legs)
         read = [on.index(a) for a in range(max(on) + 1)]
-        return joints_at(legs, self.given[None, read])[0], np.array([leg.B for leg in legs])
+        return joints_at(legs, self.given_readings[None, read])[0], np.array(
+            [leg.B for leg in legs]
+        )
 
     @cached_property
     def _length_laws(self) -> tuple[Array, Array]:
@@ -138,9 +140,12 @@ class _Image:
         reference, slope = np.zeros(len(B)), np.ones(len(B))
         for j, leg in enumerate(self.solution.legs):
             if leg.actuator is not None:
-                by_q = leg.actuator.motion(leg.A, self.given[j : j + 1]).by_q[0]
+                by_q = leg.actuator.motion(leg.A, self.given_readings[j : j + 1]).by_q[0]
                 AB = self.fitted_pose.apply(leg.B) - A[j]
-                reference[j], slope[j] = self.given[j], float(by_q @ AB) / float(np.linalg.norm(AB))
+                reference[j], slope[j] = (
+                    self.given_readings[j],
+                    float(by_q @ AB) / float(np.linalg.norm(AB)),
+                )
         return reference, slope
 
     def readings_at(self, pose: Frames) -> tuple[Array, Array]:
@@ -179,13 +184,15 @@ class _Image:
         n, m = len(chosen), len(readings_used)
         if n + m < MIN_OUTLINES or (not readings_used and len(np.unique(o.leg[chosen])) < MIN_LEGS):
             return None
-        noise = np.maximum(self._by(READING_NOISE), self.measurements.sigma_of(self.machine.legs))
+        noise = np.maximum(
+            self._readings_for(READING_NOISE), self.measurements.sigma_of(self.machine.legs)
+        )
         white = 1.0 / noise[readings_used]
         least_noise = MIN_NOISE * self.machine.size
 
         def differences(state: _State) -> Residuals:
             q, J = self.readings_at(state.pose)
-            r = q[readings_used] - self.given[readings_used]
+            r = q[readings_used] - self.given_readings[readings_used]
             return Residuals.of((white * r)[:, None], white[:, None, None] * J[readings_used, None])
 
         zero = np.zeros(max(n, m), dtype=np.intp)
@@ -241,14 +248,14 @@ class _Image:
             return None
         estimate = estimates[best]
         value, sigma = float(estimate.readings[best]), float(estimate.sigma[best])
-        error, min_error = np.abs(estimate.readings - self.given), self._least
+        error, min_error = np.abs(estimate.readings - self.given_readings), self._min_errors
         if np.any((error > min_error)[[other for other in motors if other != best]]):
             return None  # it is not the only one
         noise = self.machine.legs[best].reading_of(estimate.noise)
         if error[best] < max(SIGNIFICANT_SIGMAS * max(sigma, noise), float(min_error[best])):
             return None
         in_travel = self._is_in_travel(best, value, sigma)
-        return self._one_wrong(best, value, sigma) if in_travel else None
+        return self._wrong_reading_cause(best, value, sigma) if in_travel else None
 
     def explanation(self, chosen: IntArray) -> Cause | None:
         """Return the probable cause by the outlines alone, with the remedy.
@@ -265,14 +272,14 @@ class _Image:
         readings, sigma, given = (
             estimate.readings[motors],
             estimate.sigma[motors],
-            self.given[motors],
+            self.given_readings[motors],
         )
-        min_error = np.maximum(SIGNIFICANT_SIGMAS * sigma, self._least[motors])
+        min_error = np.maximum(SIGNIFICANT_SIGMAS * sigma, self._min_errors[motors])
         differing = np.flatnonzero(np.abs(readings - given) > min_error)
         if len(differing) == 0:
             return None
         distance = np.abs(m.q[:, motors] - readings)
-        tolerance = np.maximum(min_error, self._by(SAME_READING)[motors])
+        tolerance = np.maximum(min_error, self._readings_for(SAME_READING)[motors])
         matching = [
             other
             for other in range(m.n_rows)
@@ -293,7 +300,7 @@ class _Image:
             )
         if len(differing) == 1:
             k = int(differing[0])
-            return self._one_wrong(motors[k], readings[k], sigma[k])
+            return self._wrong_reading_cause(motors[k], readings[k], sigma[k])
         legs = [self.machine.legs[motors[k]] for k in differing]
         travel = np.transpose([leg.travel for leg in legs])
         possible = np.abs(np.clip(readings[differing], *travel) - given[differing])
@@ -307,8 +314,8 @@ class _Image:
             (few([str(leg.prismatic) for leg in legs]), *worst.values()),
         )
 
-    def _one_wrong(self, leg: int, predicted: float, sigma: float) -> Cause:
-        joint, given = self.machine.legs[leg].prismatic, float(self.given[leg])
+    def _wrong_reading_cause(self, leg: int, predicted: float, sigma: float) -> Cause:
+        joint, given = self.machine.legs[leg].prismatic, float(self.given_readings[leg])
         size, unit = SHOWN_IN[self.machine.legs[leg].reading_unit]
         return Cause(
             f"it shows a reading of {{}} of {{:.2f}} +- {{:.2f}} {unit}, given {{:.2f}} {unit}; "
@@ -316,16 +323,16 @@ class _Image:
             (str(joint), size * predicted, size * sigma, size * given),
         )
 
-    def _by(self, distance: float) -> Array:
+    def _readings_for(self, distance: float) -> Array:
         """Return readings (n_legs,) [m or rad] for a displacement, relative to the leg length."""
         size = self.machine.size
         return np.array([leg.reading_of(distance * size) for leg in self.machine.legs])
 
     @property
-    def _least(self) -> Array:
+    def _min_errors(self) -> Array:
         """Smallest reported errors of readings, (n_legs,) [m or rad]."""
         sigma = self.measurements.sigma_of(self.machine.legs)
-        return np.maximum(self._by(MIN_READING_ERROR), SIGNIFICANT_SIGMAS * sigma)
+        return np.maximum(self._readings_for(MIN_READING_ERROR), SIGNIFICANT_SIGMAS * sigma)
 
     def _is_in_travel(self, leg: int, reading: float, sigma: float) -> bool:
         """Return whether a reading is within the travel, with tolerances."""

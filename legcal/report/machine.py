@@ -69,9 +69,9 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         (
             leg["name"],
             _span(leg["travel"]),
-            _span([_at(leg, q) for q in leg["travel"] or ()]),
+            _span([_length_at(leg, q) for q in leg["travel"] or ()]),
             "" if leg["travel"] is None else f"{1e3 * leg['q_home']:z.2f}",
-            f"{1e3 * _at(leg, leg['q_home']):.2f}",
+            f"{1e3 * _length_at(leg, leg['q_home']):.2f}",
         )
         for leg in legs
         if "actuator" not in leg
@@ -162,7 +162,7 @@ def _radii(leg: dict[str, Any]) -> str:
     return ", ".join(dict.fromkeys(f"{radius:g}" for radius in rounded))
 
 
-def _at(leg: dict[str, Any], q: float) -> float:
+def _length_at(leg: dict[str, Any], q: float) -> float:
     """Return the length of a leg at a reading [m]."""
     return float(leg["q0"] if leg["kind"] == "constant" else leg["sign"] * q + leg["q0"])
 

@@ -110,7 +110,7 @@ def _cut(outline: int, image: Image, ends: Array) -> _Piece:
 
 
 def _picture(piece: _Piece, scale: float, quality: int) -> str:
-    """Return a crop as a data URL."""
+    """Encode a crop as a data URL."""
     grey = np.clip(np.rint(piece.grey), 0, 255).astype(np.uint8)
     factor = scale * min(1.0, _SIDE / max(grey.shape))
     if factor < 1.0:
