@@ -289,12 +289,12 @@ def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 class _Encoders:
     """The encoders of a session with their readings and names."""
 
-    hypothesis: Assumed
+    given: Assumed
 
     @cached_property
     def legs(self) -> list[Leg]:
         """The leg of each encoder, or the first of several legs."""
-        return [self.hypothesis.machine.legs[j] for j in self.hypothesis.machine.motors]
+        return [self.given.machine.legs[j] for j in self.given.machine.motors]
 
     @property
     def names(self) -> list[str]:
@@ -309,7 +309,7 @@ class _Encoders:
     @cached_property
     def q(self) -> Array:
         """Readings (n_rows, n_encoders) [m or rad]."""
-        return self.hypothesis.q[:, list(self.hypothesis.machine.motors)]
+        return self.given.q[:, list(self.given.machine.motors)]
 
     @property
     def move_legs_alone(self) -> bool:
@@ -340,9 +340,9 @@ class _Encoders:
 
     def reading(self, q: Array, encoders: Sequence[int]) -> Assumed:
         """Return the hypothesis with other readings (n_rows, n) of some encoders."""
-        motors, changed = self.hypothesis.machine.motors, self.hypothesis.q.copy()
+        motors, changed = self.given.machine.motors, self.given.q.copy()
         changed[:, [motors[k] for k in encoders]] = q
-        return replace(self.hypothesis, q=changed)
+        return replace(self.given, q=changed)
 
 
 def _unit_mistakes(encoders: _Encoders) -> Iterator[Mistake]:
