@@ -85,10 +85,10 @@ class GaussianPrior:
         return over_sigma if self.whitening is None else self.whitening @ over_sigma
 
     def __add__(self, other: GaussianPrior) -> GaussianPrior:
-        both, whitening = (self, other), None
+        priors, whitening = (self, other), None
         if self.whitening is not None or other.whitening is not None:
             whitening = block_diag(
-                *(np.eye(len(p.mean)) if p.whitening is None else p.whitening for p in both)
+                *(np.eye(len(p.mean)) if p.whitening is None else p.whitening for p in priors)
             )
         return GaussianPrior(
             np.concatenate([self.unknown, other.unknown]),

@@ -58,11 +58,11 @@ class _Model:
     """A machine, as the table needs it: poses from coordinates, readings from poses and back."""
 
     machine: Machine
-    own: IntArray  # which of COORDINATES are the machine's own
+    columns: IntArray  # independent coordinates, as indices into COORDINATES
 
     def poses(self, coordinates: Array, near: Array) -> tuple[Array, BoolArray]:
         """Return poses (k, 3, 4) with these coordinates (k, m), and where there is one."""
-        return poses_at_coordinates(self.machine, self.own, coordinates, near)
+        return poses_at_coordinates(self.machine, self.columns, coordinates, near)
 
     def readings(self, poses: Array) -> Array:
         """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
@@ -81,14 +81,14 @@ class _Model:
         """Return the poses (k, 3, 4) near others at readings, and where there is one."""
         machine, scale = self.machine, self.machine.size
         motors = list(machine.motors)
-        found = solve(
+        solution = solve(
             equations_of_readings(machine, q[:, motors]),
             poses_after,
             near,
             tolerance=1e-14 * scale,
             unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
         )
-        return found.points, found.worst <= REACHED * scale
+        return solution.points, solution.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
@@ -97,21 +97,21 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     if nominal is None:
         raise ValueError("a model without a result has no correction")
     calibrated = subject.machine
-    own = own_coordinates(calibrated)
-    n_nodes = _number_of_nodes(options.nodes, len(own))
-    models = _Model(calibrated, own), _Model(nominal, own)
+    columns = own_coordinates(calibrated)
+    n_nodes = _number_of_nodes(options.nodes, len(columns))
+    models = _Model(calibrated, columns), _Model(nominal, columns)
     ticks, nodes, corrected = _grid(models, n_nodes)
-    shape = (n_nodes,) * len(own)
-    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(own)))
+    shape = (n_nodes,) * len(columns)
+    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(columns)))
     figures = {
-        "coordinates": [COORDINATES[k] for k in own],
+        "coordinates": [COORDINATES[k] for k in columns],
         "nodes": len(nodes),
         "residual": _figures(left),
         "uncorrected": _figures(raw),
         "tested": len(left),
     }
     sentences = _sentences(figures)
-    names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in own]
+    names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in columns]
     lines = [
         f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
         "# Command the columns corrected_* to a controller with the nominal model: the calibrated",
@@ -120,7 +120,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
         *(f"# {sentence}" for sentence in sentences),
         ",".join([*names, *(f"corrected_{name}" for name in names)]),
     ]
-    scale = TO_FILE[own]
+    scale = TO_FILE[columns]
     rows = np.concatenate([nodes * scale, corrected * scale], axis=1)
     lines += [",".join(f"{x:.9f}" for x in row) for row in rows.tolist()]
     content = ("\n".join(lines) + "\n").encode()
@@ -145,10 +145,10 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
     It stands about the middle of the workspace and has its proportions.
     """
     calibrated, _ = models
-    machine, own = calibrated.machine, calibrated.own
-    centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, own]
-    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, own]
-    there = centre + turned_back(there - centre, own)
+    machine, columns = calibrated.machine, calibrated.columns
+    centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, columns]
+    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, columns]
+    there = centre + turned_back(there - centre, columns)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
     for part in SHRINKING ** np.arange(ATTEMPTS):
         for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: they leave it first
@@ -175,9 +175,9 @@ def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, B
     if not reached.all():
         return commands, reached
     moved, there = nominal.forward(q, X)
-    own = calibrated.own
-    found = coordinates_of(moved)[0][:, own]
-    return commands + turned_back(found - commands, own), reached & there
+    columns = calibrated.columns
+    reached_coordinates = coordinates_of(moved)[0][:, columns]
+    return commands + turned_back(reached_coordinates - commands, columns), reached & there
 
 
 def _residuals(
@@ -194,12 +194,12 @@ def _residuals(
     corners = [corrected[tuple((cells + corner).T)] for corner in product((0, 1), repeat=m)]
     home = calibrated.machine.home.as_matrix()[:3]
     X, _ = calibrated.poses(commands, home)
-    found = []
+    residuals = []
     for asked in (np.mean(corners, axis=0), commands):
         asked_poses, _ = nominal.poses(asked, home)
         reached, _ = calibrated.forward(nominal.readings(asked_poses), X)
-        found.append(_apart(calibrated.machine, reached, X))
-    return found[0], found[1]
+        residuals.append(_apart(calibrated.machine, reached, X))
+    return residuals[0], residuals[1]
 
 
 def _apart(machine: Machine, poses: Array, references: Array) -> Array:
@@ -228,19 +228,19 @@ def _figures(apart: Array) -> dict[str, float]:
 
 def _sentences(figures: dict[str, object]) -> list[str]:
     """Return what the table leaves, in words."""
-    found = []
-    for key, what in (
+    sentences = []
+    for key, label in (
         ("residual", "Between nodes the interpolated table leaves"),
         ("uncorrected", "Without it the platform is off by"),
     ):
         f = figures[key]
         if isinstance(f, dict):
-            found.append(
-                f"{what} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
+            sentences.append(
+                f"{label} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
                 f"rms, {1e3 * f['max_dX_m']:.3g} mm and {np.degrees(f['max_dE_rad']):.3g} deg "
                 f"at most (middles of {figures['tested']} cells)."
             )
-    return found
+    return sentences
 
 
 def _no_grid(machine: Machine) -> str:

@@ -170,7 +170,9 @@ def _check_options(to: str, format: Format, given: ExportOptions) -> None:
     nothing = ExportOptions()
     for name in vars(nothing):
         if getattr(given, name) != getattr(nothing, name) and name not in format.options:
-            takes = [other for other, one in FORMATS.items() if name in one.options]
+            takes = [
+                other for other, other_format in FORMATS.items() if name in other_format.options
+            ]
             raise UsageError(
                 f"--{name} could not be used: found it with --to {to}, needed "
                 f"{' or '.join(takes)}; leave it out."
@@ -183,8 +185,8 @@ def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
     if subject.result is not None:
         sources.append(subject.result.folder / RESULT_NAME)
     for place in places:
-        there = [one for one in sources if os.path.exists(one) and os.path.exists(place)]
-        if any(os.path.samefile(one, place) for one in there):
+        there = [source for source in sources if os.path.exists(source) and os.path.exists(place)]
+        if any(os.path.samefile(source, place) for source in there):
             raise UsageError(
                 f"{place}: the export could not be written: found a file of {subject.given}, which "
                 "is exported, needed another one; give another path."

@@ -23,28 +23,28 @@ _RESERVED = frozenset(
 
 def identifier(name: str) -> str:
     """Return a name as an identifier of ASCII letters, digits and underscores."""
-    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:MAX_IDENTIFIER].lower()
-    if not found or found[0].isdigit() or found in _RESERVED:
-        found = f"m_{found}".rstrip("_")
-    return found
+    text = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:MAX_IDENTIFIER].lower()
+    if not text or text[0].isdigit() or text in _RESERVED:
+        text = f"m_{text}".rstrip("_")
+    return text
 
 
 def is_identifier(name: str) -> bool:
-    """Say whether a name is an identifier in all of the languages."""
+    """Return whether a name is an identifier in all of the languages."""
     return re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", name) is not None and name not in _RESERVED
 
 
 def identifiers(names: Iterable[str]) -> list[str]:
     """Return names as identifiers that differ from each other."""
-    found: list[str] = []
+    unique_names: list[str] = []
     for name in names:
         plain, number = identifier(name), 1
         unique = plain
-        while unique in found:
+        while unique in unique_names:
             number += 1
             unique = f"{plain}_{number}"
-        found.append(unique)
-    return found
+        unique_names.append(unique)
+    return unique_names
 
 
 def c_string(text: str) -> str:

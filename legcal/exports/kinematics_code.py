@@ -109,7 +109,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
     scale = machine.size
     first = sorted(set(machine.reads))  # the leg of each reading
     home_readings = inverse_kinematics(machine, machine.home)[first]
-    own = own_coordinates(machine)
+    columns = own_coordinates(machine)
     return {
         "version": __version__,
         "base": machine.base,
@@ -117,7 +117,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
         "legs": [
             {
                 "name": leg.name,
-                "identifier": known,
+                "identifier": identifier,
                 "type": leg.type,
                 "A": leg.A,
                 "B": leg.B,
@@ -128,7 +128,9 @@ def _numbers(machine: Machine) -> dict[str, Any]:
                 "reading": first.index(machine.reads[j]),
                 "hangs_on": on[j],
             }
-            for j, (leg, known) in enumerate(zip(legs, identifiers(machine.leg_names), strict=True))
+            for j, (leg, identifier) in enumerate(
+                zip(legs, identifiers(machine.leg_names), strict=True)
+            )
         ],
         "readings": [
             {
@@ -146,7 +148,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
         ],
         "coordinates": [
             {"name": COORDINATES[k], "number": int(k), "step": MAX_STEP * (scale if k < 3 else 1.0)}
-            for k in own
+            for k in columns
         ],
         "across": [row for j, leg in enumerate(legs) for row in _across(j, leg)],
         "twists": [row for j, leg in enumerate(legs) for row in _twists(j, leg)],
@@ -181,17 +183,17 @@ def _carrier(j: int, mode: int, actuator: Actuator, at_home: float) -> dict[str,
 
 def _across(j: int, leg: Leg) -> list[dict[str, Any]]:
     """Return the directions that stay across a leg, in base or platform."""
-    found = []
+    directions = []
     for kind in leg.equations:
         if kind is EquationKind.BASE_AXIS:
-            found.append({"leg": j, "in_platform": 0, "direction": leg.base_axis})
+            directions.append({"leg": j, "in_platform": 0, "direction": leg.base_axis})
         elif kind is EquationKind.PLATFORM_AXIS:
-            found.append({"leg": j, "in_platform": 1, "direction": leg.platform_axis})
+            directions.append({"leg": j, "in_platform": 1, "direction": leg.platform_axis})
         elif kind in _ALONG_PLATFORM and leg.platform_axis is not None:
             basis = normal_basis(leg.platform_axis)
             direction: Array = basis[_ALONG_PLATFORM.index(kind)]
-            found.append({"leg": j, "in_platform": 1, "direction": direction})
-    return found
+            directions.append({"leg": j, "in_platform": 1, "direction": direction})
+    return directions
 
 
 def _twists(j: int, leg: Leg) -> list[dict[str, Any]]:

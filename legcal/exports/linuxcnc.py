@@ -35,7 +35,7 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
             f"; {delta} has the dimensions of an ideal Delta and no others: leave the controller "
             "those of the nominal model and take the correction"
         )
-        upright = all(abs(one.axis @ motor.axis) > _PARALLEL for one in machine.actuators)
+        upright = all(abs(actuator.axis @ motor.axis) > _PARALLEL for actuator in machine.actuators)
         is_delta = machine.mobility == len(machine.actuators) == 3 and len(legs) == N_STRUTS
         is_delta &= motor.turns or upright
         return f"found that the motor '{motor.joint}' moves joints at A, {needed}{ideal * is_delta}"
@@ -61,10 +61,10 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
         "# Load it after the module: loadrt genhexkins, or [KINS] KINEMATICS = genhexkins.",
         "",
     ]
-    for what, points in (("base", machine.A_base), ("platform", machine.B_platform)):
+    for side, points in (("base", machine.A_base), ("platform", machine.B_platform)):
         for j, point in enumerate(points):
             lines += [
-                f"setp genhexkins.{what}.{j}.{axis} {float(_MM * x)!r}"
+                f"setp genhexkins.{side}.{j}.{axis} {float(_MM * x)!r}"
                 for axis, x in zip("xyz", point, strict=True)
             ]
         lines.append("")

@@ -204,7 +204,7 @@ def _text(*numbers: float) -> str:
 
 def _unused(name: str, taken: set[str]) -> str:
     """Return a name that is not taken."""
-    found = name
-    while found in taken:
-        found += "_"
-    return found
+    unused = name
+    while unused in taken:
+        unused += "_"
+    return unused

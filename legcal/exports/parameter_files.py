@@ -81,7 +81,7 @@ def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
 
 def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return legs in links and in R_b and R_e, and the parameters with their covariance."""
-    machine, known = subject.machine, _joints(subject)
+    machine, joints = subject.machine, _joints(subject)
     document: dict[str, Any] = {
         "legcal_export": 1,
         "legcal": __version__,
@@ -94,7 +94,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         "T_platform_Re": _millimetres(machine.T_platform_Re.as_matrix()),
         "home": _millimetres(machine.home.as_matrix()),
         "legs": [
-            _leg(name, in_links, in_frames, known)
+            _leg(name, in_links, in_frames, joints)
             for name, in_links, in_frames in zip(
                 machine.leg_names, machine.legs_of_frames, geometries(machine), strict=True
             )
@@ -107,7 +107,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         unit = {row.name: row.unit for row in result.parameters}
         names = result.kinematic.names
         units = [UNITS.get(unit.get(name, "m"), (1.0, "")) for name in names]
-        scale = np.array([one for one, _ in units])
+        scale = np.array([factor for factor, _ in units])
         covariance = np.array(result.kinematic.covariance) * np.outer(scale, scale)
         document["covariance"] = {
             "names": names,
@@ -125,10 +125,10 @@ def rows_of(subject: Subject) -> list[Row]:
 def _joint_rows(subject: Subject) -> Iterator[Row]:
     """Give joint centres and axes in their links."""
     machine, nominal = subject.machine, subject.nominal
-    known = _joints(subject)
+    joints = _joints(subject)
     for side, link in (("base", machine.base), ("platform", machine.platform)):
         for j, leg in enumerate(machine.legs_of_frames):
-            joint = known.get((side, leg.name))
+            joint = joints.get((side, leg.name))
             point, axis = _end(leg, side)
             before, turned = None, None
             if nominal is not None:
@@ -158,14 +158,18 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
 
 def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
     """Give directions and axes of what moves joints at A, in the base link."""
-    before = {} if nominal is None else {one.joint: one for one in nominal.actuators}
+    before = (
+        {}
+        if nominal is None
+        else {nominal_actuator.joint: nominal_actuator for nominal_actuator in nominal.actuators}
+    )
     status = _MODEL if nominal is None else "derived"
     for actuator in machine.actuators:
         other = before.get(actuator.joint)
-        what = "axis" if actuator.turns else "direction"
+        vector = "axis" if actuator.turns else "direction"
         for k, letter in enumerate("xyz"):
             was = None if other is None else float(other.axis[k])
-            name = f"{actuator.joint}.{what}.{letter}"
+            name = f"{actuator.joint}.{vector}.{letter}"
             yield Row(name, machine.base, "", float(actuator.axis[k]), was, None, status)
         for k, letter in enumerate("xyz" * actuator.turns):
             was = None if other is None else 1e3 * float(other.point[k])
@@ -203,8 +207,8 @@ def _parameter_rows(subject: Subject) -> Iterator[Row]:
                 of = f"{name}.{side}.{axis}"
                 yield Row(of, _frame_of(of), "mm", 1e3 * float(x), None, None, _MODEL)
         if leg.kind is not LegKind.PASSIVE:
-            what = "length" if leg.kind is LegKind.CONSTANT else "offset"
-            yield Row(f"{name}.{what}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
+            quantity = "length" if leg.kind is LegKind.CONSTANT else "offset"
+            yield Row(f"{name}.{quantity}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
         if leg.twist is not None:
             degrees = float(np.degrees(leg.twist))
             yield Row(f"{name}.twist", "", "deg", degrees, None, None, _MODEL)
@@ -217,7 +221,7 @@ def _frame_of(name: str) -> str:
 
 
 def _leg(
-    name: str, in_links: Leg, in_frames: Leg, known: Mapping[tuple[str, str], JointInLink]
+    name: str, in_links: Leg, in_frames: Leg, joints: Mapping[tuple[str, str], JointInLink]
 ) -> dict[str, Any]:
     """Return a leg of the document."""
     actuator = in_links.actuator
@@ -233,12 +237,12 @@ def _leg(
         "A": {
             "link": _point(in_links.A),
             "R_b": _point(in_frames.A),
-            **_uncertainty(known.get(("base", name))),
+            **_uncertainty(joints.get(("base", name))),
         },
         "B": {
             "link": _point(in_links.B),
             "R_e": _point(in_frames.B),
-            **_uncertainty(known.get(("platform", name))),
+            **_uncertainty(joints.get(("platform", name))),
         },
         "base_axis": _axes(in_links.base_axis, in_frames.base_axis, "R_b"),
         "platform_axis": _axes(in_links.platform_axis, in_frames.platform_axis, "R_e"),
@@ -250,18 +254,18 @@ def _leg(
 def _actuators(machine: Machine) -> dict[str, Any]:
     """Return what moves joints at A, by joint, in the base link and in R_b."""
     in_frames = {actuator.joint: actuator for actuator in actuators_of(geometries(machine))}
-    found = {}
+    actuators = {}
     for actuator in machine.actuators:
         there = in_frames[actuator.joint]
-        what = "axis" if actuator.turns else "direction"
-        found[actuator.joint] = {
+        vector = "axis" if actuator.turns else "direction"
+        actuators[actuator.joint] = {
             "kind": actuator.kind.value,
-            what: _axes(actuator.axis, there.axis, "R_b"),
+            vector: _axes(actuator.axis, there.axis, "R_b"),
         }
         if actuator.turns:
             points = {"link": _point(actuator.point), "R_b": _point(there.point)}
-            found[actuator.joint]["point"] = points
-    return {"actuators": found} if found else {}
+            actuators[actuator.joint]["point"] = points
+    return {"actuators": actuators} if actuators else {}
 
 
 def _point(point: Array) -> list[float]:
@@ -288,9 +292,9 @@ def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str
 
 def _millimetres(matrix: Array) -> list[list[float]]:
     """Return a motion with its translation in millimetres."""
-    found = matrix.copy()
-    found[:3, 3] *= 1e3
-    rows: list[list[float]] = found.tolist()
+    scaled = matrix.copy()
+    scaled[:3, 3] *= 1e3
+    rows: list[list[float]] = scaled.tolist()
     return rows
 
 

@@ -83,19 +83,19 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
 
 def _without_meshes(robot: etree._Element) -> list[str]:
     """Remove shapes and textures of other files; return what they were."""
-    found = []
+    removed = []
     for link in robot.iterfind("link"):
         for shape in [part for part in link if part.tag in _SHAPES]:
             mesh = shape.find("geometry/mesh")
             if mesh is not None:
-                found.append(mesh.get("filename", "a mesh without a name"))
+                removed.append(mesh.get("filename", "a mesh without a name"))
                 link.remove(shape)
     for texture in list(robot.iter("texture")):
         parent = texture.getparent()
         if parent is not None:
-            found.append(texture.get("filename", "a texture without a name"))
+            removed.append(texture.get("filename", "a texture without a name"))
             parent.remove(texture)
-    return found
+    return removed
 
 
 def _stub() -> etree._Element:
@@ -112,7 +112,7 @@ def _stub() -> etree._Element:
 def _calibration(subject: Subject) -> dict[str, object]:
     """Return the numbers of calibration.yaml [m, rad]."""
     machine = subject.machine
-    found: dict[str, object] = {
+    calibration: dict[str, object] = {
         "base_link": machine.base,
         "platform_link": machine.platform,
         "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
@@ -131,13 +131,13 @@ def _calibration(subject: Subject) -> dict[str, object]:
         },
     }
     if machine.actuators:  # which carry the joints of their legs: these are at reading 0
-        found["actuators"] = {a.joint: a.document() for a in machine.actuators}
+        calibration["actuators"] = {a.joint: a.document() for a in machine.actuators}
     if subject.result is not None:
         result = subject.result.document
-        known = {row.name: row for row in result.parameters}
+        row_of = {row.name: row for row in result.parameters}
         names = result.kinematic.names
-        rows = [known.get(name) for name in names]
-        found["parameters"] = {
+        rows = [row_of.get(name) for name in names]
+        calibration["parameters"] = {
             "frames": "R_b and R_e",
             "names": names,
             "units": ["m" if row is None else row.unit for row in rows],
@@ -146,4 +146,4 @@ def _calibration(subject: Subject) -> dict[str, object]:
             "sigma": [None if row is None else row.sigma for row in rows],
             "covariance": np.array(result.kinematic.covariance).tolist(),
         }
-    return found
+    return calibration

@@ -94,15 +94,17 @@ def load_subject(given: str | Path) -> Subject:
 def _nominal(result: EarlierResult) -> Machine:
     """Return the nominal machine of a result, in the same links; its legs alone are nominal."""
     machine, document = result.machine, result.document
-    known = parametrization_of(machine, twists=True)
+    parametrization = parametrization_of(machine, twists=True)
     rows = {row.name: row for row in document.parameters}
     axes: Mapping[str, Mapping[str, list[float]]] = document.nominal_axes
     legs = []
-    for name, place, leg in zip(machine.leg_names, known.place, geometries(machine), strict=True):
+    for name, place, leg in zip(
+        machine.leg_names, parametrization.place, geometries(machine), strict=True
+    ):
         numbers = np.concatenate([leg.A, leg.B, [leg.q0]])
         for column, at in enumerate(place[: LegColumns.LENGTH + 1].tolist()):
-            if at >= 0 and known.names[at] in rows:
-                numbers[column] = rows[known.names[at]].nominal
+            if at >= 0 and parametrization.names[at] in rows:
+                numbers[column] = rows[parametrization.names[at]].nominal
         base, platform = (axes.get(side, {}).get(name) for side in ("base", "platform"))
         twist = rows.get(f"{name}.twist")
         legs.append(

@@ -85,8 +85,8 @@ def nearest_point_to_line(u: Array, M: Array, d: Array, P: Array) -> Array:
 def segment_distance(start_1: Array, span_1: Array, start_2: Array, span_2: Array) -> Array:
     """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1."""
 
-    def dot(one: Array, other: Array) -> Array:
-        return np.asarray(np.einsum("ni,ni->n", one, other))
+    def dot(first: Array, second: Array) -> Array:
+        return np.asarray(np.einsum("ni,ni->n", first, second))
 
     between = start_1 - start_2
     a, e, b = dot(span_1, span_1), dot(span_2, span_2), dot(span_1, span_2)

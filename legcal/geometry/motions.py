@@ -76,18 +76,18 @@ def matrix_of(R: Array, t: Array) -> Array:
 
 def matrix_product(*matrices: Array) -> Array:
     """Return the matrix (..., 4, 4) of motions one after the other, the last one first."""
-    found = matrices[0]
+    product = matrices[0]
     for matrix in matrices[1:]:
-        found = found @ matrix
-    return matrix_of(found[..., :3, :3], found[..., :3, 3])
+        product = product @ matrix
+    return matrix_of(product[..., :3, :3], product[..., :3, 3])
 
 
 def matrix_inverse(matrix: Array) -> Array:
     """Return the matrix (4, 4) of the inverse motion."""
-    found = np.eye(4)
-    found[:3, :3] = matrix[:3, :3].T
-    found[:3, 3] = -(found[:3, :3] @ matrix[:3, 3])
-    return found
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -(inverse[:3, :3] @ matrix[:3, 3])
+    return inverse
 
 
 def matrix_applied(matrix: Array, points: Array) -> Array:
@@ -95,9 +95,9 @@ def matrix_applied(matrix: Array, points: Array) -> Array:
     return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-def pose_distance(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
+def pose_distance(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
     """Return distance [m] and angle [rad] between two poses."""
-    off = one.inv() * other
+    off = first.inv() * second
     return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
 
 
@@ -198,9 +198,9 @@ def _arms(
     whole = np.bincount(group, weights=weight)[:, None]
 
     def centres(points: Array) -> Array:
-        found = np.zeros((len(whole), 3))
-        np.add.at(found, group, weight[:, None] * points)
-        return found / whole
+        sums = np.zeros((len(whole), 3))
+        np.add.at(sums, group, weight[:, None] * points)
+        return sums / whole
 
     centre_from, centre_to = centres(P_from), centres(P_to)
     return P_from - centre_from[group], P_to - centre_to[group], centre_from, centre_to, weight

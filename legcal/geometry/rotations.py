@@ -52,12 +52,12 @@ def nearest_rotation(matrix: Array) -> Array:
     return np.asarray((U * flip[..., None, :]) @ Vt)
 
 
-def rotation_between(one: Array, other: Array) -> Rotation:
+def rotation_between(first: Array, second: Array) -> Rotation:
     """Return the smallest rotation that takes one unit direction (3,) onto another."""
-    normal = cross(one, other)
-    sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
+    normal = cross(first, second)
+    sine, cosine = float(np.linalg.norm(normal)), float(first @ second)
     if sine == 0.0:
-        return Rotation.from_rotvec((0.0 if cosine > 0.0 else np.pi) * normal_basis(one)[0])
+        return Rotation.from_rotvec((0.0 if cosine > 0.0 else np.pi) * normal_basis(first)[0])
     return Rotation.from_rotvec(np.arctan2(sine, cosine) / sine * normal)
 
 

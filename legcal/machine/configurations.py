@@ -108,12 +108,14 @@ def random_configurations(
     """
     generator = np.random.default_rng(rng)
     draw = _drawn if mechanism.is_determined else _wandered
-    found = list(draw(mechanism, count, generator))
-    _require(mechanism, count, len(found))
+    configurations = list(draw(mechanism, count, generator))
+    _require(mechanism, count, len(configurations))
     return Configurations(
-        np.array(found).reshape(count, mechanism.chain.nq),
-        np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
-        [platform_pose(mechanism, c) for c in found],
+        np.array(configurations).reshape(count, mechanism.chain.nq),
+        np.array([joint_values(mechanism, c) for c in configurations]).reshape(
+            count, mechanism.n_legs
+        ),
+        [platform_pose(mechanism, c) for c in configurations],
     )
 
 
@@ -133,21 +135,21 @@ def random_poses(
     if not machine.is_determined:
         drawn = random_configurations(machine, count, rng)
         return drawn.readings, drawn.poses
-    found = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
-    _require(machine, count, len(found))
-    if not found:
+    pairs = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
+    _require(machine, count, len(pairs))
+    if not pairs:
         return np.zeros((0, machine.n_legs)), []
-    readings, poses = (np.array(part) for part in zip(*found, strict=True))
+    readings, poses = (np.array(part) for part in zip(*pairs, strict=True))
     return readings, list(motions_of(poses[:, :, :3], poses[:, :, 3]))
 
 
-def _require(machine: Machine, count: int, found: int) -> None:
+def _require(machine: Machine, count: int, n_found: int) -> None:
     """Refuse a machine of which too few random poses are found."""
-    if found < count:
+    if n_found < count:
         raise DidNotConverge(
             Problem(
                 "random poses could not be drawn",
-                f"{found} of {count} inside the travel in {MAX_DRAWS} tries for each",
+                f"{n_found} of {count} inside the travel in {MAX_DRAWS} tries for each",
                 "all",
                 f"check {machine.urdf.wording.home} and the limits of the sliders",
                 str(machine.yaml_path),
@@ -340,10 +342,10 @@ def random_postures_of_legs(
     slack = rounding + 0.05 * (travel[:, 1] - travel[:, 0])
     low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
     high = np.maximum(travel[:, 1], at_home) + slack
-    found = start.R[:0], start.t[:0]
+    postures = start.R[:0], start.t[:0]
     share, tried, near_singular = 1.0, 0, 0
     for _ in range(ATTEMPTS):
-        n = 2 * (count - len(found[1])) + 10
+        n = 2 * (count - len(postures[1])) + 10
         wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))[:, drive.first]
         wanted = at_home + share * (wanted - at_home)
         R, t = drive.wandered(n, share, rng)
@@ -355,11 +357,11 @@ def random_postures_of_legs(
         R, t = drive.closed(R, t, wanted, LAST_STEPS)
         values = drive.values(R, t)
         good &= drive.is_closed(R, t, wanted) & np.all((values >= low) & (values <= high), axis=1)
-        found = np.concatenate([found[0], R[good]]), np.concatenate([found[1], t[good]])
-        if len(found[1]) >= count:
-            return found[0][:count], found[1][:count]
+        postures = np.concatenate([postures[0], R[good]]), np.concatenate([postures[1], t[good]])
+        if len(postures[1]) >= count:
+            return postures[0][:count], postures[1][:count]
         share = max(SHRINKING * share, MIN_SHARE)
-    said = f"found {len(found[1])} of {count} random poses inside the travel"
+    said = f"found {len(postures[1])} of {count} random poses inside the travel"
     if 2 * near_singular > tried and drive.hold() < LOOSE:
         raise DidNotConverge(
             f"The observations could not be predicted: {said}, needed all; most ways there come "
@@ -393,16 +395,16 @@ class _Drive:
         self.driven = np.array([], dtype=np.intp)
         constrained = self.slopes(R, t)[0]
         self.driven = np.array(motors, dtype=np.intp)
-        every = self.slopes(R, t)[0]
-        rank_every, rank_constrained = (
+        unconstrained = self.slopes(R, t)[0]
+        rank_all, rank_constrained = (
             int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0
-            for J in (every, constrained)
+            for J in (unconstrained, constrained)
         )
-        count = rank_every - rank_constrained
+        count = rank_all - rank_constrained
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
-            found = pose_equations(legs, R, t, by_local=False)
-            rows = found.by_pose[0][found.measured][:, self.columns] / size
+            equations = pose_equations(legs, R, t, by_local=False)
+            rows = equations.by_pose[0][equations.measured][:, self.columns] / size
             left = np.eye(len(size)) - np.linalg.pinv(constrained / size, rcond=RANK) @ (
                 constrained / size
             )
@@ -430,8 +432,8 @@ class _Drive:
 
     def equations(self, R: Array, t: Array) -> PoseEquations:
         """Return what poses must satisfy: the constraints, and the lengths of driven motors."""
-        found = pose_equations(self.legs, R, t, by_local=False)
-        return found.of(~found.measured | np.isin(found.leg, self.driven))
+        equations = pose_equations(self.legs, R, t, by_local=False)
+        return equations.of(~equations.measured | np.isin(equations.leg, self.driven))
 
     def slopes(self, R: Array, t: Array) -> Array:
         """Return their derivatives (k, m, f) by the possible motions."""
@@ -446,8 +448,8 @@ class _Drive:
     def closed(self, R: Array, t: Array, wanted: Array, steps: int) -> tuple[Array, Array]:
         """Return poses nearer to wanted values (k, n_legs) of driven motors."""
         lengthening = self.lengthening(wanted)
-        found = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
-        return found.R, found.t
+        solution = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
+        return solution.R, solution.t
 
     def wandered(self, n: int, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return n poses that differ from home as far as no motor holds the platform."""

@@ -74,7 +74,7 @@ def with_arms(
             continue
         T = matrix_product(matrix_inverse(T_body_base), matrix_inverse(chain.poses[0]))
         T_base_arm = matrix_product(T, chain.poses[1])
-        found = [
+        candidates = [
             _arm(
                 cylinder,
                 matrix_applied(T_base_arm, _ends(cylinder, bodies)),
@@ -85,7 +85,7 @@ def with_arms(
             for cylinder in shown
             if bodies.body_of[cylinder.link] == chain.bodies[0]
         ]
-        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > within]
+        seen = [arm for arm in candidates if _from_axis(arm.ends, actuator).max() > within]
         longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
         arms[actuator.joint] = replace(actuator, arm=longest)
     return tuple(
@@ -138,7 +138,7 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
 
 
 def is_measured(legs: Sequence[Leg], cylinder: VisualCylinder, bodies: Bodies) -> bool:
-    """Say whether outlines of a visual cylinder are a part of some leg, along it or its arm."""
+    """Return whether outlines of a visual cylinder are a part of some leg, along it or its arm."""
     within = coaxial_tolerance(legs)
     return any(
         bool(_along(leg, leg.chain, [cylinder], bodies, within)) for leg in legs if leg.chain
@@ -154,7 +154,7 @@ def _along(
 ) -> tuple[Cylinder, ...]:
     """Return the cylinders along one leg, *within* so much [m] of its axis."""
     halves = halves_of_leg(leg, chain)
-    found = []
+    cylinders = []
     for cylinder in shown:
         if bodies.body_of[cylinder.link] not in halves:
             continue
@@ -163,8 +163,8 @@ def _along(
         along = ends @ u
         if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < within:
             start, end = sorted(float(x) for x in along)
-            found.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
-    return tuple(found)
+            cylinders.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
+    return tuple(cylinders)
 
 
 def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
@@ -203,7 +203,7 @@ def _raised(
     ):
         return chain
     normal = chain.base.axes[-1].along
-    found = []
+    heights = []
     for k, centre in ((len(chain.bodies), chain.B), (1, chain.A)):
         for cylinder in shown:
             if bodies.body_of[cylinder.link] == chain.bodies[k - 1]:
@@ -211,10 +211,10 @@ def _raised(
                 height = float((offset @ normal).mean())
                 beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
                 if np.linalg.norm(beside, axis=1).max() < within:
-                    found.append((cylinder.length, height))
-    if not found:
+                    heights.append((cylinder.length, height))
+    if not heights:
         return chain
-    shift = max(found)[1] * normal
+    shift = max(heights)[1] * normal
     return replace(chain, A=chain.A + shift, B=chain.B + shift)
 
 

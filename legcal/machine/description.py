@@ -132,8 +132,8 @@ def home_at_height(described: Description, height: float, turn: Rotation | None)
     """
     A, B = _joints(described)
     if turn is None:
-        one, two = ((p - p.mean(axis=0))[:, :2] @ [1.0, 1.0j] for p in (A, B))
-        angle = round(float(np.degrees(np.angle(np.sum(one * two.conj())))))
+        base, platform = ((p - p.mean(axis=0))[:, :2] @ [1.0, 1.0j] for p in (A, B))
+        angle = round(float(np.degrees(np.angle(np.sum(base * platform.conj())))))
         turn = Rotation.from_euler("z", angle, degrees=True)
     middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
     x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
@@ -164,8 +164,8 @@ def look_like_base(described: Description) -> list[str]:
     That is so if all motors are inside their travel with both links in one place, the platform
     joints lie away from those of the base, and the machine is not said to stand so.
     """
-    known = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
-    if len(known) < _MANY or (described.home is not None and _closes(described, described.home)):
+    measured = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
+    if len(measured) < _MANY or (described.home is not None and _closes(described, described.home)):
         return []
     origin = Home.of((0.0, 0.0, 0.0), Rotation.identity())
     A, B = _joints(described)
@@ -190,7 +190,7 @@ def _joints(described: Description) -> tuple[Array, Array]:
 
 
 def _closes(described: Description, home: Home) -> bool:
-    """Say whether all motors are inside their travel at a pose."""
+    """Return whether all motors are inside their travel at a pose."""
     A, B = _joints(described)
     lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
     return all(
@@ -248,9 +248,9 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        found = _out_of_proportion(described, leg.name, float(length))
-        if found:
-            return found
+        disproportions = _out_of_proportion(described, leg.name, float(length))
+        if disproportions:
+            return disproportions
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [

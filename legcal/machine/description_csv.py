@@ -96,8 +96,8 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     )
     filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
-        found, remedy = "radius beside tube or rod", "empty the others"
-        table.refuse(row, found, "one of them", *_RADII, remedy=remedy, what="radius")
+        conflict, remedy = "radius beside tube or rod", "empty the others"
+        table.refuse(row, conflict, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
     cells = _Cells(table)
     hangs_on = cells.texts("hangs_on")
@@ -152,12 +152,12 @@ class _Cells:
         return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
 
     def vectors(self, name: str) -> list[Any]:
-        found = zip(*(self.numbers(f"{name}_{i}") for i in _XYZ), strict=True)
-        return [None if vector == (None,) * 3 else list(vector) for vector in found]
+        vectors = zip(*(self.numbers(f"{name}_{i}") for i in _XYZ), strict=True)
+        return [None if vector == (None,) * 3 else list(vector) for vector in vectors]
 
     def pairs(self, name: str) -> list[Any]:
-        found = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
-        return [None if pair == (None, None) else list(pair) for pair in found]
+        pairs = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
+        return [None if pair == (None, None) else list(pair) for pair in pairs]
 
 
 def _is_there(value: Any) -> bool:
@@ -247,17 +247,19 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     if {"x", "y"} <= set(keys) and len(lines) > 1:
         lines = _from_points(lines, keys, path)
         keys = [split_heading(text)[0] for text in lines[0][1]]
-    found = [_coordinate(key) for key in keys]
-    sides = _sides(side for side, *_ in filter(None, found))
-    if any(one is not None and one[1] for one in found):
-        lines = _from_one_row(lines, found, sides, path)
+    coordinates = [_coordinate(key) for key in keys]
+    sides = _sides(side for side, *_ in filter(None, coordinates))
+    if any(coordinate is not None and coordinate[1] for coordinate in coordinates):
+        lines = _from_one_row(lines, coordinates, sides, path)
         header = lines[0][1]
     else:
         plain = {split_heading(name)[0]: name for name in names}
         plain |= {word: name for name, words in _OTHER.items() for word in words}
         header = [
-            f"{sides[one[0]]}_{one[2]}" if one else plain.get(key, text.lower())
-            for one, key, text in zip(found, keys, lines[0][1], strict=True)
+            f"{sides[coordinate[0]]}_{coordinate[2]}"
+            if coordinate
+            else plain.get(key, text.lower())
+            for coordinate, key, text in zip(coordinates, keys, lines[0][1], strict=True)
         ]
     below = lines[1:]
     if "leg" in header and all(
@@ -305,7 +307,7 @@ def _sides(words: Iterable[str]) -> dict[str, str]:
 
 def _from_one_row(
     lines: Lines,
-    found: Sequence[tuple[str, str, str] | None],
+    coordinates: Sequence[tuple[str, str, str] | None],
     sides: dict[str, str],
     path: object,
 ) -> Lines:
@@ -320,9 +322,11 @@ def _from_one_row(
     cells = rows[0][1]
     joints: dict[int, dict[str, str]] = {}
     others = {}
-    for one, text, cell in zip(found, header, cells, strict=True):
-        if one is not None and one[1]:
-            joints.setdefault(int(one[1]), {})[f"{sides[one[0]]}_{one[2]}"] = cell
+    for coordinate, text, cell in zip(coordinates, header, cells, strict=True):
+        if coordinate is not None and coordinate[1]:
+            joints.setdefault(int(coordinate[1]), {})[f"{sides[coordinate[0]]}_{coordinate[2]}"] = (
+                cell
+            )
         else:
             others[text.lower()] = cell
     return _rows(joints, others, (number, rows[0][0]))
@@ -353,9 +357,9 @@ def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
         named.append((" ".join(words), cells, matches[0] if matches else None))
     wrong = [name for name, _, match in named if match is None]
     if wrong:
-        found = describe(wrong[0]) if wrong[0].strip() else "no name"
+        stated = describe(wrong[0]) if wrong[0].strip() else "no name"
         raise DatasetError(
-            f"{path}: the joints could not be read: found {found} in a "
+            f"{path}: the joints could not be read: found {stated} in a "
             "table with a row for each joint, needed names of side and number such as B1 and P1, "
             "or base1 and platform1; correct it."
         )

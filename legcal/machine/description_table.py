@@ -63,7 +63,7 @@ def _is_radius(value: Any) -> bool:
 
 
 def _is_pair(value: object) -> bool:
-    """Say whether a value is one pair of readings."""
+    """Return whether a value is one pair of readings."""
     return isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)
 
 
@@ -76,10 +76,10 @@ _POSITIVE = {**_NUMBER, "exclusiveMinimum": 0}
 _ROW = {"type": "array", "items": _NUMBER}
 
 
-def _schema_of_legs(one: dict[str, Any]) -> WithJsonSchema:
+def _schema_of_legs(of_leg: dict[str, Any]) -> WithJsonSchema:
     """Return the JSON Schema of what :func:`_of_legs` takes."""
-    of_each = {"type": "array", "items": {"anyOf": [one, {"type": "null"}]}}
-    return WithJsonSchema({"anyOf": [one, of_each]})
+    of_each = {"type": "array", "items": {"anyOf": [of_leg, {"type": "null"}]}}
+    return WithJsonSchema({"anyOf": [of_leg, of_each]})
 
 
 def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
@@ -127,10 +127,10 @@ def _directions(value: Any) -> Any:
 
 def _kinds(value: Any) -> Any:
     entries = value if isinstance(value, list) else [value]
-    known = [kind.value for kind in LegKind]
+    names = [kind.value for kind in LegKind]
     for kind in entries:
-        if kind is not None and kind not in known:
-            needed = f"{', '.join(known)}, one for all legs or a list"
+        if kind is not None and kind not in names:
+            needed = f"{', '.join(names)}, one for all legs or a list"
             raise BadValue(describe(kind), needed, "correct it")
     return value
 
@@ -267,12 +267,12 @@ class ActuatorEntry(FileSchema):
         right = ["travel_deg", "travel_us"] if self.turns else ["travel"]
         if len(travels) == 1 and travels[0] in right and (travels != ["travel_us"] or pulses):
             return None
-        what = f"a carriage, in {unit}"
+        reading = f"a carriage, in {unit}"
         if self.turns:
-            what = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
+            reading = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
         return (
             f"found {' and '.join(travels) or 'no travel'}, needed {right[0]}, the lowest and "
-            f"highest reading of {what}; correct it."
+            f"highest reading of {reading}; correct it."
         )
 
     def travel_in_metres(self, unit: str) -> tuple[float, float]:
@@ -354,36 +354,36 @@ def read_description(
     given = {} if given is None else given
     try:
         if path.suffix.lower() == ".csv":
-            found = read_columns(path, unit)
-            found["name"] = name or found["name"]
-            if not is_plain_name(found["name"]) and name is None:
+            table = read_columns(path, unit)
+            table["name"] = name or table["name"]
+            if not is_plain_name(table["name"]) and name is None:
                 raise DatasetError(
                     f"{path}: the model could not be named after the file: found "
-                    f"{describe(found['name'])}, needed letters, digits, '-', '_' and '.'; "
+                    f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
                     "give it a name with --name NAME."
                 )
         else:
-            found = read_yaml(path, WHAT)
-            found = {key: value for key, value in found.items() if value is not None}
+            table = read_yaml(path, WHAT)
+            table = {key: value for key, value in table.items() if value is not None}
             if name is not None:
-                found["name"] = name
+                table["name"] = name
             if unit is not None:
-                found.setdefault("unit", unit)
+                table.setdefault("unit", unit)
     except DatasetError as error:
         raise ModelError(error.facts) from error
-    _refuse_twice(path, found, given)
-    if "version" in found and "legcal_table" not in found:
+    _refuse_twice(path, table, given)
+    if "version" in table and "legcal_table" not in table:
         raise ModelError(
-            f"{path}: the table could not be read: found version: {found['version']}, needed "
+            f"{path}: the table could not be read: found version: {table['version']}, needed "
             "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
             "place."
         )
-    if unit is not None and found.get("unit", unit) != unit:
+    if unit is not None and table.get("unit", unit) != unit:
         raise ModelError(
             f"{path}: the unit could not be decided: found --unit {unit} and "
-            f"{describe(found['unit'])} in the table, needed one of them; leave out --unit."
+            f"{describe(table['unit'])} in the table, needed one of them; leave out --unit."
         )
-    return described_machine({**found, **given}, path)
+    return described_machine({**table, **given}, path)
 
 
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
@@ -410,13 +410,13 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     return description
 
 
-def _refuse_twice(path: Path, found: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     """Refuse entries that the table has and the command too."""
     twice = [
-        f"{OPTIONS[key]} beside {key if key in found else other}"
+        f"{OPTIONS[key]} beside {key if key in table else other}"
         for key in given
         for other in (key, *("types" for _ in [0] if key == "type"))
-        if _says_something(found.get(other))
+        if _says_something(table.get(other))
     ]
     if twice:
         raise ModelError(
@@ -426,7 +426,7 @@ def _refuse_twice(path: Path, found: Mapping[str, Any], given: Mapping[str, Any]
 
 
 def _says_something(value: Any) -> bool:
-    """Say whether an entry of a table, or of one of its legs, is there."""
+    """Return whether an entry of a table, or of one of its legs, is there."""
     return any(x is not None for x in value) if isinstance(value, list) else value is not None
 
 
@@ -438,15 +438,15 @@ def in_metres(value: float, unit: str) -> float:
 def _types(file: TableFile, n: int) -> list[LegType]:
     """Return the type of each leg."""
     texts = file.types or [(file.type or "").split("-")[-1]] * n
-    return [found for text in texts if (found := leg_type(text)) is not None]
+    return [type_ for text in texts if (type_ := leg_type(text)) is not None]
 
 
 def _conflicting_entries(file: TableFile, source: str) -> list[str]:
     """Return which entries of a table do not fit together: counts, names, types."""
     if (file.type is None) == (file.types is None):
-        found = "both" if file.type else "neither"
+        stated = "both" if file.type else "neither"
         return [
-            f"{source}: the legs could not be read: found {found} of type and types, needed "
+            f"{source}: the legs could not be read: found {stated} of type and types, needed "
             "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS."
         ]
     n = len(file.base_joints)
@@ -504,17 +504,19 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
 
 def _wrong_actuators(file: TableFile, source: str) -> list[str]:
     """Return what does not fit together of motors that rods hang on, and of these rods."""
-    names, motors, known = file.leg_names, file.motors_of_legs, file.actuators or {}
+    names, motors, actuators = file.leg_names, file.motors_of_legs, file.actuators or {}
     problems = [
         f"{source}: actuators.{name} could not be used: {problem}"
-        for name, entry in known.items()
+        for name, entry in actuators.items()
         if (problem := entry.problem(file.unit)) is not None
     ]
     for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
         where = f"{source}: leg '{leg}' could not be used"
-        if motor is not None and motor not in known:
-            found = f"'{motor}' in hangs_on, which is not among actuators; "
-            problems.append(f"{where}: found {found}{closest(motor, list(known) or ['none'])}")
+        if motor is not None and motor not in actuators:
+            missing = f"'{motor}' in hangs_on, which is not among actuators; "
+            problems.append(
+                f"{where}: found {missing}{closest(motor, list(actuators) or ['none'])}"
+            )
         elif (motor is None) is not (type_.actuator is None):
             on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
             problems.append(
@@ -522,18 +524,19 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
                 "types that begin with the motor of a rod (PSS, RSS, PRS), and for no others; "
                 "correct them."
             )
-        elif motor is not None and known[motor].turns is not (
+        elif motor is not None and actuators[motor].turns is not (
             type_.actuator is ActuatorKind.REVOLUTE
         ):
-            moves = "turns" if known[motor].turns else "slides"
+            moves = "turns" if actuators[motor].turns else "slides"
             problems.append(
                 f"{where}: found the type {type_} on '{motor}', which {moves}, needed a type that "
-                f"begins with {'R' if known[motor].turns else 'P'}; correct the type or the motor."
+                f"begins with {'R' if actuators[motor].turns else 'P'}; correct the type or the "
+                "motor."
             )
     problems += [
         f"{source}: actuators.{name} could not be used: found no leg that hangs on it, needed one "
         "in hangs_on; leave it out, or name it there."
-        for name in known
+        for name in actuators
         if name not in motors
     ]
     lengths = _of_each(file.lengths, len(names))
@@ -552,12 +555,12 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
 
 def _actuators(file: TableFile) -> dict[str, Actuator]:
     """Return the motors that rods hang on, in the base link."""
-    found, motors = {}, file.motors_of_legs
+    actuators, motors = {}, file.motors_of_legs
     for name, entry in (file.actuators or {}).items():
         along = np.array(entry.axis or entry.direction, dtype=float)
         A = [file.base_joints[j] for j, motor in enumerate(motors) if motor == name]
         at = entry.point or np.mean(A, axis=0).tolist()
-        found[name] = Actuator(
+        actuators[name] = Actuator(
             name,
             ActuatorKind.REVOLUTE if entry.turns else ActuatorKind.PRISMATIC,
             np.asarray(along / np.linalg.norm(along)),
@@ -570,8 +573,8 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
             joints = np.array([[in_metres(x, file.unit) for x in joint] for joint in A])
             radius = in_metres(entry.arm_radius, file.unit)
             first = file.leg_names[motors.index(name)]
-            found[name] = found[name].with_arm(joints, radius, first)
-    return found
+            actuators[name] = actuators[name].with_arm(joints, radius, first)
+    return actuators
 
 
 def _home_readings(file: TableFile) -> dict[str, float]:
@@ -587,9 +590,9 @@ def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
     problems = []
     for key, turns in (("home_readings", False), ("home_readings_deg", True)):
         right = [name for name, entry in (file.actuators or {}).items() if entry.turns is turns]
-        what = "arm, in degrees" if turns else f"carriage, in {file.unit}"
+        motor = "arm, in degrees" if turns else f"carriage, in {file.unit}"
         problems += [
-            f"{source}: {key}.{name} could not be used: found no such {what}, needed "
+            f"{source}: {key}.{name} could not be used: found no such {motor}, needed "
             f"{', '.join(right) or 'one among actuators'}; {closest(name, right or ['none'])}"
             for name in getattr(file, key) or {}
             if name not in right
@@ -633,16 +636,16 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
     ):
         if low is None and high is None:
             continue
-        found = ""
+        conflict = ""
         if low is None or high is None:
-            found = f"{'max' if low is None else 'min'}_length alone"
+            conflict = f"{'max' if low is None else 'min'}_length alone"
         elif not low < high:
-            found = f"min_length {low:g} and max_length {high:g}"
+            conflict = f"min_length {low:g} and max_length {high:g}"
         elif travel is not None:
-            found = "travel beside min_length and max_length"
-        if found:
+            conflict = "travel beside min_length and max_length"
+        if conflict:
             problems.append(
-                f"{source}: min_length and max_length could not be used: found {found} of leg "
+                f"{source}: min_length and max_length could not be used: found {conflict} of leg "
                 f"'{name}', needed the shortest and the longest length, in place of travel; "
                 "correct them."
             )
@@ -749,16 +752,17 @@ def _description(file: TableFile, source: str) -> Description:
     return described
 
 
-def _less(one: float, other: float) -> float:
+def _less(minuend: float, subtrahend: float) -> float:
     """Return a difference by its decimal digits."""
-    return float(Decimal(repr(float(one))) - Decimal(repr(float(other))))
+    return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 
 def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
     """Return the radii of tube and rod [m]."""
-    both = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
+    radii = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
     tube, rod = (
-        None if both.get(part) is None else in_metres(both[part], unit) for part in ("tube", "rod")
+        None if radii.get(part) is None else in_metres(radii[part], unit)
+        for part in ("tube", "rod")
     )
     return tube, rod
 
@@ -822,24 +826,24 @@ def _impossible_legs(described: Description) -> list[str]:
                     [],
                 ).append(leg.name)
     problems = [
-        f"{described.source}: {legs_in_words(names)} could not be used: found {what}"
-        for what, names in lacking.items()
+        f"{described.source}: {legs_in_words(names)} could not be used: found {mistake}"
+        for mistake, names in lacking.items()
     ]
     # Legs that begin and end in the same two points, and joints all in one point.
     legs = described.legs
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
-    for j, one in enumerate(legs):
-        for two in legs[j + 1 :]:
+    for j, first in enumerate(legs):
+        for second in legs[j + 1 :]:
             gap = max(
-                float(np.linalg.norm(one.A_base - two.A_base)),
-                float(np.linalg.norm(one.B_platform - two.B_platform)),
+                float(np.linalg.norm(first.A_base - second.A_base)),
+                float(np.linalg.norm(first.B_platform - second.B_platform)),
             )
             if gap <= _SAME * max(spans):
                 problems.append(
-                    f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
-                    "found both between the same two points, needed different joints; correct "
-                    "their rows."
+                    f"{described.source}: legs '{first.name}' and '{second.name}' could not be "
+                    "used: found both between the same two points, needed different joints; "
+                    "correct their rows."
                 )
     if min(spans) <= _SAME * max(spans):
         problems.append(

@@ -110,15 +110,15 @@ def _motor_notes(machine: Machine) -> list[str]:
 def _spin_notes(machine: Machine) -> list[str]:
     """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
     notes = []
-    both = sum(
+    n_spinning = sum(
         leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
     )
-    if both:
+    if n_spinning:
         legs, spin = "1 leg has", "spins about itself"
-        if both > 1:
-            legs, spin = f"{both} legs have", "spin about themselves"
+        if n_spinning > 1:
+            legs, spin = f"{n_spinning} legs have", "spin about themselves"
         notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(leg.idle_spins for leg in machine.legs) - both
+    others = sum(leg.idle_spins for leg in machine.legs) - n_spinning
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(

@@ -52,5 +52,5 @@ class Dimensions:
 
     def stated(self) -> dict[str, Any]:
         """Return what is given, by its name."""
-        found = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: value for name, value in found.items() if value is not None}
+        dimensions = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in dimensions.items() if value is not None}

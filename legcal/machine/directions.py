@@ -102,12 +102,12 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
         owner, kind, which = _split(name, leg_names)
         coordinates.setdefault((kind, owner), []).append(which)
     groups: dict[tuple[str, str], list[str]] = {}
-    for (kind, owner), found in coordinates.items():
-        axes = list_in_words(sorted(found))
+    for (kind, owner), letters in coordinates.items():
+        axes = list_in_words(sorted(letters))
         if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # a tube and a rod; two angles
             axes = ""
         elif kind.endswith("_axis"):
-            axes = f"angle{'s' * (len(found) > 1)} {axes}"
+            axes = f"angle{'s' * (len(letters) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(owner)
     phrases = []
     for (kind, axes), owners in groups.items():

@@ -95,22 +95,22 @@ def pose_equations(
         return _lengths(legs, R, t, by_local, q)
     groups: dict[tuple[object, ...], list[int]] = {}  # legs alike at once, those on actuators alone
     for j, leg in enumerate(legs):
-        own = j if on[j] >= 0 else -1
+        alone = j if on[j] >= 0 else -1
         joints = leg.base_joint, leg.platform_joint
-        groups.setdefault((own, leg.kind, *joints, *leg.equations), []).append(j)
+        groups.setdefault((alone, leg.kind, *joints, *leg.equations), []).append(j)
     parts: dict[int, PoseEquations] = {}
     for alike in groups.values():
         leg, a = legs[alike[0]], on[alike[0]]
         at = None if q is None or a < 0 else q[:, a]
-        length, *found, by_own = _of_alike([legs[j] for j in alike], R, t, by_local, at)
-        by_q = np.zeros((*found[0].shape, 0 if q is None else q.shape[1]))
+        length, *equations, by_reading = _of_alike([legs[j] for j in alike], R, t, by_local, at)
+        by_q = np.zeros((*equations[0].shape, 0 if q is None else q.shape[1]))
         if at is not None:
-            by_q[..., a] = by_own[..., 0]
+            by_q[..., a] = by_reading[..., 0]
         rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
         kinds = leg.equations[rows]
         is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
         arm = np.where(is_length, 1.0, length[..., None])
-        values, by_pose, local, by_q = (x[:, :, rows] for x in (*found, by_q))
+        values, by_pose, local, by_q = (x[:, :, rows] for x in (*equations, by_q))
         values = arm * values
         by_pose, local, by_q = (arm[..., None] * x for x in (by_pose, local, by_q))
         measured = _measured(leg)[rows]
@@ -132,19 +132,19 @@ def n_pose_constraints(legs: Sequence[Leg]) -> int:
     return sum(leg.n_constraints for leg in legs) - len(actuators_of(legs))
 
 
-def _without_readings(legs: Sequence[Leg], found: PoseEquations) -> PoseEquations:
+def _without_readings(legs: Sequence[Leg], equations: PoseEquations) -> PoseEquations:
     """Return the equations of legs with the readings of all actuators eliminated.
 
     The rows in which a reading stands are turned (by a reflection) so that it stands only in that
     of the first rod on the actuator, which is measured then; the others are constraints.
     """
-    values, measured = found.values.copy(), found.measured.copy()
-    slopes = np.concatenate([found.by_pose, found.by_q], axis=2)  # turned together
-    on = np.array(actuator_index(legs))[found.leg]
-    is_first = np.diff(found.leg, prepend=-1) != 0
+    values, measured = equations.values.copy(), equations.measured.copy()
+    slopes = np.concatenate([equations.by_pose, equations.by_q], axis=2)  # turned together
+    on = np.array(actuator_index(legs))[equations.leg]
+    is_first = np.diff(equations.leg, prepend=-1) != 0
     for a, first in enumerate(first_rods(legs)):
         rows = np.flatnonzero(on == a)
-        pivot = int(np.argmax(is_first[rows] & (found.leg[rows] == first)))
+        pivot = int(np.argmax(is_first[rows] & (equations.leg[rows] == first)))
         measured[rows] = np.arange(len(rows)) == pivot
         if len(rows) == 1:
             continue
@@ -159,7 +159,7 @@ def _without_readings(legs: Sequence[Leg], found: PoseEquations) -> PoseEquation
         values[:, rows] -= v * (scale * np.einsum("kr,kr->k", v, values[:, rows]))[:, None]
     none = np.zeros((*values.shape, 0))
     return PoseEquations(
-        values, slopes[:, :, :6], none, found.leg, found.kinds, measured, slopes[:, :, 6:]
+        values, slopes[:, :, :6], none, equations.leg, equations.kinds, measured, slopes[:, :, 6:]
     )
 
 
@@ -167,9 +167,9 @@ def posture_constraints(
     legs: Sequence[Leg], R: Array, t: Array, q: Array, *, by_local: bool = False
 ) -> PoseEquations:
     """Return what holds at poses and readings q (k, n) of actuators, whatever was measured."""
-    found = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
+    equations = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
     hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
-    return found.of(~found.measured | hangs[found.leg])
+    return equations.of(~equations.measured | hangs[equations.leg])
 
 
 def equations_at_readings(
@@ -183,18 +183,18 @@ def equations_at_readings(
     on = actuator_index(legs)
     rods = [on.index(a) for a in range(max(on, default=-1) + 1)]
     q = np.nan_to_num(np.broadcast_to(lengthening[:, rods], (len(t), len(rods))))
-    found = pose_equations(legs, R, t, by_local=by_local, q=q if rods else None)
-    wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
-    known = np.isfinite(wanted)
-    hangs = np.array(on)[found.leg] >= 0
+    equations = pose_equations(legs, R, t, by_local=by_local, q=q if rods else None)
+    wanted = np.where(equations.measured, lengthening[:, equations.leg], 0.0)
+    is_read = np.isfinite(wanted)
+    hangs = np.array(on)[equations.leg] >= 0
     return PoseEquations(
-        np.where(known, found.values - np.where(hangs, 0.0, wanted), 0.0),
-        found.by_pose * known[..., None],
-        found.by_local,
-        found.leg,
-        found.kinds,
-        found.measured,
-        found.by_q,
+        np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
+        equations.by_pose * is_read[..., None],
+        equations.by_local,
+        equations.leg,
+        equations.kinds,
+        equations.measured,
+        equations.by_q,
     )
 
 
@@ -211,8 +211,8 @@ def leg_equations(
     Rows but that of the length have no unit; a passive leg has the row of its length too. Of a rod
     on an actuator *q* (k,) are its readings, zero if they are not given.
     """
-    _, *found = _of_alike([leg], R, t, by_local, q)
-    values, by_pose, local, by_q = (x[:, 0] for x in found)
+    _, *equations = _of_alike([leg], R, t, by_local, q)
+    values, by_pose, local, by_q = (x[:, 0] for x in equations)
     owner = np.zeros(len(leg.equations), dtype=np.intp)
     return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
 
@@ -314,7 +314,7 @@ def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) 
 
 
 def least_squares_equations(
-    found: PoseEquations,
+    equations: PoseEquations,
     n_dependent: int = 0,  # constraints that follow from the others where all hold
 ) -> tuple[Array, Array]:
     """Return equations (k, m) and derivatives (k, m, 6) that hold where readings miss least.
@@ -323,7 +323,10 @@ def least_squares_equations(
     the constraints leave can undo; steps to their root are those of Gauss-Newton with the
     constraints exact.
     """
-    constraints, J = found.by_pose[:, ~found.measured], found.by_pose[:, found.measured]
+    constraints, J = (
+        equations.by_pose[:, ~equations.measured],
+        equations.by_pose[:, equations.measured],
+    )
     _, size, along = np.linalg.svd(constraints, full_matrices=False)
     counts = size > _DEPENDENT * size[:, :1]
     counts[:, max(constraints.shape[1] - n_dependent, 0) :] = False
@@ -331,24 +334,24 @@ def least_squares_equations(
     left = J - J @ np.swapaxes(along, 1, 2) @ along
     U, singular, _ = np.linalg.svd(left, full_matrices=False)
     U = np.swapaxes(U * (singular > _SINGULAR * singular[:, :1])[:, None], 1, 2)
-    residual = (U @ found.values[:, found.measured, None])[..., 0]
+    residual = (U @ equations.values[:, equations.measured, None])[..., 0]
     return (
-        np.concatenate([found.values[:, ~found.measured], residual], axis=1),
+        np.concatenate([equations.values[:, ~equations.measured], residual], axis=1),
         np.concatenate([constraints, U @ J], axis=1),
     )
 
 
 def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
-    found = pose_equations(machine.legs, R, t, by_local=False)
-    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
+    equations = pose_equations(machine.legs, R, t, by_local=False)
+    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def machine_equations_at(machine: Machine, R: Array, t: Array, readings: Array) -> PoseEquations:
     """Return what they miss at readings of the motors (k, n_motors) [m or rad]."""
     motors = machine.sign * machine.at_readings(readings)
-    found = equations_at_readings(machine.legs, R, t, motors)
-    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
+    equations = equations_at_readings(machine.legs, R, t, motors)
+    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
@@ -364,7 +367,7 @@ def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEqu
 
 
 def is_constrained(machine: Machine) -> bool:
-    """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
+    """Return whether the machine itself forbids some poses, whatever the lengths of its sliders."""
     return not machine.spatial or n_pose_constraints(machine.legs) > 0
 
 
@@ -424,7 +427,7 @@ def pose_sensitivity(
 
 
 def is_overdetermined(equations: PoseEquations, columns: Sequence[int]) -> bool:
-    """Say whether there are more readings than the constraints leave freedoms at the first pose."""
+    """Return whether readings outnumber the freedoms that constraints leave at the first pose."""
     n_constraints, n_read = int(np.sum(~equations.measured)), int(equations.measured.sum())
     if n_read + n_constraints <= len(columns):
         return False
@@ -494,9 +497,9 @@ def _lengths(
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
     if q is not None and hung:
-        carried, own = list(hung), [on[j] for j in hung]
+        carried, columns = list(hung), [on[j] for j in hung]
         by_reading = carried_at_A(tuple(legs)).by_reading(q)[:, carried]
-        by_q[:, carried, own] = -np.sum(by_reading * u[:, carried], axis=2)
+        by_q[:, carried, columns] = -np.sum(by_reading * u[:, carried], axis=2)
     for j, motion in moved.items():
         local[:, j, LegColumns.A] = -_back(motion, u[:, j])
         _write_actuator(motion, u[:, j], local[:, j])
@@ -633,7 +636,7 @@ def _component(at: _Placed, tied: Array) -> _EquationRow:
 def _twist(at: _Placed) -> _EquationRow:
     """Return sin(angle - twist) of the axes p and w in the leg, and its gradients."""
     leg, u, b = at.legs[0], at.u, at.axes("platform")
-    tau = np.array([float(one.twist or 0.0) for one in at.legs])
+    tau = np.array([float(its_leg.twist or 0.0) for its_leg in at.legs])
     tied = _basis(b)[:, 0] if leg.is_fixed_to_platform else b
     outer = at.base_axis, at.in_base(tied)
     joints = leg.base_joint, leg.platform_joint

@@ -40,9 +40,9 @@ def description_of(table: Path | None, given: Dimensions) -> Description:
     """Return the machine that a table, with options beside it, or a family describes."""
     stated = given.stated()
     if (table is None) == (given.family is None):
-        found = "neither" if table is None else "both"
+        sources = "neither" if table is None else "both"
         raise UsageError(
-            f"The model could not be written: found {found} of a table and --family, needed one; "
+            f"The model could not be written: found {sources} of a table and --family, needed one; "
             "give a YAML or CSV table, or --family hexapod or delta; legcal new --template writes "
             "a table to start from."
         )
@@ -84,12 +84,12 @@ def family_table(given: Dimensions) -> dict[str, Any]:
         raise UsageError(_no_family(str(given.family)))
     family, stated, unit = FAMILIES[name], given.stated(), given.unit or "mm"
     where = f"The family {name} could not be built"
-    known = (*family.dimensions, *family.others)
+    keys = (*family.dimensions, *family.others)
     lengths = {key: value for key, value in stated.items() if isinstance(value, float | int)}
     problems = [
-        f"{where}: found {flag(key)}, needed some of {', '.join(map(flag, known))}; leave it out."
+        f"{where}: found {flag(key)}, needed some of {', '.join(map(flag, keys))}; leave it out."
         for key in stated
-        if key not in (*known, "family", "unit", "name")
+        if key not in (*keys, "family", "unit", "name")
     ]
     if lengths and given.unit is None:
         problems.append(
@@ -121,16 +121,17 @@ def family_table(given: Dimensions) -> dict[str, Any]:
     return {"legcal_table": 1, "name": given.name or name, "unit": unit, **table}
 
 
-def _no_family(found: str) -> str:
+def _no_family(family: str) -> str:
     """Return the sentence for what is none of the families."""
     remedy = (
         "write the joints of any other machine in a table, for which legcal new --template -o DIR "
         "makes one to start from"
     )
-    if found.startswith("6-") and (of_legs := leg_type(found[2:])) and of_legs.actuator is None:
-        remedy = f"give --family hexapod --type {found[2:]}, or {remedy}"
+    if family.startswith("6-") and (of_legs := leg_type(family[2:])) and of_legs.actuator is None:
+        remedy = f"give --family hexapod --type {family[2:]}, or {remedy}"
     return (
-        f"The family could not be built: found --family {found}, needed hexapod or delta; {remedy}."
+        f"The family could not be built: found --family {family}, needed hexapod or delta; "
+        f"{remedy}."
     )
 
 

@@ -99,39 +99,39 @@ def feasible_poses(
         if machine.is_determined
         else _walked(machine, rng, obstacles)
     )
-    found: list[Array] = []
+    configurations: list[Array] = []
     failed = 0
     progress("Poses", 0, n_poses)
-    while len(found) < n_poses and failed < _MAX_FAILED_POSES:
+    while len(configurations) < n_poses and failed < _MAX_FAILED_POSES:
         configuration = next(draws)
         if configuration is None:
             failed += 1
         else:
             failed = 0
-            found.append(configuration)
-            progress("Poses", len(found), n_poses)
-    if len(found) < n_poses:
+            configurations.append(configuration)
+            progress("Poses", len(configurations), n_poses)
+    if len(configurations) < n_poses:
         causes: Counter[Cause] = Counter()
         for (cause, _), count in obstacles.items():
             causes[cause] += count
         (main, _), *_others = causes.most_common()
-        what = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
+        excluded = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
         raise DidNotConverge(
             Problem(
                 f"{n_poses} poses could not be drawn",
-                f"{len(found)} that the machine reaches in "
-                f"{obstacles.total() + len(found)} draws, others excluded {what}",
+                f"{len(configurations)} that the machine reaches in "
+                f"{obstacles.total() + len(configurations)} draws, others excluded {excluded}",
                 "all",
                 _REMEDIES[main],
                 str(machine.yaml_path),
             )
         )
-    return poses_at(machine, found)
+    return poses_at(machine, configurations)
 
 
 def _counted(cause: Cause, n: int, obstacles: Counter[Obstacle]) -> str:
     """Return how often a cause excluded a draw, and what it most often was in detail."""
-    most = max((count, detail) for (one, detail), count in obstacles.items() if one is cause)
+    most = max((count, detail) for (reason, detail), count in obstacles.items() if reason is cause)
     detail = f" ({most[0]} times {most[1]})" if most[1] != cause else ""
     return f"{n} times by {cause}{detail}"
 
@@ -177,8 +177,8 @@ class Feasibility:
 
         The travel of motors is left out where their readings have been checked already.
         """
-        found = self.obstacle(configuration, of_motors=of_motors)
-        return None if found is None else found[1]
+        obstacle = self.obstacle(configuration, of_motors=of_motors)
+        return None if obstacle is None else obstacle[1]
 
     def obstacle(self, configuration: Array, *, of_motors: bool = True) -> Obstacle | None:
         """Return the same with its cause."""
@@ -197,8 +197,8 @@ class Feasibility:
             return Cause.SINGULARITY, Cause.SINGULARITY.value
         collision = self.collision(T)
         if collision is not None:
-            one, two = collision
-            return Cause.COLLISION, f"legs '{one}' and '{two}' run through each other"
+            first, second = collision
+            return Cause.COLLISION, f"legs '{first}' and '{second}' run through each other"
         return None
 
     def led(
@@ -226,8 +226,8 @@ class Feasibility:
         touching = np.flatnonzero(self._touching(T_base_platform))
         if not len(touching):
             return None
-        one, two = self._leg[self._pairs[:, touching[0]]]
-        return self._machine.leg_names[one], self._machine.leg_names[two]
+        first, second = self._leg[self._pairs[:, touching[0]]]
+        return self._machine.leg_names[first], self._machine.leg_names[second]
 
     def _touching(self, T_base_platform: RigidTransform) -> BoolArray:
         """Return which pairs of cylinders are nearer than the sum of their radii."""
@@ -237,9 +237,9 @@ class Feasibility:
         along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
         B = B_at(self._machine, T_base_platform.as_matrix()[None])[0]
         start = (B - vectors)[self._leg] + along[:, :1] * u
-        one, two = self._pairs
+        first, second = self._pairs
         span = np.diff(along, axis=1) * u
-        distance = segment_distance(start[one], span[one], start[two], span[two])
+        distance = segment_distance(start[first], span[first], start[second], span[second])
         return np.asarray(distance < self._clearance)
 
     def _beyond_limits(self, configuration: Array) -> str | None:
@@ -281,12 +281,12 @@ def _followed(
             full = _FULL_EXTREME if extreme else _FULL
             readings = drawn(_NEARER ** max(0, draw + 1 - full))
             start = machine.home_configuration
-            found = feasibility.led(start, readings, _WAY, on_the_chain=True)
-            if not isinstance(found, tuple):
+            result = feasibility.led(start, readings, _WAY, on_the_chain=True)
+            if not isinstance(result, tuple):
                 last = draw
-                yield found
+                yield result
                 break
-            obstacles[found] += 1
+            obstacles[result] += 1
         else:
             yield None
 

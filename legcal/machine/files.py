@@ -114,10 +114,10 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
     )
 
 
-def read_file(path: Path, what: str) -> bytes:
+def read_file(path: Path, kind: str) -> bytes:
     """Return the bytes of a mechanism file."""
     try:
-        return content_of(path, what)
+        return content_of(path, kind)
     except DatasetError as error:
         raise ModelError(error.facts) from error
 

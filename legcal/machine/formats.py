@@ -79,8 +79,8 @@ def read_source(model: str | Path) -> Source:
     source = _read_xml(path) if is_xml else read_yaml_source(path)
     if source.file.legcal is not None:
         return source
-    known = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in known for pair in source.file.closed_loop for name in pair):
+    names = {*source.urdf.links, *source.urdf.joints}
+    if not all(name in names for pair in source.file.closed_loop for name in pair):
         return source  # refused later, with the place of the name
     check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
     return completed(source)
@@ -216,8 +216,8 @@ def rotation_letters(kind: str) -> str | None:
     """Return the letters of the axes that a joint type turns about, in order; None if unknown."""
     if kind in ("SPHERICAL", "FIXED"):
         return "XYZ" if kind == "SPHERICAL" else ""
-    found = _UNIVERSAL.fullmatch(kind)
-    return found[1] + found[2] if found and found[1] != found[2] else None
+    match = _UNIVERSAL.fullmatch(kind)
+    return match[1] + match[2] if match and match[1] != match[2] else None
 
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
@@ -302,7 +302,7 @@ def read_loop_source(path: Path, content: bytes) -> Source:
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
     """Return the loops of a URDF, the problems of others noted."""
-    found = []
+    loops = []
     seen: set[str] = set()
     for i, element in enumerate(elements, start=1):
         n_before = len(problems)
@@ -324,8 +324,8 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -
         if len(problems) > n_before or ends is None:
             continue
         (link_1, T_1), (link_2, T_2) = ends
-        found.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
-    return found
+        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
+    return loops
 
 
 def _ends(
@@ -437,8 +437,8 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
 def completed(source: Source) -> Source:
     """Return a mechanism without a block with the poses where it is closed, and all travels."""
     closures = [
-        Closure("3d" if kind == "3d" else "6d", one, two)
-        for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+        Closure("3d" if kind == "3d" else "6d", first, second)
+        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
     ]
     try:
         chain = ClosedChain(source.urdf.text, closures)
@@ -450,18 +450,18 @@ def completed(source: Source) -> Source:
     drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
     unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
     unit[chain.rotation_columns()] = 1.0
-    found = closed_near(chain, start, source.urdf.links, unit)
-    configuration = start if found is None else found
+    closed = closed_near(chain, start, source.urdf.links, unit)
+    configuration = start if closed is None else closed
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
     off = _off(chain, start)
-    if sliders and found is not None and off > CLOSED:
-        configuration = found = _levelled(chain, found, source, closures, unit)
+    if sliders and closed is not None and off > CLOSED:
+        configuration = closed = _levelled(chain, closed, source, closures, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
-    if found is None:
+    if closed is None:
         return source
     size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
     drawn = {
@@ -508,20 +508,20 @@ def _levelled(
         rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
         return rows[0][None], rows[1][None]
 
-    found = _solved(chain, equations, configuration, unit)
-    if found is None:
+    closed = _solved(chain, equations, configuration, unit)
+    if closed is None:
         return configuration
     sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
     values = [chain.q_index(name) for name in sliders]
     rates = [chain.v_index(name) for name in sliders]
     for _ in range(STEPS):
-        free = null_space(equations(found[None])[1][0], rcond=1e-9)
-        step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
-        nearer = _solved(chain, equations, chain.integrate(found, _shortened(step, unit)), unit)
-        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
+        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
+        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
             break
-        found = nearer
-    return found
+        closed = nearer
+    return closed
 
 
 def closed_near(
@@ -539,12 +539,12 @@ def closed_near(
     drawn = chain.turns(start, links[0], links)
     for trial in range(TRIALS):
         away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
-        found = _close(chain, away, unit)
-        if found is None:
+        closed = _close(chain, away, unit)
+        if closed is None:
             continue
-        turned = _turned(drawn, chain.turns(found, links[0], links))
+        turned = _turned(drawn, chain.turns(closed, links[0], links))
         if best is None or turned < best[0] - 1e-6:
-            best = turned, found
+            best = turned, closed
     return None if best is None else best[1]
 
 
@@ -576,7 +576,7 @@ def _solved(
     chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
 ) -> Array | None:
     """Return the configuration near a given one where equations hold, or None."""
-    found = solve(
+    solution = solve(
         equations,
         lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
         configuration[None],
@@ -585,7 +585,7 @@ def _solved(
         damped=True,
         steps=STEPS,
     )
-    return found.points[0] if found.worst[0] <= CLOSED else None
+    return solution.points[0] if solution.worst[0] <= CLOSED else None
 
 
 def _off(chain: ClosedChain, configuration: Array) -> float:

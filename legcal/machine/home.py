@@ -118,8 +118,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             for trial in trials
         ]
         starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
-        found = at_readings(starts)
-        for T in found:
+        reached = at_readings(starts)
+        for T in reached:
             if T is None:
                 continue
             rank = _unlikely(machine, T) + float((level.inv() * T.rotation).magnitude())
@@ -209,8 +209,8 @@ def _at_readings(
         return machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
 
     def exact(poses: Array) -> tuple[Array, Array]:
-        found = missed(poses)
-        return found.values, found.by_pose
+        rows = missed(poses)
+        return rows.values, rows.by_pose
 
     def solved(equations: Equations, poses: Array) -> Solved:
         return solve(
@@ -223,17 +223,17 @@ def _at_readings(
             max_stalled=MAX_STALLED,
         )
 
-    found = solved(exact, poses)
-    holds = found.worst < _CLOSED * reach
-    if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
-        poses, n_dependent = _on_constraints(machine, found.points)
-        found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
-        singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
-        holds = (found.worst < _CLOSED * reach) & (singular > _REGULAR)
-        holds &= [_in_travel(machine, pose) for pose in found.points]
+    solution = solved(exact, poses)
+    holds = solution.worst < _CLOSED * reach
+    if solution.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
+        poses, n_dependent = _on_constraints(machine, solution.points)
+        solution = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
+        singular = np.linalg.svd(solution.jacobian * unit, compute_uv=False)[:, -1]
+        holds = (solution.worst < _CLOSED * reach) & (singular > _REGULAR)
+        holds &= [_in_travel(machine, pose) for pose in solution.points]
     return [
         motion_of(pose[:, :3], pose[:, 3]) if held else None
-        for pose, held in zip(found.points, holds, strict=True)
+        for pose, held in zip(solution.points, holds, strict=True)
     ]
 
 
@@ -242,8 +242,8 @@ def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
     near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
     held = np.array([problem is None for _, problem in near])
     poses = np.array([T.as_matrix()[:3] for T, _ in near])
-    found = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
-    constraints = found.by_pose[:, ~found.measured]
+    equations = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    constraints = equations.by_pose[:, ~equations.measured]
     n = constraints.shape[1]
     if n == 0 or not held.any():
         return poses, 0
@@ -251,7 +251,7 @@ def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
 
 
 def _in_travel(machine: Machine, pose: Array) -> bool:
-    """Say whether all motors are inside their travel at a pose (3, 4)."""
+    """Return whether all motors are inside their travel at a pose (3, 4)."""
     q = readings_at(machine, motion_of(pose[:, :3], pose[:, 3]))
     return all(machine.legs[j].in_travel(q[j : j + 1])[0] for j in machine.motors)
 
@@ -299,8 +299,8 @@ def check_home_travel(machine: Machine) -> None:
     leg = machine.legs[worst]
     others = ""
     if len(far) > 1:
-        what = "leg" if leg.actuator is None else "motor"
-        more = f"{what} is" if len(far) == 2 else f"{what}s are"
+        thing = "leg" if leg.actuator is None else "motor"
+        more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
@@ -328,12 +328,12 @@ def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
 
     In m, of rods on motors that turn in rad.
     """
-    found = {}
+    excess_of = {}
     q = readings_at(machine, machine.home)
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
         moves = leg.kind is not LegKind.CONSTANT or leg.actuator is not None
         if moves and excess > share * (upper - lower):
-            found[j] = excess
-    return found
+            excess_of[j] = excess
+    return excess_of

@@ -109,10 +109,10 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     stated = motor_entries(machine.actuators)
     actuators = dict[str, InspectedActuator]()
     for a in machine.actuators:
-        found = a.document() | stated.get(a.joint, {})
+        document = a.document() | stated.get(a.joint, {})
         if a.arm is not None:
-            found["arm"] = found["arm"] | {"radius": a.arm.radius}
-        actuators[a.joint] = InspectedActuator.model_validate(found)
+            document["arm"] = document["arm"] | {"radius": a.arm.radius}
+        actuators[a.joint] = InspectedActuator.model_validate(document)
     return Inspection(
         name=machine.name,
         spatial=machine.spatial,

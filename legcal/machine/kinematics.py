@@ -215,9 +215,9 @@ def followed_poses(
     failure. Arguments and other exceptions are those of :func:`forward_kinematics_many`.
     """
     readings = _readings(machine, np.asarray(q, dtype=np.float64))
-    known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    reached = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
     if not on_the_chain:
-        poses, part = follow_poses(machine, machine.home, known[0], readings, LONG_STEP)
+        poses, part = follow_poses(machine, machine.home, reached[0], readings, LONG_STEP)
         if np.all(part == 1.0):
             followed = motions_of(poses[:, :, :3], poses[:, :, 3])
             for i, (T, row) in enumerate(zip(followed, readings, strict=True)):
@@ -225,7 +225,7 @@ def followed_poses(
             return
     configurations = [machine.home_configuration]
     for i, row in enumerate(readings):
-        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
+        nearest = configurations[int(np.argmin(np.abs(np.array(reached) - row).max(axis=1)))]
         try:
             configuration = follow(machine, nearest, row, f" of row {i + 1}")
         except DidNotConverge as failure:
@@ -234,7 +234,7 @@ def followed_poses(
         T = platform_pose(machine, configuration)
         contradicted = _disagreement(machine, T, row, f" of row {i + 1}")
         if contradicted is None:
-            known.append(row)
+            reached.append(row)
             configurations.append(configuration)
         yield T, contradicted
 
@@ -295,13 +295,13 @@ def _disagreement(
     """Return the error of readings (n_motors,) that contradict each other, None if they do not."""
     if not machine.is_redundant:
         return None
-    found = contradictions(machine, [platform_in_base(machine, T)], readings[None])
-    if not found:
+    conflicts = contradictions(machine, [platform_in_base(machine, T)], readings[None])
+    if not conflicts:
         return None
     return DidNotConverge(
         Problem(
             f"the pose at the readings{which} could not be computed",
-            str(found[0].cause(machine)),
+            str(conflicts[0].cause(machine)),
             "",
             "check this reading, its encoder and the offset of the leg",
             str(machine.yaml_path),
@@ -407,23 +407,23 @@ def follow(
     q_columns, v_columns = slider_columns(machine, motors)
     free = np.delete(np.arange(machine.chain.nv), v_columns)
     first, last = configuration[q_columns], readings[given]
-    known = machine.chain.linearize(configuration)[1][:, free]
+    last_jacobian = machine.chain.linearize(configuration)[1][:, free]
 
     def attempt(part: float) -> bool:
-        nonlocal configuration, known
+        nonlocal configuration, last_jacobian
         trial = configuration.copy()
         trial[q_columns] = last if part == 1.0 else first + part * (last - first)
         reached, jacobian = _closed_from(machine, trial, free)
         if reached is None or _is_flipped(machine, reached):
             return False
-        if not excludes_singularity(known, jacobian):
+        if not excludes_singularity(last_jacobian, jacobian):
             ends = [
                 matrix_of(*machine.chain.placement(c, machine.base, machine.platform))
                 for c in (configuration, reached)
             ]
             if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
                 return False
-        configuration, known = reached, jacobian
+        configuration, last_jacobian = reached, jacobian
         return True
 
     done = 0.0 if is_redundant else walk_in_steps(attempt, min_step)
@@ -471,8 +471,8 @@ def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTrans
     """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
     equations = equations_of_readings(machine, readings[None])
     tolerance = ROUNDING * machine.size
-    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
-    return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    solution = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
+    return motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
 
 
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
@@ -480,10 +480,10 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
+        rows = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
         if machine.is_redundant:
-            return least_squares_equations(found, n_dependent)
-        return found.values, found.by_pose
+            return least_squares_equations(rows, n_dependent)
+        return rows.values, rows.by_pose
 
     return equations
 
@@ -496,8 +496,8 @@ def follow_poses(
     The joints of the chain do not count. With them comes which part of each way is done, (k,).
     """
     T = start.as_matrix()[None]
-    known = dimensionless(machine, T)
-    poses, known = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], known))
+    jacobians = dimensionless(machine, T)
+    poses, jacobians = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], jacobians))
     scale = leg_scale(machine, start)
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     motors = list(machine.motors)
@@ -512,7 +512,7 @@ def follow_poses(
             now = readings_at_poses(machine, poses[rows])[:, motors]
             share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
             readings = now + share * (last[rows] - now)
-        found = newton(
+        solution = newton(
             equations_of_readings(machine, readings),
             poses_after,
             poses[rows],
@@ -522,14 +522,14 @@ def follow_poses(
             unit=unit,
             steps=REDUNDANT_STEPS if machine.is_redundant else FEW_STEPS,
         )
-        jacobian = dimensionless(machine, found.points)
-        good = found.converged | (found.worst < TOLERANCE * scale)
-        good &= ~_is_reversed(machine, found.points)
+        jacobian = dimensionless(machine, solution.points)
+        good = solution.converged | (solution.worst < TOLERANCE * scale)
+        good &= ~_is_reversed(machine, solution.points)
         for i in np.flatnonzero(good):
-            if not excludes_singularity(known[rows[i]], jacobian[i]):
-                good[i] = is_on_same_side(known[rows[i]], jacobian[i])
+            if not excludes_singularity(jacobians[rows[i]], jacobian[i]):
+                good[i] = is_on_same_side(jacobians[rows[i]], jacobian[i])
         reached = rows[good]
-        poses[reached], known[reached] = found.points[good], jacobian[good]
+        poses[reached], jacobians[reached] = solution.points[good], jacobian[good]
         done[reached] = part[good]
         step[rows] *= np.where(good, 2.0, 0.5)
 
@@ -539,10 +539,10 @@ def _closed_from(
 ) -> tuple[Array | None, Array]:
     """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
     equations, retract = closure_equations(machine, None, machine.size, free)
-    found = newton(
+    solution = newton(
         equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
-    return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
+    return solution.points[0] if solution.worst[0] < CLOSED else None, solution.jacobian[0]
 
 
 def _closed_at(
@@ -571,7 +571,7 @@ def _closed_at(
 
 
 def _is_flipped(machine: Machine, configuration: Array) -> bool:
-    """Say whether a leg without a motor has shrunk through its base joint."""
+    """Return whether a leg without a motor has shrunk through its base joint."""
     rows = [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE]
     if not rows:
         return False
@@ -582,9 +582,9 @@ def _is_flipped(machine: Machine, configuration: Array) -> bool:
 def _is_reversed(machine: Machine, poses: Array) -> BoolArray:
     """Say at which poses (k, 3, 4) a leg that is fixed to the platform points the wrong way."""
     R, t = poses[:, :, :3], poses[:, :, 3]
-    found = np.zeros(len(poses), dtype=np.bool_)
+    reversed_poses = np.zeros(len(poses), dtype=np.bool_)
     for leg in machine.legs:
         if leg.is_fixed_to_platform and leg.platform_axis is not None:
             along = (R @ leg.platform_axis) * (R @ leg.B + t - leg.A)
-            found |= along.sum(axis=1) <= 0.0
-    return found
+            reversed_poses |= along.sum(axis=1) <= 0.0
+    return reversed_poses

@@ -146,17 +146,17 @@ def with_radii(
 ) -> tuple[tuple[Cylinder, ...], ...]:
     """Return the cylinders of all legs with other radii [m], by number of the leg and cylinder."""
     return tuple(
-        tuple(replace(one, radius=radius(j, one)) for one in of_leg)
+        tuple(replace(cylinder, radius=radius(j, cylinder)) for cylinder in of_leg)
         for j, of_leg in enumerate(cylinders)
     )
 
 
 def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:
     """Return the cylinder that each link names as a part: its longest; the others hide pieces."""
-    found: dict[str, Cylinder] = {}
+    longest: dict[str, Cylinder] = {}
     for cylinder in sorted(cylinders, key=lambda c: (c.end - c.start, c.radius)):
-        found[cylinder.link] = cylinder
-    return found
+        longest[cylinder.link] = cylinder
+    return longest
 
 
 def cylinder_of_arm(arm: Arm) -> Cylinder:
@@ -366,7 +366,7 @@ class Leg:
         return arm if arm is not None and arm.leg == self.name else None
 
     def is_arm(self, part: str) -> bool:
-        """Say whether one of its parts is not along the leg but the arm of its motor."""
+        """Return whether one of its parts is not along the leg but the arm of its motor."""
         return self.arm is not None and self.arm.link == part
 
     @property
@@ -407,14 +407,14 @@ class Leg:
     @property
     def equations(self) -> tuple[EquationKind, ...]:
         """The equations of this leg, in the order of their rows."""
-        found = [EquationKind.LENGTH]
+        kinds = [EquationKind.LENGTH]
         if self.base_axis is not None:
-            found += self.base_joint.at_base
+            kinds += self.base_joint.at_base
         if self.platform_axis is not None:
-            found += self.platform_joint.at_platform
+            kinds += self.platform_joint.at_platform
         if self.twist is not None:
-            found.append(EquationKind.TWIST)
-        return tuple(found)
+            kinds.append(EquationKind.TWIST)
+        return tuple(kinds)
 
     @property
     def urdf_chain(self) -> LegChain:
@@ -504,7 +504,7 @@ def with_platform_points(
     :func:`frame_point`, another at the foot of the platform link's origin, *origin* (3,) in the
     frame of the legs [m], if that is given.
     """
-    found = []
+    moved = []
     for j, leg in enumerate(legs):
         point = frame_point(legs, frame_legs, j) if j in frame_legs else origin
         if leg.is_fixed_to_platform and leg.platform_axis is not None and point is not None:
@@ -520,8 +520,8 @@ def with_platform_points(
                     for c in leg.cylinders
                 ),
             )
-        found.append(leg)
-    return tuple(found)
+        moved.append(leg)
+    return tuple(moved)
 
 
 def radius_name(leg_name: str, part: str) -> str:

@@ -126,7 +126,9 @@ def _load(source: Source) -> Machine:
     _check_names(file, urdf, source.path)
     # The closures: in one order, since sums depend on it.
     pairs = sorted(zip(file.closed_loop, file.type, strict=True))
-    closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
+    closures = [
+        Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
+    ]
     # Base, platform and legs, as the file has them or proposed; home from a drawing, if any.
     block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
     if block.home is None and source.poses is not None:
@@ -134,9 +136,9 @@ def _load(source: Source) -> Machine:
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
-    urdf, own = with_own_origins(source.urdf, closures, machine)
+    urdf, closures_there = with_own_origins(source.urdf, closures, machine)
     if urdf is not source.urdf:
-        machine = _assemble(replace(source, urdf=urdf), block, own)
+        machine = _assemble(replace(source, urdf=urdf), block, closures_there)
     # Home: a pose that closes.
     given = machine.home if block.home is not None else None
     if given is not None and source.is_drawn_open and not machine.actuators:
@@ -176,8 +178,8 @@ def _load(source: Source) -> Machine:
     _check_dependence(machine)
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = mechanism_notes(machine, home_is_given=block.home is not None)
-    return replace(machine, diagnostics=(*source.notes, *proposed, *found))
+    notes = mechanism_notes(machine, home_is_given=block.home is not None)
+    return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
@@ -254,8 +256,10 @@ def _closed_chain(
     chains: Sequence[LegChain],
 ) -> ClosedChain:
     """Return the tree with its closures, and actuators with their gains."""
-    known = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
-    gains = {str(c.motor): known.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
+    stated_gains = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {
+        str(c.motor): stated_gains.get(str(c.motor), 1.0) for c in chains if c.actuator is not None
+    }
     try:
         normals = normals_of_closures(in_plane, closures, block, urdf)
         return ClosedChain(urdf.text, closures, normals, gains)
@@ -285,13 +289,13 @@ def _actuators(
         actuator, place = stated.get(name), f"legcal.motors.{name}"
         wrong = Problem(f"{place} could not be used", file=str(path), name=place)
         if actuator is None:
-            known = sorted(str(motor) for motor in stated)
+            motors = sorted(str(motor) for motor in stated)
             problems.append(
                 replace(
                     wrong,
                     found="no motor of that name that carries rods",
-                    needed=f"one of {', '.join(known) or 'them in the model'}",
-                    remedy=closest(name, known or ["none"]),
+                    needed=f"one of {', '.join(motors) or 'them in the model'}",
+                    remedy=closest(name, motors or ["none"]),
                 )
             )
             continue
@@ -324,15 +328,15 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
 
 def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
     """Refuse readings at home of joints that are no actuators."""
-    known = sorted(actuator.joint for actuator in machine.actuators)
+    joints = sorted(actuator.joint for actuator in machine.actuators)
     for name in given:
-        if name not in known:
+        if name not in joints:
             raise ModelError(
                 Problem(
                     f"legcal.home_readings.{name} could not be used",
                     "no actuator of that name",
-                    f"one of {', '.join(known)}",
-                    closest(name, known),
+                    f"one of {', '.join(joints)}",
+                    closest(name, joints),
                     str(machine.yaml_path),
                 )
             )
@@ -364,12 +368,12 @@ def _readings_at_home(
     for j, leg in enumerate(machine.legs):
         if leg.actuator is None:
             continue
-        both = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
         size, unit = SHOWN_IN[leg.reading_unit]
-        said = f"the readings {size * both[0]:.1f} and {size * both[1]:.1f} {unit}"
+        said = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         if leg.actuator.joint in given:
             wanted = given[leg.actuator.joint]
-            q[j] = min(both, key=lambda x: abs(x - wanted))
+            q[j] = min(readings, key=lambda x: abs(x - wanted))
             if not leg.in_travel(np.array([wanted]))[0]:
                 degrees = ", in radians" if leg.reads_angle else ""
                 raise ModelError(
@@ -383,12 +387,12 @@ def _readings_at_home(
                     )
                 )
             continue
-        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
+        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
         scale = 1e-6 * float(np.ptp(leg.travel))
         if all(inside) and leg.actuator.joint in drawn:
-            q[j] = min(both, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
+            q[j] = min(readings, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
             continue
-        if all(inside) and abs(both[0] - both[1]) > scale:
+        if all(inside) and abs(readings[0] - readings[1]) > scale:
             raise ModelError(
                 Problem(
                     f"the assembly of leg '{leg.name}' at home is ambiguous",
@@ -400,7 +404,11 @@ def _readings_at_home(
                 )
             )
         middle = 0.5 * sum(leg.travel)
-        q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
+        q[j] = (
+            readings[inside.index(True)]
+            if any(inside)
+            else min(readings, key=lambda x: abs(x - middle))
+        )
     return q
 
 
@@ -417,8 +425,8 @@ def _legs_in_order(
     problems, ordered = [], list[LegChain]()
     owner: dict[int, str] = {}
     for name, joint in block.legs.items():
-        found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
-        if not found:
+        matches = [c for c in chains if _is_on(joint, c, bodies, urdf)]
+        if not matches:
             problems.append(
                 Problem(
                     f"legcal.legs.{name} could not be used",
@@ -428,19 +436,19 @@ def _legs_in_order(
                     str(path),
                 )
             )
-        elif id(found[0]) in owner:
+        elif id(matches[0]) in owner:
             problems.append(
                 Problem(
                     f"legcal.legs.{name} could not be used",
-                    f"'{joint}' on the leg that is already named '{owner[id(found[0])]}'",
+                    f"'{joint}' on the leg that is already named '{owner[id(matches[0])]}'",
                     "a leg of its own",
                     "correct it",
                     str(path),
                 )
             )
         else:
-            owner[id(found[0])] = name
-            ordered.append(found[0])
+            owner[id(matches[0])] = name
+            ordered.append(matches[0])
     problems += [
         Problem(
             "legcal.legs is incomplete",
@@ -458,7 +466,7 @@ def _legs_in_order(
 
 
 def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
-    """Say whether a joint belongs to a leg."""
+    """Return whether a joint belongs to a leg."""
     if any(step.connection.joint == joint for step in chain.steps):
         return True
     entry = urdf.joints[joint]
@@ -494,24 +502,24 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     problems = [
         Problem(
             f"{place} could not be used",
-            f"the {what} '{name}', which is not in {urdf.path.name}",
+            f"the {kind} '{name}', which is not in {urdf.path.name}",
             "",
-            closest(name, sorted(known)),
+            closest(name, sorted(candidates)),
             str(path),
         )
-        for place, name, what, known in named
-        if name not in known
+        for place, name, kind, candidates in named
+        if name not in candidates
     ]
     problems += [
         Problem(
             f"closed_loop.{i} could not be used",
-            f"'{one}' twice",
+            f"'{frame_1}' twice",
             "two frames",
             "correct one of them",
             str(path),
         )
-        for i, (one, two) in enumerate(file.closed_loop)
-        if one == two
+        for i, (frame_1, frame_2) in enumerate(file.closed_loop)
+        if frame_1 == frame_2
     ]
     problems += _frames_of_neighbours(file, urdf, path)
     if block is not None and block.base == block.platform:
@@ -682,7 +690,7 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
 
 
 def _beyond_turns(joint: UrdfJoint) -> bool:
-    """Say whether a joint turns further than any arm."""
+    """Return whether a joint turns further than any arm."""
     return joint.limits is not None and max(map(abs, joint.limits)) > MAX_TURN
 
 

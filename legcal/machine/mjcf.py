@@ -211,7 +211,7 @@ class MjcfReader:
         return bodies
 
     def _is_free(self, joints: list[BodyElement]) -> bool:
-        """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
+        """Return whether the joints of a body, none of them driven, leave it all six freedoms."""
         axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
         for part in joints:
             attributes = self._attributes(part)
@@ -375,9 +375,9 @@ class MjcfReader:
 
     def _unused(self, name: str) -> str:
         """Return a name that nothing in the file has, and take it."""
-        found = self.tree.unused(name, self._names)
-        self._names.add(found)
-        return found
+        unused = self.tree.unused(name, self._names)
+        self._names.add(unused)
+        return unused
 
     # Closures and motors
 
@@ -391,11 +391,11 @@ class MjcfReader:
             if attributes.get("active", "true") == "false":
                 continue
             if element.tag not in ("connect", "weld"):
-                found = "is no constraint that legcal knows"
+                reason = "is no constraint that legcal knows"
                 if element.tag in _COUPLINGS:
-                    found = f"couples <{element.tag}> coordinates, which is not followed"
+                    reason = f"couples <{element.tag}> coordinates, which is not followed"
                 remedy = "close loops with <connect> and <weld> alone"
-                self.problems.add(element, found, remedy)
+                self.problems.add(element, reason, remedy)
                 continue
             name = str(attributes.get("name") or f"{element.tag}{i}")
             if name in names:
@@ -421,14 +421,14 @@ class MjcfReader:
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
         """Return the two sites that a constraint holds together."""
-        found = []
+        sites = []
         for key in ("site1", "site2"):
             name = element.get(key, "")
             if name in self.sites:
-                found.append(self.sites[name])
+                sites.append(self.sites[name])
             else:
                 self._unknown(element, f"the site '{name}' as {key}", name, self.sites)
-        return (found[0], found[1]) if len(found) == 2 else None
+        return (sites[0], sites[1]) if len(sites) == 2 else None
 
     def _joined_bodies(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
         """Return the frames on two bodies that a constraint holds together."""
@@ -493,22 +493,22 @@ class MjcfReader:
         return list(motors)
 
     def _unknown(
-        self, element: etree._Element, what: str, name: str, known: Mapping[str, object]
+        self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
     ) -> None:
         """Note that an element names something that is not in the file."""
-        remedy = closest(name, known).rstrip(".")
-        self.problems.add(element, f"names {what}, which is not in the file", remedy)
+        remedy = closest(name, candidates).rstrip(".")
+        self.problems.add(element, f"names {reference}, which is not in the file", remedy)
 
     # Attributes, with defaults and compiler options
 
     def _attributes(self, part: BodyElement) -> dict[str, str]:
         """Return the attributes of an element over those of its default class."""
-        own = _attributes_of(part.element)
-        classes = self._default(part.element, own.get("class", part.childclass))
+        stated = _attributes_of(part.element)
+        classes = self._default(part.element, stated.get("class", part.childclass))
         default = classes.get(str(part.element.tag), {})
-        if not ORIENTATIONS.keys().isdisjoint(own):
+        if not ORIENTATIONS.keys().isdisjoint(stated):
             default = {k: v for k, v in default.items() if k not in ORIENTATIONS}
-        return {**default, **own}
+        return {**default, **stated}
 
     def _default(self, element: etree._Element, name: str) -> Defaults:
         """Return a default class; the main one, with a problem, if it is not there."""
@@ -524,8 +524,8 @@ class MjcfReader:
     def _childclass(self, part: BodyElement) -> str:
         """Return the default class that holds within a body or frame."""
         name = part.element.get("childclass", part.childclass)
-        known = self._default(part.element, name) is self._defaults.get(name)
-        return name if known else part.childclass
+        is_defined = self._default(part.element, name) is self._defaults.get(name)
+        return name if is_defined else part.childclass
 
     def _numbers(
         self, element: etree._Element, attributes: Attributes, key: str, counts: tuple[int, ...]
@@ -534,8 +534,8 @@ class MjcfReader:
         text = attributes.get(key)
         if text is None:
             return None
-        found = number_list(text, len(text.split()))
-        if found is None or len(found) not in counts:
+        numbers = number_list(text, len(text.split()))
+        if numbers is None or len(numbers) not in counts:
             wanted = " or ".join(map(str, counts))
             self.problems.add(
                 element,
@@ -543,7 +543,7 @@ class MjcfReader:
                 "correct the value",
             )
             return None
-        return np.array(found)
+        return np.array(numbers)
 
     def _pose(self, element: etree._Element, attributes: Attributes) -> RigidTransform:
         """Return the motion of ``pos`` and an orientation."""
@@ -602,11 +602,11 @@ class MjcfReader:
         here = {tag: dict(values) for tag, values in inherited.items()}
         for part in element:
             if part.tag != "default":
-                values, own = here.setdefault(str(part.tag), {}), _attributes_of(part)
-                if not ORIENTATIONS.keys().isdisjoint(own):
+                values, attributes = here.setdefault(str(part.tag), {}), _attributes_of(part)
+                if not ORIENTATIONS.keys().isdisjoint(attributes):
                     for key in ORIENTATIONS:
                         values.pop(key, None)
-                values.update(own)
+                values.update(attributes)
         if name == "main":
             here = {**self._defaults["main"], **here}
             name = element.get("class", "main")
@@ -658,7 +658,7 @@ def _attributes_of(element: etree._Element) -> dict[str, str]:
 
 
 def _span_space(axes: list[Array]) -> bool:
-    """Say whether there are three axes, independent of each other."""
+    """Return whether there are three axes, independent of each other."""
     return len(axes) == 3 and int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) == 3
 
 

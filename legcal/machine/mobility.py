@@ -74,7 +74,7 @@ def _moved(machine: Machine, motions: Array) -> int:
 
 def generic_configurations(machine: Machine, count: int) -> list[Array]:
     """Return home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
-    chain, found = machine.chain, [machine.home_configuration]
+    chain, configurations = machine.chain, [machine.home_configuration]
     rng = np.random.default_rng(1965)
     unit = _column_units(machine)
     jacobian = chain.linearize(machine.home_configuration)[1] * unit
@@ -88,8 +88,8 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
         step = STEP * unit * direction / size
         configuration = project(machine, chain.integrate(machine.home_configuration, step))
         if configuration is not None:
-            found.append(configuration)
-    return found
+            configurations.append(configuration)
+    return configurations
 
 
 def project(machine: Machine, configuration: Array) -> Array | None:
@@ -100,7 +100,7 @@ def project(machine: Machine, configuration: Array) -> Array | None:
         residual, jacobian = chain.linearize(points[0])
         return (weights * residual)[None], (weights[:, None] * jacobian)[None]
 
-    found = solve(
+    solution = solve(
         equations,
         lambda points, step: chain.integrate(points[0], step[0])[None],
         configuration[None],
@@ -108,7 +108,7 @@ def project(machine: Machine, configuration: Array) -> Array | None:
         unit=_column_units(machine),
         steps=15,
     )
-    return found.points[0] if found.worst[0] < CLOSED else None
+    return solution.points[0] if solution.worst[0] < CLOSED else None
 
 
 def free_motions(machine: Machine, configuration: Array) -> Array:
@@ -198,27 +198,29 @@ def dimensionless(
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
 
 
-def is_on_same_side(known: Array, jacobian: Array) -> bool:
-    """Say whether two Jacobians of :func:`dimensionless` are on the same side of singularities.
+def is_on_same_side(reference: Array, jacobian: Array) -> bool:
+    """Return whether two Jacobians of :func:`dimensionless` are on the same side of singularities.
 
     Determinants of square ones have the same sign then. The sum of the products of all minors,
     det(J0' J1), says so too where there are more rows, because constraints follow from each other.
     Motors that do not determine the pose leave it zero.
     """
-    return len(known) >= known.shape[1] and bool(np.linalg.det(known.T @ jacobian) > 0.0)
+    return len(reference) >= reference.shape[1] and bool(
+        np.linalg.det(reference.T @ jacobian) > 0.0
+    )
 
 
-def excludes_singularity(known: Array, jacobian: Array) -> bool:
-    """Say whether two Jacobians differ too little for one of smaller rank between them."""
-    difference = jacobian - known
-    if known.shape[0] == known.shape[1]:
+def excludes_singularity(reference: Array, jacobian: Array) -> bool:
+    """Return whether two Jacobians differ too little for one of smaller rank between them."""
+    difference = jacobian - reference
+    if reference.shape[0] == reference.shape[1]:
         try:
-            change = np.linalg.solve(known, difference)
+            change = np.linalg.solve(reference, difference)
         except np.linalg.LinAlgError:
-            change = np.full_like(known, np.inf)
+            change = np.full_like(reference, np.inf)
         if float(np.abs(change).sum(axis=1).max()) < MAX_CHANGE:
             return True
-    left, values, right = np.linalg.svd(known, full_matrices=False)
+    left, values, right = np.linalg.svd(reference, full_matrices=False)
     rank = int(np.sum(values > 1e-6 * values[0]))
     change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
     return float(np.linalg.norm(change, 2)) < MAX_CHANGE

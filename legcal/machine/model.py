@@ -240,14 +240,16 @@ class Machine:
         for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
             base[leg, rank:n_d] = 0.0
             platform[leg, rank:n_d] = 0.0
-        found = parameters_of_legs(self.legs_of_frames)
-        return replace(found, base_joints=base, platform_joints=platform)
+        parameters = parameters_of_legs(self.legs_of_frames)
+        return replace(parameters, base_joints=base, platform_joints=platform)
 
     def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
         """Return the mechanism with other radii of its visible cylinders, as :func:`with_radii`."""
         others = with_radii([leg.cylinders for leg in self.legs], radius)
         legs = zip(self.legs, others, strict=True)
-        return replace(self, legs=tuple(replace(leg, cylinders=own) for leg, own in legs))
+        return replace(
+            self, legs=tuple(replace(leg, cylinders=cylinders) for leg, cylinders in legs)
+        )
 
     def with_leg_order(self, names: Sequence[str]) -> "Machine":
         """Return the same mechanism with its legs, each named once, in another order.
@@ -314,8 +316,8 @@ def readings_at_poses(machine: Machine, poses: Array) -> Array:
     B = B_at(machine, poses)
     lengths = np.linalg.norm(B - machine.A_base, axis=2)
     hangs = np.array([leg.actuator is not None for leg in machine.legs])
-    own = machine.sign * (lengths - machine.q0)
-    return np.asarray(np.where(hangs, _of_actuators(machine, B), own))
+    of_sliders = machine.sign * (lengths - machine.q0)
+    return np.asarray(np.where(hangs, _of_actuators(machine, B), of_sliders))
 
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:

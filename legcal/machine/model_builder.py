@@ -91,7 +91,7 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
 
 
 def _hangs_from_base(leg: AssembledLeg) -> bool:
-    """Say whether a leg hangs from the base, or what moves on it, and not from the platform.
+    """Return whether a leg hangs from the base, or what moves on it, and not from the platform.
 
     From the platform hangs a leg whose S is at the base.
     """

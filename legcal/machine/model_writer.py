@@ -107,8 +107,8 @@ def _joint_of(machine: Machine, leg: Leg) -> str:
     if leg.prismatic is not None and leg.actuator is None:
         return leg.prismatic
     chain = leg.urdf_chain
-    own = chain.steps[chain.actuator is not None :]
-    moving = [step.connection.joint for step in own if step.connection.joint]
+    steps = chain.steps[chain.actuator is not None :]
+    moving = [step.connection.joint for step in steps if step.connection.joint]
     fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
     return str([*moving, *fixed][0])
 
@@ -219,7 +219,7 @@ def _with_home(text: str, home: RigidTransform) -> str:
 
 
 def _is_written_down(machine: Machine) -> bool:
-    """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
+    """Return whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
     if machine.yaml_path.suffix.lower() in XML_SUFFIXES:
         return False
     content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
@@ -243,8 +243,8 @@ def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
 
 def check_closes(machine: Machine) -> None:
     """Check that a mechanism closes at home: its own readings lead back to it."""
-    found = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
-    away = machine.home.inv() * found
+    pose = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
+    away = machine.home.inv() * pose
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
     if not max(shift / machine.size, turn) <= CLOSES:
         raise DidNotConverge(

@@ -197,24 +197,28 @@ class PlacedOccluders:
             return np.zeros((0, 2, 2))
         return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
 
-    def hide(self, points: Array, own: IntArray, margin: Array, before: Array) -> IntArray:
+    def hide(self, points: Array, leg_of_point: IntArray, margin: Array, before: Array) -> IntArray:
         """Return which of them hides each point (n, 3) from the origin, -1 where none does.
 
-        ``own`` is the leg to which each point belongs, -1 of none, ``margin`` what others reach
-        beyond themselves where they are as far away as it, and ``before`` by how much at least what
-        hides it is nearer [m].
+        ``leg_of_point`` is the leg of each point, -1 for none, ``margin`` the reach of bodies of
+        other legs beyond their surface at the depth of the point, and ``before`` the least distance
+        by which a body that hides the point is nearer [m].
         """
         front = np.full(len(points), -1, dtype=np.intp)
         last = 1.0 - before / np.linalg.norm(points, axis=1)
         for i, occluder in enumerate(self.occluders):
-            is_own = own == occluder.leg if occluder.leg >= 0 else np.zeros(len(own), np.bool_)
-            if occluder.turns and (np.all(is_own) or occluder.triangles is not None):
+            is_same_leg = (
+                leg_of_point == occluder.leg
+                if occluder.leg >= 0
+                else np.zeros(len(leg_of_point), np.bool_)
+            )
+            if occluder.turns and (np.all(is_same_leg) or occluder.triangles is not None):
                 continue
-            reach = np.where(is_own, 0.0, margin)
+            reach = np.where(is_same_leg, 0.0, margin)
             behind = self._behind if occluder.triangles is None else self._behind_mesh
             hides = behind(i, points, reach, last)
             if occluder.turns:
-                hides &= ~is_own
+                hides &= ~is_same_leg
             front[hides] = i
         return front
 
@@ -338,7 +342,7 @@ def occluders_of(
     """Return what hides of the visuals of a file: all that is not measured and can be placed."""
     base, platform = ends
     places = _places(legs, bodies, base, platform, normals)
-    found = []
+    occluders = []
     for solid in shown:
         body = bodies.body_of[solid.link]
         if body not in places:
@@ -356,8 +360,8 @@ def occluders_of(
             occluder.planes  # noqa: B018
         except QhullError:  # flat
             continue
-        found.append(occluder)
-    return tuple(found)
+        occluders.append(occluder)
+    return tuple(occluders)
 
 
 def _places(
@@ -443,7 +447,7 @@ def _roll(
 
 
 def _turns_leg(chain: LegChain, i: int) -> bool:
-    """Say whether a joint of a leg is a revolute about it, or a sphere."""
+    """Return whether a joint of a leg is a revolute about it, or a sphere."""
     step = chain.steps[i]
     if step.connection.type != "revolute":
         return step.connection.type == "sphere"
@@ -508,11 +512,11 @@ def reordered(occluders: Sequence[Occluder], order: Sequence[int]) -> tuple[Occl
     def other(carrier: Carrier) -> Carrier:
         return replace(carrier, legs=tuple(place[j] for j in carrier.legs))
 
-    for carrier in (one.carrier for one in occluders):
+    for carrier in (occluder.carrier for occluder in occluders):
         if isinstance(carrier, Carrier):
             moved[id(carrier)] = other(carrier)
             continue
         roll = carrier.roll
         roll = None if roll is None else roll._replace(carrier=other(roll.carrier))
         moved[id(carrier)] = replace(carrier, leg=place[carrier.leg], roll=roll)
-    return tuple(replace(one, carrier=moved[id(one.carrier)]) for one in occluders)
+    return tuple(replace(occluder, carrier=moved[id(occluder.carrier)]) for occluder in occluders)

@@ -35,19 +35,19 @@ _ROUNDING = 1e-14  # [rad]: what turns less does not turn
 def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
-    found: dict[str, tuple[RigidTransform, bool]] = {}
+    origins: dict[str, tuple[RigidTransform, bool]] = {}
     moved = set[str]()  # motors that carry rods
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
         """Move a joint by a motion that is given in a link of its body."""
         joint, T_body_link = handle.joint, handles.bodies.T_body_link
-        T_parent_origin, is_turned = found.get(joint.name, (joint.T_parent_origin, False))
+        T_parent_origin, is_turned = origins.get(joint.name, (joint.T_parent_origin, False))
         there = RigidTransform.from_matrix(
             matrix_product(matrix_inverse(T_body_link[joint.parent]), T_body_link[body])
         )
         seen = motion.seen_from(there) if body != joint.parent else motion
         seen = seen.inv() if handle.is_inverse else seen
-        found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
+        origins[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
     for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
         chain = leg.urdf_chain
@@ -69,13 +69,13 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
         move(handles.of(first, first.near, base, leg.name), at_base, base)
         move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
-    return found
+    return origins
 
 
 def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTransform]]:
     """Return each arm that is not where the URDF draws it, and how its visual moves in its link."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
-    found = []
+    arms = []
     for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
         arm, other, chain = leg.arm, wanted.arm, leg.urdf_chain
         if arm is None or other is None or chain.actuator is None:
@@ -88,8 +88,8 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
         shift = line.point + along * line.axis - before.point
         motion = Motion(shift, before.point, _turn(before.axis, line.axis, directed=True))
         if motion.turn is not None or np.abs(shift).max() > _ROUNDING:
-            found.append((arm, motion.of(RigidTransform.identity())))
-    return found
+            arms.append((arm, motion.of(RigidTransform.identity())))
+    return arms
 
 
 def with_own_origins(
@@ -261,11 +261,11 @@ class Handles:
         raise NoOriginError(frame=frame, closure=closure)
 
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
-        """Say whether a link carries one joint or none, and so many frames of closures."""
-        found = [joint for joint in self._urdf.joints.values() if joint.parent == link]
+        """Return whether a link carries one joint or none, and so many frames of closures."""
+        joints = [joint for joint in self._urdf.joints.values() if joint.parent == link]
         frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
         uses = sum(frame_link(self._urdf, frame) == link for frame in frames)
-        return found == ([] if below is None else [below]) and uses == closures
+        return joints == ([] if below is None else [below]) and uses == closures
 
 
 @dataclass(frozen=True, eq=False)

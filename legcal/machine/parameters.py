@@ -89,7 +89,7 @@ def parametrize(
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is anywhere on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
-    found: list[tuple[str, str]] = []
+    parameters: list[tuple[str, str]] = []
     place = np.full(free.shape, -1, dtype=np.intp)
     for block in _BLOCKS:
         for j, leg in enumerate(legs):
@@ -100,13 +100,13 @@ def parametrize(
                     name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
                 else:
                     name, unit = _name_of_actuator(leg, column)
-                    shared = next((i for i, (n, _) in enumerate(found) if n == name), None)
+                    shared = next((i for i, (n, _) in enumerate(parameters) if n == name), None)
                     if shared is not None:
                         place[j, column] = shared
                         continue
-                place[j, column] = len(found)
-                found.append((name, unit))
-    return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
+                place[j, column] = len(parameters)
+                parameters.append((name, unit))
+    return Parametrization(tuple(n for n, _ in parameters), tuple(u for _, u in parameters), place)
 
 
 def _local_name(leg: Leg, column: int) -> str:
@@ -128,9 +128,9 @@ def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
     if column == ActuatorColumns.GAIN:
         return f"{actuator.joint}.gain", ""
     axis = "axis" if actuator.turns else "direction"
-    what, columns, unit = next(
-        (what, columns, unit)
-        for what, columns, unit in (
+    vector, columns, unit = next(
+        (vector, columns, unit)
+        for vector, columns, unit in (
             (axis, ActuatorColumns.AXIS, "rad"),
             ("axis_point", ActuatorColumns.POINT, "m"),
             ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
@@ -138,13 +138,13 @@ def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
         )
         if columns.start <= column < columns.stop
     )
-    return f"{actuator.joint}.{what}.{column - columns.start + 1}", unit
+    return f"{actuator.joint}.{vector}.{column - columns.start + 1}", unit
 
 
 def is_held_by_default(name: str) -> bool:
-    """Say whether a parameter is known unless somebody frees it: a twist, a gain, a line of an arm.
+    """Return whether a parameter is fixed by default: a twist, a gain, a line of an arm.
 
-    That of an arm which is seen is estimated about where the model draws it.
+    The line of a visible arm is estimated, near its line in the model.
     """
     return ParameterId.parse(name).kind in ("twist", "gain", *ARMS)
 
@@ -160,7 +160,7 @@ def n_frame_legs(*, spatial: bool) -> int:
 
 
 def is_spatial(frame_legs: Sequence[int]) -> bool:
-    """Say whether legs whose joints define a frame are of a platform in space, not in a plane."""
+    """Return whether frames defined by these legs are of a spatial platform, not a planar one."""
     return len(frame_legs) == n_frame_legs(spatial=True)
 
 
@@ -269,37 +269,40 @@ def with_numbers(
 
     Where an axis at the platform or a twist is given the leg has its twist as given.
     """
-    found = []
-    for leg, start, row, own in zip(legs, nominal, numbers, given, strict=True):
-        if not own.any():
-            found.append(leg)
+    moved_legs = []
+    for leg, start, row, is_given in zip(legs, nominal, numbers, given, strict=True):
+        if not is_given.any():
+            moved_legs.append(leg)
             continue
         axes = []
         for columns, axis, origin in (
             (LegColumns.BASE_AXIS, leg.base_axis, start.base_axis),
             (LegColumns.PLATFORM_AXIS, leg.platform_axis, start.platform_axis),
         ):
-            if axis is not None and origin is not None and own[columns].any():
+            if axis is not None and origin is not None and is_given[columns].any():
                 turned = turned_axis(origin, row[columns])
                 axis = turned if turned @ axis > 0.0 else -turned
             axes.append(axis)
         moved = replace(
             leg,
-            A=np.where(own[LegColumns.A], row[LegColumns.A], leg.A),
-            B=np.where(own[LegColumns.B], row[LegColumns.B], leg.B),
-            q0=float(row[LegColumns.LENGTH]) if own[LegColumns.LENGTH] else leg.q0,
+            A=np.where(is_given[LegColumns.A], row[LegColumns.A], leg.A),
+            B=np.where(is_given[LegColumns.B], row[LegColumns.B], leg.B),
+            q0=float(row[LegColumns.LENGTH]) if is_given[LegColumns.LENGTH] else leg.q0,
             base_axis=axes[0],
             platform_axis=axes[1],
         )
-        if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any():
+        if (
+            leg.twist is not None
+            and is_given[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any()
+        ):
             moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
-        of_actuator = own[LegColumns.ACTUATOR]
+        of_actuator = is_given[LegColumns.ACTUATOR]
         if leg.actuator is not None and start.actuator is not None and of_actuator.any():
             numbers_there = leg.actuator.numbers(start.actuator)
             wanted = np.where(of_actuator, row[LegColumns.ACTUATOR], numbers_there)
             moved = replace(moved, actuator=leg.actuator.with_numbers(start.actuator, wanted))
-        found.append(moved)
-    return tuple(found)
+        moved_legs.append(moved)
+    return tuple(moved_legs)
 
 
 def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, ...]:
@@ -346,7 +349,8 @@ def reframed(
     zero = ~free_coordinates(len(legs), frame_legs)
     moved = _in_frames(legs, RigidTransform.identity(), T)
     return tuple(
-        replace(leg, B=np.where(own, 0.0, leg.B)) for leg, own in zip(moved, zero, strict=True)
+        replace(leg, B=np.where(is_zero, 0.0, leg.B))
+        for leg, is_zero in zip(moved, zero, strict=True)
     )
 
 

@@ -64,8 +64,8 @@ def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
     ]
     for k, panel in enumerate(views):
         ends = (panel.standing.reshape(-1, 2), panel.moving.reshape(-1, 2))
-        both = np.concatenate([panel.A, panel.B, *ends])
-        middle = 0.5 * (both.min(axis=0) + both.max(axis=0))
+        corners = np.concatenate([panel.A, panel.B, *ends])
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         left, top = _SIDE * (k % across), _HEAD + _SIDE * (k // across)
         corner = np.array([left, top]) + 0.5 * _SIDE
 
@@ -164,14 +164,14 @@ def _round_length(length: float) -> float:
 
 
 def _line(
-    one: Sequence[float] | Array,
-    two: Sequence[float] | Array,
+    start: Sequence[float] | Array,
+    end: Sequence[float] | Array,
     colour: str,
     thick: float,
     opacity: float = 1.0,
 ) -> str:
     return (
-        f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{two[0]:.1f}" y2="{two[1]:.1f}" '
+        f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}" '
         f'stroke="{colour}" stroke-width="{thick:.1f}" stroke-opacity="{opacity:g}" '
         'stroke-linecap="butt"/>'
     )

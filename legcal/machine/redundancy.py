@@ -71,8 +71,8 @@ class ReadingTests:
         There are none if no test is beyond *most*, times the *scale* of residuals. Of several one
         is as likely wrong as another.
         """
-        own = np.flatnonzero(self.pose == pose)
-        order = own[np.argsort(-self.squared[own], kind="stable")]
+        tests = np.flatnonzero(self.pose == pose)
+        order = tests[np.argsort(-self.squared[tests], kind="stable")]
         squared = self.squared[order]
         if not squared[0] > (scale * most) ** 2:
             return []
@@ -100,7 +100,7 @@ class Contradiction:
         return Cause(
             f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from where the other motors put it, "
             "needed at most {:.1f} mm",
-            (first, *(one for pair in also for one in pair), off, 1e3 * self.allowed),
+            (first, *(value for pair in also for value in pair), off, 1e3 * self.allowed),
         )
 
 
@@ -153,27 +153,30 @@ def contradictions(
         lengthening = machine.sign * machine.at_readings(others)
         there = solve_poses(geometries(machine), machine.frame_legs, R, t, lengthening)
         at = _Surplus.of(machine, there.R, there.t, suspected)
-        left, own_r, own = (x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model))
-        good = (own > 0.0) & (there.size < _AT_REST)
-        redundancy[good, i], off[good, i] = own[good], own_r[good] / own[good]
-        explained[good, i] = np.maximum(chi2 - left + own * off[:, i] ** 2, 0.0)[good]
+        left, r_there, redundancy_there = (
+            x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model)
+        )
+        good = (redundancy_there > 0.0) & (there.size < _AT_REST)
+        redundancy[good, i] = redundancy_there[good]
+        off[good, i] = r_there[good] / redundancy_there[good]
+        explained[good, i] = np.maximum(chi2 - left + redundancy_there * off[:, i] ** 2, 0.0)[good]
     r = np.sqrt(explained * redundancy)
     judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
-    found = dict[int, Contradiction]()
+    by_pose = dict[int, Contradiction]()
     for k, pose in enumerate(np.flatnonzero(~used).tolist()):
-        alike = [one - k * len(unit) for one in judged.of_pose(pose, REJECTION, scale)]
+        alike = [reading - k * len(unit) for reading in judged.of_pose(pose, REJECTION, scale)]
         if not alike:
             continue
         distance = np.abs(off[k]) * sigma_m
         alike.sort(key=distance.__getitem__)
         i = alike[0]
-        found[pose] = Contradiction(
-            tuple(machine.motors[own] for own in alike),
+        by_pose[pose] = Contradiction(
+            tuple(machine.motors[motor] for motor in alike),
             float(off[k, i] * sigma_m[i] * unit[i]),
             tuple(distance[alike].tolist()),
             float(REJECTION * scale * sigma_m[i] / np.sqrt(redundancy[k, i])),
         )
-    return found
+    return by_pose
 
 
 def _numbers(machine: Machine, poses: BoolArray) -> tuple[IntArray, IntArray]:
@@ -209,24 +212,26 @@ class _Surplus:
         """Return them of a nominal model at poses R, t of R_e in R_b and readings."""
         legs, motors = geometries(machine), machine.motors
         lengthening = machine.sign * machine.at_readings(readings)
-        found = equations_at_readings(legs, R, t, lengthening, by_local=True)
-        by_pose = found.by_pose[:, :, list(freedoms(machine.frame_legs))]
+        equations = equations_at_readings(legs, R, t, lengthening, by_local=True)
+        by_pose = equations.by_pose[:, :, list(freedoms(machine.frame_legs))]
         left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # what no motion changes
-        on, by_reading = actuator_index(legs), np.zeros((*found.values.shape, len(motors)))
+        on, by_reading = actuator_index(legs), np.zeros((*equations.values.shape, len(motors)))
         for i, j in enumerate(motors):
             if on[j] >= 0:
-                by_reading[:, :, i] = found.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
+                by_reading[:, :, i] = equations.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
             else:
-                by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
+                by_reading[:, equations.measured & (equations.leg == j), i] = -legs[j].sign
         parametrization = parametrization_of(machine)
         length = machine.size
         size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
-        by_model = found.by_parameters(parametrization) * (_MODEL * size)
-        values, own, of_model = (
-            np.einsum("kms,km...->ks...", left, x) for x in (found.values, by_reading, by_model)
+        by_model = equations.by_parameters(parametrization) * (_MODEL * size)
+        values, reading_effects, of_model = (
+            np.einsum("kms,km...->ks...", left, x) for x in (equations.values, by_reading, by_model)
         )
-        share = np.sum(own**2, axis=1) / np.maximum(np.sum(by_reading**2, axis=1), 1e-300)
-        return cls(values, own, of_model, share > _SAYS, ROUGH_READING * length)
+        share = np.sum(reading_effects**2, axis=1) / np.maximum(
+            np.sum(by_reading**2, axis=1), 1e-300
+        )
+        return cls(values, reading_effects, of_model, share > _SAYS, ROUGH_READING * length)
 
     def at(self, poses: BoolArray) -> _Surplus:
         """Return those of some poses."""
@@ -247,11 +252,11 @@ class _Surplus:
 
 def _fitted_model(surplus: _Surplus, sigma_m: Array, used: BoolArray) -> tuple[Array, Array]:
     """Return the errors of a model that some poses show, and their covariance."""
-    own = surplus.at(used)
-    weighted = np.swapaxes(own.by_model, 1, 2) @ own.information(sigma_m)
-    H = np.eye(own.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, own.by_model)
+    subset = surplus.at(used)
+    weighted = np.swapaxes(subset.by_model, 1, 2) @ subset.information(sigma_m)
+    H = np.eye(subset.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, subset.by_model)
     covariance = np.linalg.inv(H)
-    return -covariance @ np.einsum("kps,ks->p", weighted, own.values), covariance
+    return -covariance @ np.einsum("kps,ks->p", weighted, subset.values), covariance
 
 
 def _tested(
@@ -285,9 +290,9 @@ def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Arra
 
     They are zero up to rounding at the pose of forward kinematics unless motors are redundant.
     """
-    motors, found = list(machine.motors), np.zeros(machine.n_legs)
-    found[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
-    return found
+    motors, residuals = list(machine.motors), np.zeros(machine.n_legs)
+    residuals[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return residuals
 
 
 def consistent_readings(
@@ -317,9 +322,9 @@ def determining_readings(machine: Machine, readings: Array) -> Array:
     """
     if not machine.is_redundant:
         return readings
-    found = consistent_readings(machine, readings)
-    found[:, _surplus_motors(machine)] = np.nan
-    return found
+    determining = consistent_readings(machine, readings)
+    determining[:, _surplus_motors(machine)] = np.nan
+    return determining
 
 
 @lru_cache(maxsize=8)

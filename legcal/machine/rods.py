@@ -22,11 +22,11 @@ AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, a
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the actuators of legs, each once, in the order of their first legs."""
-    found: dict[str, Actuator] = {}
+    actuators: dict[str, Actuator] = {}
     for leg in legs:
         if leg.actuator is not None:
-            found.setdefault(leg.actuator.joint, leg.actuator)
-    return tuple(found.values())
+            actuators.setdefault(leg.actuator.joint, leg.actuator)
+    return tuple(actuators.values())
 
 
 def actuator_index(legs: Sequence[Leg]) -> list[int]:
@@ -48,22 +48,22 @@ class Carried:
 
     def at(self, q: Array) -> Array:
         """Return the joints (k, n, 3) at readings of actuators (k, n_actuators)."""
-        own, angle = self._own(q)
-        found = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
-        return np.asarray(found + self.slide * own)
+        reading, angle = self._readings_and_angles(q)
+        joints = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
+        return np.asarray(joints + self.slide * reading)
 
     def by_reading(self, q: Array) -> Array:
         """Return how each joint moves with the reading of its actuator there, (k, n, 3)."""
-        _, angle = self._own(q)
+        _, angle = self._readings_and_angles(q)
         turning = self.sin * np.cos(angle) - self.cos * np.sin(angle)
         return np.asarray(self.gain[:, None] * turning + self.slide)
 
-    def _own(self, q: Array) -> tuple[Array, Array]:
+    def _readings_and_angles(self, q: Array) -> tuple[Array, Array]:
         """Return the reading of the actuator of each joint, and its angle, (k, n, 1)."""
-        own = np.zeros((len(q), len(self.on)))
+        readings = np.zeros((len(q), len(self.on)))
         carried = self.on >= 0
-        own[:, carried] = q[:, self.on[carried]]
-        return own[..., None], (self.gain * own)[..., None]
+        readings[:, carried] = q[:, self.on[carried]]
+        return readings[..., None], (self.gain * readings)[..., None]
 
 
 @lru_cache(maxsize=16)
@@ -89,12 +89,12 @@ def arms_at(legs: Sequence[Leg], q: Array) -> dict[int, Array]:
 
     They are by the legs that have them as parts (:attr:`Leg.arm`), in the frame of A.
     """
-    on, found = actuator_index(legs), dict[int, Array]()
+    on, arms = actuator_index(legs), dict[int, Array]()
     for j, leg in enumerate(legs):
         if leg.actuator is not None and leg.arm is not None:
             ends = [leg.actuator.at(end, q[:, on[j]]) for end in leg.arm.ends]
-            found[j] = np.stack(ends, axis=1)
-    return found
+            arms[j] = np.stack(ends, axis=1)
+    return arms
 
 
 def ends_at_poses(

@@ -88,9 +88,9 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     """Return a mechanism YAML, checked in itself (its names are checked against the URDF later)."""
     content = read_file(path, WHAT)
     try:
-        found = parse_yaml(content, path, WHAT)
-        _check_kind(found, path)
-        file = validate(MechanismFile, _without_nulls(found), path)
+        document = parse_yaml(content, path, WHAT)
+        _check_kind(document, path)
+        file = validate(MechanismFile, _without_nulls(document), path)
     except DatasetError as error:
         raise ModelError(error.facts) from error
     problems = _contradictions(file, path)
@@ -99,9 +99,9 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     return file
 
 
-def _check_kind(found: Mapping[str, Any], path: Path) -> None:
+def _check_kind(document: Mapping[str, Any], path: Path) -> None:
     """Refuse the other YAML files that legcal reads, with the command for each."""
-    if "legcal_table" in found:
+    if "legcal_table" in document:
         raise ModelError(
             Problem(
                 f"the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
@@ -113,10 +113,10 @@ def _check_kind(found: Mapping[str, Any], path: Path) -> None:
         raise ModelError(what_a_dataset_is_for(path))
 
 
-def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
+def _without_nulls(document: dict[str, Any]) -> dict[str, Any]:
     """Drop empty optional lists, which YAML reads as null."""
     return {
-        k: v for k, v in found.items() if v is not None or k not in ("joint_name", "joint_type")
+        k: v for k, v in document.items() if v is not None or k not in ("joint_name", "joint_type")
     }
 
 
@@ -205,15 +205,15 @@ def _contradictions(file: MechanismFile, path: Path) -> list[Problem]:
 
 def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
     """Return what the YAML says of actuators beside the URDF, by their joints."""
-    found = dict[str, dict[str, float]]()
+    entries = dict[str, dict[str, float]]()
     for actuator in actuators:
         said = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
         if actuator.pulses is not None:
             said["centre_us"] = actuator.pulses.centre
             said["us_per_deg"] = actuator.pulses.per_degree
         if said:
-            found[actuator.joint] = said
-    return found
+            entries[actuator.joint] = said
+    return entries
 
 
 def mechanism_yaml(
@@ -221,7 +221,7 @@ def mechanism_yaml(
 ) -> str:
     """Return the YAML of a mechanism."""
     document = {
-        "closed_loop": [[one, two] for one, two, _ in loops],
+        "closed_loop": [[first, second] for first, second, _ in loops],
         "type": [kind for *_, kind in loops],
         "name_mot": motors,
         "joint_name": [],

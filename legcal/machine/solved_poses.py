@@ -64,38 +64,38 @@ def solve_poses(
 
     def equations(poses: Array) -> tuple[Array, Array]:
         if lengthening is None:
-            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
-            found = found.of(~found.measured)
+            rows = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+            rows = rows.of(~rows.measured)
         else:
-            found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        jacobian = found.by_pose.copy()
+            rows = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        jacobian = rows.by_pose.copy()
         jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
+        return rows.values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
     length = mean_length(legs, poses[0]) if len(poses) else 1.0
     if scale is None:
         scale = np.repeat([1.0, length], 3)
     how: dict[str, Any] = {"tolerance": ROUNDING * length, "unit": scale, "rank": DEPENDENT}
-    found = solve(equations, poses_after, poses, steps=steps, **how)
-    poses, missed, size = found.points, found.worst, found.size
+    solution = solve(equations, poses_after, poses, steps=steps, **how)
+    poses, missed, size = solution.points, solution.worst, solution.size
     if lengthening is None or len(poses) == 0:
         return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
-    def with_known(poses: Array) -> PoseEquations:
-        found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        found.by_pose[:, :, fixed] = 0.0
-        return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
+    def constraints_and_readings(poses: Array) -> PoseEquations:
+        rows = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        rows.by_pose[:, :, fixed] = 0.0
+        return rows.of(~rows.measured | np.isfinite(lengthening[0, rows.leg]))
 
-    if is_overdetermined(with_known(poses), freedoms(frame_legs)):
-        found = solve(
-            lambda poses: least_squares_equations(with_known(poses)),
+    if is_overdetermined(constraints_and_readings(poses), freedoms(frame_legs)):
+        solution = solve(
+            lambda poses: least_squares_equations(constraints_and_readings(poses)),
             poses_after,
             poses,
             steps=steps,
             **how,
         )
-        poses, size = found.points, found.size
+        poses, size = solution.points, solution.size
         missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
     return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
@@ -112,10 +112,10 @@ def solve_postures(
 
     def equations(points: Array) -> tuple[Array, Array]:
         poses = points[:, :12].reshape(-1, 3, 4)
-        found = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
-        jacobian = np.concatenate([found.by_pose, found.by_q], axis=2)
+        rows = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
+        jacobian = np.concatenate([rows.by_pose, rows.by_q], axis=2)
         jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
+        return rows.values, jacobian
 
     def retract(points: Array, step: Array) -> Array:
         poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
@@ -124,12 +124,12 @@ def solve_postures(
     points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
     points = np.concatenate([points, q], axis=1)
     length = mean_length(legs, points[0, :12].reshape(3, 4)) if len(points) else 1.0
-    found = solve(
+    solution = solve(
         equations, retract, points, tolerance=ROUNDING * length, unit=scale, rank=DEPENDENT
     )
-    poses = found.points[:, :12].reshape(-1, 3, 4)
-    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
-    return solved, found.points[:, 12:]
+    poses = solution.points[:, :12].reshape(-1, 3, 4)
+    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], solution.worst, solution.size)
+    return solved, solution.points[:, 12:]
 
 
 def project_pose(
@@ -150,15 +150,15 @@ def project_pose(
         return T, describe_worst(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        constraints = ~found.measured
-        return found.values[:, constraints], found.by_pose[:, constraints]
+        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        constraints = ~rows.measured
+        return rows.values[:, constraints], rows.by_pose[:, constraints]
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    found = solve(
+    solution = solve(
         equations, poses_after, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit
     )
-    projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-    if found.worst[0] <= 1e-9 * scale:
+    projected = motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
+    if solution.worst[0] <= 1e-9 * scale:
         return projected, None
     return projected, describe_worst(machine, constraints_at(machine, projected))

@@ -63,11 +63,11 @@ class UrdfBuilder:
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name that no link and no joint has yet: the given one, or it with a number."""
         taken = self.links.keys() | self.joints.keys() | others
-        number, found = 1, name
-        while found in taken:
+        number, unused = 1, name
+        while unused in taken:
             number += 1
-            found = f"{name}_{number}"
-        return found
+            unused = f"{name}_{number}"
+        return unused
 
     def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
         """Add a link with its visible cylinders."""
@@ -196,10 +196,10 @@ def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[l
             group[find(joint.child)] = find(joint.parent)
     ground = find(urdf.root)
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
-    ends = [(frame_link(urdf, one), frame_link(urdf, two)) for one, two in closures]
-    for one, two in (*pairs, *ends):
-        if ground not in (find(one), find(two)):
-            group[find(two)] = find(one)
+    ends = [(frame_link(urdf, first), frame_link(urdf, second)) for first, second in closures]
+    for first, second in (*pairs, *ends):
+        if ground not in (find(first), find(second)):
+            group[find(second)] = find(first)
     closed = {find(link) for pair in ends for link in pair} - {ground}
     groups: dict[str, list[str]] = {}
     for link in urdf.links:
@@ -285,12 +285,12 @@ def close_loop(
     loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
 ) -> tuple[list[str], str]:
     """Add the frames of a loop to a tree and return the closure."""
-    one, two = loop.T_link_frame
+    T_first, T_second = loop.T_link_frame
     if loop.kind in ("revolute", "universal"):
-        one, two = _with_axes(loop, poses)
+        T_first, T_second = _with_axes(loop, poses)
     ends = []
     for number, (link, T_link_frame) in enumerate(
-        zip(loop.links, (one, two), strict=True), start=1
+        zip(loop.links, (T_first, T_second), strict=True), start=1
     ):
         frame = text.unused(f"{loop.name}_{number}")
         text.link(frame)
@@ -309,7 +309,7 @@ def _with_axes(
     loop: Loop, poses: Mapping[str, RigidTransform]
 ) -> tuple[RigidTransform, RigidTransform]:
     """Return the frames turned onto the axes of the joint, alike where the loop is closed."""
-    one, two = loop.T_link_frame
+    T_first, T_second = loop.T_link_frame
     first, second = (
         T.rotation.apply(axis) for T, axis in zip(loop.T_link_frame, loop.axes, strict=True)
     )
@@ -329,8 +329,8 @@ def _with_axes(
             _columns(along_x, second, cross(along_x, second)),
         )
     return (
-        RigidTransform.from_components(one.translation, rotations[0]),
-        RigidTransform.from_components(two.translation, rotations[1]),
+        RigidTransform.from_components(T_first.translation, rotations[0]),
+        RigidTransform.from_components(T_second.translation, rotations[1]),
     )
 
 

@@ -89,11 +89,11 @@ class Ties:
             value, row = self._point(legs, j)
             parts.append((np.array([value]), row[None]))
         if self.n_dependent:
-            _, found, stress = _closed(legs, self.n_dependent, self.postures)
-            wide = np.zeros((*found.values.shape, *shape))
-            wide[:, np.arange(len(found.leg)), found.leg] = found.by_local
+            _, equations, stress = _closed(legs, self.n_dependent, self.postures)
+            wide = np.zeros((*equations.values.shape, *shape))
+            wide[:, np.arange(len(equations.leg)), equations.leg] = equations.by_local
             rows = np.einsum("kms,kmjc->ksjc", stress, wide)
-            values = np.einsum("kms,km->ks", stress, found.values)
+            values = np.einsum("kms,km->ks", stress, equations.values)
             parts.append((values.ravel(), rows.reshape(-1, *shape)))
         values, rows = zip(*parts, strict=True)
         return TieRows(np.concatenate(values), np.concatenate(rows))
@@ -166,9 +166,9 @@ def by_step(rows: TieRows, place: IntArray) -> Array:
 
     Legs may share some, those of what carries their ends.
     """
-    found = np.zeros((int(place.max(initial=-1)) + 1, len(rows.values)))
-    np.add.at(found, place[place >= 0], rows.by_local[:, place >= 0].T)
-    return found.T
+    by_parameter = np.zeros((int(place.max(initial=-1)) + 1, len(rows.values)))
+    np.add.at(by_parameter, place[place >= 0], rows.by_local[:, place >= 0].T)
+    return by_parameter.T
 
 
 def on_ties(
@@ -184,8 +184,8 @@ def on_ties(
     at_nominal = ties.at(nominal)
     n = len(independent(at_nominal, by_step(at_nominal, place) * scale)[1])
     for _ in range(_STEPS):
-        found = ties.at(legs)
-        left, along = independent(found, by_step(found, place) * scale, n)
+        rows = ties.at(legs)
+        left, along = independent(rows, by_step(rows, place) * scale, n)
         step = -(along.T @ left)
         legs = moved_legs(legs, place, scale * step)
         if np.abs(step).max(initial=0.0) < _AT_REST:
@@ -211,7 +211,7 @@ def n_nearly_dependent(machine: Machine) -> int:
 
 
 def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -> bool:
-    """Say whether a machine with small errors can be moved to where it has its mobility again.
+    """Return whether a machine with small errors can be moved to where it has its mobility again.
 
     Then its constraints hold with as many of them dependent at postures where no tie was taken.
     """
@@ -230,17 +230,17 @@ def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -
 
 def ties_in_words(machine: Machine) -> str | None:
     """Return what the joints of an overconstrained machine tie, None where they tie nothing."""
-    ties, found = machine_ties(machine), parametrization_of(machine, twists=True)
+    ties, parametrization = machine_ties(machine), parametrization_of(machine, twists=True)
     if ties.n_dependent == 0:
         return None
     rows = ties.at(geometries(machine))
-    scale = np.where([name == "m" for name in found.units], machine.size, 1.0)
-    tied = sparse_basis(independent(rows, by_step(rows, found.place) * scale)[1])
+    scale = np.where([name == "m" for name in parametrization.units], machine.size, 1.0)
+    tied = sparse_basis(independent(rows, by_step(rows, parametrization.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
-    alone = [found.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
+    alone = [parametrization.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
     words = [f"{_named(alone, machine)} stay as they are"] if alone else []
     together = np.flatnonzero(np.any(np.abs(tied[~is_alone]) > SHOWN, axis=0))
-    names = [found.names[i] for i in together]
+    names = [parametrization.names[i] for i in together]
     if names:
         words.append(f"{_named(names, machine)} change only together")
     n = n_pose_constraints(machine.legs)
@@ -261,12 +261,12 @@ def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) 
     return posture_constraints(legs, at.R, at.t, at.q, by_local=by_local)
 
 
-def _slopes(legs: Sequence[Leg], found: PoseEquations, home: Array) -> tuple[Array, Array]:
+def _slopes(legs: Sequence[Leg], equations: PoseEquations, home: Array) -> tuple[Array, Array]:
     """Return derivatives (k, m, 6 + n) by postures, and what makes these comparable, (6 + n,)."""
     joints = actuators_of(legs)
     length = mean_length(legs, home)
     unit = np.array([length] * 3 + [1.0] * 3 + [length if j.turns else 1.0 for j in joints])
-    return np.concatenate([found.by_pose, found.by_q], axis=2) / unit, unit
+    return np.concatenate([equations.by_pose, equations.by_q], axis=2) / unit, unit
 
 
 def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
@@ -287,8 +287,8 @@ def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
     here = _constraints(legs, _Postures(R, t, readings_of_rods(legs, R, t)))
     if len(here.leg) < 2:
         return 0
-    found = np.linalg.svd(_slopes(legs, here, home)[0][0], compute_uv=False)
-    return len(here.leg) - int(np.sum(found > least * found[0]))
+    singular_values = np.linalg.svd(_slopes(legs, here, home)[0][0], compute_uv=False)
+    return len(here.leg) - int(np.sum(singular_values > least * singular_values[0]))
 
 
 def _postures_near(
@@ -317,16 +317,16 @@ def _closed(
     """
     home = np.concatenate([at.R[0], at.t[0][:, None]], axis=1)
     for _ in range(_STEPS):
-        found = _constraints(legs, at, by_local=True)
-        slopes, unit = _slopes(legs, found, home)
+        equations = _constraints(legs, at, by_local=True)
+        slopes, unit = _slopes(legs, equations, home)
         left, singular, right = np.linalg.svd(slopes)
         rank = left.shape[1] - n_dependent
-        along = np.einsum("kmr,km->kr", left[:, :, :rank], found.values) / singular[:, :rank]
+        along = np.einsum("kmr,km->kr", left[:, :, :rank], equations.values) / singular[:, :rank]
         step = -np.einsum("kr,krc->kc", along, right[:, :rank])
         if np.abs(step).max(initial=0.0) < _AT_REST * mean_length(legs, home):
             break
         at = _moved(at, step / unit)
-    return at, found, left[:, :, rank:]
+    return at, equations, left[:, :, rank:]
 
 
 def _moved(at: _Postures, step: Array) -> _Postures:

@@ -333,8 +333,8 @@ def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> 
     if block.platform_joint is None:
         return
     joint = urdf.joints[block.platform_joint]
-    found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
-    if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
+    carrying = bodies.body_of[joint.parent], bodies.body_of[joint.child]
+    if carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
         raise OutOfClass(
             Problem(
                 f"legcal.platform_joint '{joint.name}' is not covered",
@@ -398,8 +398,8 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
 
     for connection in bodies.connections:
         if base not in connection.bodies:
-            one, two = (find(body) for body in connection.bodies)
-            group[two] = one
+            first, second = (find(body) for body in connection.bodies)
+            group[second] = first
     others = [
         next(find(body) for body in c.bodies if body != base)
         for c in bodies.connections
@@ -577,19 +577,21 @@ def _not_a_chain(
             str(urdf.path),
         )
     if body == base:
-        found = "returns to the base"
+        course = "returns to the base"
     elif n_onward == 0:
-        found = f"ends at link '{body}' without reaching the platform"
+        course = f"ends at link '{body}' without reaching the platform"
     elif n_onward > 1 and _is_an_arm(steps, within):
-        found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        course = (
+            f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        )
         moved = "a motor in name_mot that moves this link"
         needed = f"joints whose centres are fixed in the base, or {moved}"
         remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
     else:
-        found = f"shares link '{body}' with another leg or branches there"
+        course = f"shares link '{body}' with another leg or branches there"
     return Problem(
         "this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}",
+        f"{_name(first)} {course}",
         "",
         needed,
         f"{remedy}check {urdf.wording.closures}, or {urdf.wording.correct_ends}",
@@ -598,13 +600,15 @@ def _not_a_chain(
 
 
 def _is_an_arm(steps: list[Step], within: float) -> bool:
-    """Say whether joints make an arm whose end moves: one revolute, or several apart."""
+    """Return whether joints make an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
     if len(steps) == 1:
         return True
-    for one, two in pairwise(steps):
-        near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
+    for lower, upper in pairwise(steps):
+        near, far = nearest(
+            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
+        )
         if near is None or far is None or float(np.linalg.norm(far - near)) > within:
             return True
     return False
@@ -658,21 +662,21 @@ def _platform_body(
     candidates = meeting or [body for body in at if body != base]
     candidates = [body for body in candidates if body in carried] or candidates
     candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last
-    found, reasons = [], list[OutOfClass]()
+    platforms, reasons = [], list[OutOfClass]()
     for body in candidates:
         try:
             find_chains(bodies, urdf, urdf.root, body, motors)
         except OutOfClass as error:
             reasons.append(error)
         else:
-            found.append(body)
-    if len(found) == 1:
-        return found[0]
-    if found:
+            platforms.append(body)
+    if len(platforms) == 1:
+        return platforms[0]
+    if platforms:
         raise OutOfClass(
             Problem(
                 "no platform could be proposed",
-                f"several links where legs could end ({', '.join(found)})",
+                f"several links where legs could end ({', '.join(platforms)})",
                 "one",
                 urdf.wording.state_ends,
                 str(path),

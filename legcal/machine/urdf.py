@@ -59,7 +59,7 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
     return robot
 
 
-def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
+def parse_xml(path: Path, content: bytes, kind: str) -> etree._Element:
     """Return the outermost element of an XML file, without comments, entities or the network."""
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False,
@@ -71,7 +71,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
         line = error.lineno or 1
         raise ModelError(
             Problem(
-                f"the {what} could not be read: found {error.msg}, needed "
+                f"the {kind} could not be read: found {error.msg}, needed "
                 "well-formed XML; mend that line, or copy the file again if it was cut off.",
                 file=str(path),
                 line=line,
@@ -81,7 +81,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 f"more than {MAX_ELEMENTS} elements",
                 "fewer",
                 "give the file of one mechanism",
@@ -92,7 +92,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     if document.doctype or document.internalDTD is not None:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 "a document type (<!DOCTYPE>), whose entities are never expanded",
                 "plain XML",
                 "remove it",
@@ -104,7 +104,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     except UnicodeDecodeError as error:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 "text in another encoding",
                 "UTF-8",
                 "save it as UTF-8",
@@ -145,12 +145,12 @@ class Problems:
     def __len__(self) -> int:
         return len(self.all)
 
-    def add(self, element: etree._Element, found: str, remedy: str) -> None:
+    def add(self, element: etree._Element, mistake: str, remedy: str) -> None:
         """Note what is wrong with an element of the file and how to mend it."""
         name = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
         self.all.append(
             Problem(
-                f"{name} could not be used: it {found}",
+                f"{name} could not be used: it {mistake}",
                 remedy=remedy,
                 file=str(self.path),
                 line=cast("int", element.sourceline),
@@ -159,9 +159,9 @@ class Problems:
             )
         )
 
-    def add_of_file(self, what: str, found: str, needed: str, remedy: str) -> None:
+    def add_of_file(self, consequence: str, found: str, needed: str, remedy: str) -> None:
         """Note what is wrong with the whole file."""
-        self.all.append(Problem(what, found, needed, remedy, str(self.path)))
+        self.all.append(Problem(consequence, found, needed, remedy, str(self.path)))
 
     def raise_if_any(self) -> None:
         """Raise all problems as one error."""
@@ -209,7 +209,7 @@ def check_tree(
     """Check that links and joints are one tree, and return its root link."""
     for elements in (links, joints):
         _check_names(elements, problems)
-    known = {e.get("name", "") for e in links}
+    names = {e.get("name", "") for e in links}
     children: dict[str, list[str]] = {}
     parent_joint: dict[str, str] = {}
     for joint in joints:
@@ -219,7 +219,7 @@ def check_tree(
             link = None if end is None else end.get("link")
             if link is None:
                 problems.add(joint, f"has no <{tag} link=...>", "name the link")
-            elif link not in known:
+            elif link not in names:
                 problems.add(
                     joint, f"names the {tag} link '{link}', which is not in the file",
                     "correct the name",
@@ -386,16 +386,16 @@ def checked_tree(
     links = [e for e in robot if e.tag == "link"]
     joints = [e for e in robot if e.tag == "joint"]
     n_moving = sum(e.get("type") != "fixed" for e in joints)
-    for found, most, what in (
+    for number, most, counted in (
         (len(links), MAX_LINKS, "links"),
         (len(joints), MAX_LINKS, "joints"),
         (n_moving, MAX_MOVING, "joints that move"),
     ):
-        if found > most:
+        if number > most:
             raise ModelError(
                 Problem(
                     "the mechanism could not be read",
-                    f"{found} {what}",
+                    f"{number} {counted}",
                     f"at most {most}",
                     "give one mechanism, with fixed joints where nothing moves",
                     str(path),
@@ -476,8 +476,8 @@ def _vector(
 ) -> Array:
     """Return three numbers of an attribute, or the default where they are missing or wrong."""
     text = None if element is None else element.get(attribute)
-    found = None if text is None else number_list(text, 3)
-    return np.array(default if found is None else found)
+    numbers = None if text is None else number_list(text, 3)
+    return np.array(default if numbers is None else numbers)
 
 
 def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:

@@ -40,7 +40,7 @@ _CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "rgba8": 4,
 
 
 def is_bag(path: Path) -> bool:
-    """Say whether a path is that of a bag."""
+    """Return whether a path is that of a bag."""
     return path.suffix.lower() in _BAGS or (path / _METADATA).is_file()
 
 
@@ -80,10 +80,10 @@ class Bag:
         """Return how many images could not be used."""
         if not self._bad:
             return ()
-        one = self._bad == 1
+        images, were = ("image", "was") if self._bad == 1 else ("images", "were")
         return (
-            f"{self._bad} image{'' if one else 's'} of {self.path} {'was' if one else 'were'} left "
-            "out: damaged, of an unknown encoding, or not later than the one before.",
+            f"{self._bad} {images} of {self.path} {were} left out: damaged, of an unknown "
+            "encoding, or not later than the one before.",
         )
 
     def readings(self) -> Series | None:
@@ -106,11 +106,11 @@ class Bag:
                 f"{', '.join(map(describe, topics)) or 'one'}; correct the name."
             )
         if self._image_topic is None and len(topics) != 1:
-            found = ", ".join(map(describe, topics)) or "no topic"
+            stated = ", ".join(map(describe, topics)) or "no topic"
             remedy = f"name it behind the bag, {self.path}:{topics[0]}" if topics else (
                 "give another bag")  # fmt: skip
             raise DatasetError(
-                f"{self.path}: the images could not be read: found {found} with them, needed one; "
+                f"{self.path}: the images could not be read: found {stated} with them, needed one; "
                 f"{remedy}."
             )
         return self._image_topic or topics[0]
@@ -177,8 +177,13 @@ def _image(message: Any) -> NDArray[np.uint8] | None:
         deep = np.frombuffer(data.tobytes(), dtype=order)[: rows * step // 2]
         return np.asarray(deep.reshape(rows, step // 2)[:, :columns] >> 8, dtype=np.uint8)
     channels = 1 if encoding.startswith("bayer_") else _CHANNELS.get(encoding, 0)
-    known = encoding in _CHANNELS or encoding in _COLOURS
-    if not known or min(rows, columns) < 1 or step < columns * channels or data.size < rows * step:
+    is_supported = encoding in _CHANNELS or encoding in _COLOURS
+    if (
+        not is_supported
+        or min(rows, columns) < 1
+        or step < columns * channels
+        or data.size < rows * step
+    ):
         return None
     image = data[: rows * step].reshape(rows, step)[:, : columns * channels]
     shaped = image if channels == 1 else image.reshape(rows, columns, channels)

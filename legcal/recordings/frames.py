@@ -88,8 +88,8 @@ class Video:
                     if only is not None and count not in only:
                         count += 1
                         continue
-                    found, image = video.retrieve()
-                    if not found:
+                    is_read, image = video.retrieve()
+                    if not is_read:
                         break
                     time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)  # of the frame just read
                     if time <= last:  # a container without times of its own
@@ -168,5 +168,5 @@ def _taken(photograph: Photograph) -> float | None:
 
 def stamp_in(text: str) -> float | None:
     """Return the Unix time [s] in a text, whatever its unit, or None."""
-    found = _STAMP.findall(text)
-    return unix_seconds(float(found[-1])) if found else None
+    stamps = _STAMP.findall(text)
+    return unix_seconds(float(stamps[-1])) if stamps else None

@@ -239,13 +239,13 @@ def plan_import(
     tables = {path: read_series(path, machine, lengths=lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
-        own = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
-        if own is None:
+        series = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
+        if series is None:
             raise UsageError(
                 f"{recording.path}: the readings could not be found: found none in it, needed a "
                 "table with times; give it with --readings."
             )
-        views.append(_view(name, recording, own, offset, progress, one_clock=not readings))
+        views.append(_view(name, recording, series, offset, progress, one_clock=not readings))
     return Import(machine, model, destination, tuple(views), tuple(cameras))
 
 
@@ -300,12 +300,12 @@ def _view(
         raise DatasetError(f"{start} found {len(times)} frames, needed those of a recording.")
     frames_move = moving(changes)
     moves = moving(reading_speeds(series.times, series.q))
-    for what, motion in (("frames", frames_move), ("readings", moves)):
+    for signal, motion in (("frames", frames_move), ("readings", moves)):
         if motion is None:
             raise DatasetError(
-                f"{start} found {what} that change alike all the time, needed a machine that rests "
-                "at each pose and moves between; for photographs of poses that were held use "
-                f"legcal init. ({series.source if what == 'readings' else recording.path})"
+                f"{start} found {signal} that change alike all the time, needed a machine that "
+                "rests at each pose and moves between; for photographs of poses that were held use "
+                f"legcal init. ({series.source if signal == 'readings' else recording.path})"
             )
     assert frames_move is not None
     assert moves is not None
@@ -325,10 +325,10 @@ def _view(
     _check_overlap(times - apart.seconds, series, start)
     stills, kept = still_frames(times, frames_move, series.times, moves, apart, LEAST_STILL)
     if not kept:
-        found = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
+        reasons = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
         raise DatasetError(
-            f"{start} found no frame to use ({found}), needed rests of {LEAST_STILL:g} s and more "
-            "with readings; record longer rests."
+            f"{start} found no frame to use ({reasons}), needed rests of {LEAST_STILL:g} s and "
+            "more with readings; record longer rests."
         )
     q = np.array([series.q[rows].mean(axis=0) for rows in kept])
     rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
@@ -379,7 +379,7 @@ def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, 
 
 
 def import_recordings(
-    found: Import, *, force: bool = False, progress: Report = no_progress
+    plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
     """Write the dataset of an import, complete or not at all; return its files but the images.
 
@@ -390,13 +390,13 @@ def import_recordings(
     UsageError
         If files are in the way and *force* is not given.
     """
-    check_path(found.destination, DATASET_FOLDER)
-    motors = [found.machine.legs[j] for j in found.machine.motors]
+    check_path(plan.destination, DATASET_FOLDER)
+    motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     try:
-        with temporary_folder(existing_parent(found.destination), found.destination.name) as folder:
+        with temporary_folder(existing_parent(plan.destination), plan.destination.name) as folder:
             rows: list[tuple[object, ...]] = []
-            for view in found.views:
+            for view in plan.views:
                 (folder / _SHOTS / view.name).mkdir(parents=True)
                 used = view.used
                 for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
@@ -413,13 +413,13 @@ def import_recordings(
             table = folder / _TABLE
             table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
             new = plan_new_dataset(
-                folder / _SHOTS, table, found.model, found.destination,
-                SheetOptions(cameras=found.cameras, encoder_sigma=found.encoder_sigma),
+                folder / _SHOTS, table, plan.model, plan.destination,
+                SheetOptions(cameras=plan.cameras, encoder_sigma=plan.encoder_sigma),
             )  # fmt: skip
             return write_new_dataset(new, force=force)
     except OSError as error:
         raise OutOfResources(
-            f"{found.destination}: the dataset could not be written: found "
+            f"{plan.destination}: the dataset could not be written: found "
             f"'{error.strerror or error}', needed a folder that takes its files; free some space "
             "or give another folder; nothing was written."
         ) from error

@@ -66,10 +66,12 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"poses that were held. {' '.join(sheet.notes)}".rstrip()
         )
-    found = sheet.readings(lengths=lengths)
+    readings = sheet.readings(lengths=lengths)
     times = _seconds(sheet.text("time"), path)
-    in_words = f"{found.unit}, {found.unit_from}"
-    return _in_order(Series(str(path), times, found.q, sheet.taken, in_words, tuple(sheet.notes)))
+    in_words = f"{readings.unit}, {readings.unit_from}"
+    return _in_order(
+        Series(str(path), times, readings.q, sheet.taken, in_words, tuple(sheet.notes))
+    )
 
 
 def series_of_joints(
@@ -79,11 +81,11 @@ def series_of_joints(
     joints = [column.name for column in reading_columns(machine.legs)]
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:
-        known = sorted({name for state in states for name in state})
-        missing = [name for name in joints if name not in known]
+        names = sorted({name for state in states for name in state})
+        missing = [name for name in joints if name not in names]
         raise DatasetError(
             f"{source}: the readings could not be used: found the joints "
-            f"{', '.join(map(describe, known[:10])) or 'none'}, needed "
+            f"{', '.join(map(describe, names[:10])) or 'none'}, needed "
             f"{', '.join(missing or joints)} in one message; rename the joints of the model or "
             "give a table with --readings."
         )
@@ -120,14 +122,14 @@ def _seconds(texts: Sequence[str], path: Path) -> Array:
         if seconds is None or len(wrong):
             raise _no_time(texts[wrong[0]], path)
         return numbers * (seconds / size if size else 1.0)
-    found = []
+    stamps = []
     for text in texts:
         try:
             moment = datetime.fromisoformat(text.strip())
         except ValueError:
             raise _no_time(text, path) from None
-        found.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
-    return np.array(found)
+        stamps.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+    return np.array(stamps)
 
 
 def _no_time(text: str, path: Path) -> DatasetError:

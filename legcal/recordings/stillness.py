@@ -93,19 +93,28 @@ def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves
     """
     span = max(np.ptp(frame_times), np.ptp(times))
     step = max(float(np.median(np.diff(frame_times))), span / _MOST_SAMPLES)
-    one, start_one = _on_grid(frame_times, frames_move, step)
-    two, start_two = _on_grid(times, moves, step)
-    n = correlate(np.ones_like(one), np.ones_like(two))
-    sums = [correlate(a, b) for a, b in ((one, np.ones_like(two)), (np.ones_like(one), two),
-                                         (one, two), (one**2, np.ones_like(two)),
-                                         (np.ones_like(one), two**2))]  # fmt: skip
+    frame_samples, start_of_frames = _on_grid(frame_times, frames_move, step)
+    reading_samples, start_of_readings = _on_grid(times, moves, step)
+    ones_1, ones_2 = np.ones_like(frame_samples), np.ones_like(reading_samples)
+    n = correlate(ones_1, ones_2)
+    sums = [
+        correlate(frame_samples, ones_2),
+        correlate(ones_1, reading_samples),
+        correlate(frame_samples, reading_samples),
+        correlate(frame_samples**2, ones_2),
+        correlate(ones_1, reading_samples**2),
+    ]
     n = np.maximum(np.round(n), 1.0)
     mean = [s / n for s in sums]
     spread = [np.maximum(mean[3] - mean[0] ** 2, 1e-6), np.maximum(mean[4] - mean[1] ** 2, 1e-6)]
     score = (mean[2] - mean[0] * mean[1]) / np.sqrt(spread[0] * spread[1])
-    # at index i the readings lie under the frames from sample i - len(two) + 1 on
-    lags = start_one - start_two + step * (np.arange(len(score)) - (len(two) - 1))
-    score[n < _LEAST_OVERLAP * min(len(one), len(two))] = -1.0
+    # At index i the readings start at frame sample i - len(reading_samples) + 1.
+    lags = (
+        start_of_frames
+        - start_of_readings
+        + step * (np.arange(len(score)) - (len(reading_samples) - 1))
+    )
+    score[n < _LEAST_OVERLAP * min(len(frame_samples), len(reading_samples))] = -1.0
     if most is not None:
         score[np.abs(lags) > most] = -1.0
     best = int(np.argmax(score))
@@ -195,7 +204,7 @@ def still_frames(
     """
     shifted = times + offset.seconds
     margin = 3.0 * offset.sigma
-    found: list[Still] = []
+    stills: list[Still] = []
     used: list[Sequence[int]] = []
     for first, last in runs(frames_move):
         begin, end = float(frame_times[first]), float(frame_times[last])
@@ -203,7 +212,7 @@ def still_frames(
             continue
         inside = np.flatnonzero((shifted >= begin + margin) & (shifted <= end - margin))
         if not len(inside):
-            found.append(Still(begin, end, None, "no reading"))
+            stills.append(Still(begin, end, None, "no reading"))
             continue
         rests = max(
             ((a, b) for a, b in runs(moves[inside[0] : inside[-1]])),
@@ -211,15 +220,15 @@ def still_frames(
             default=(0, 0) if len(inside) == 1 else None,
         )
         if rests is None:
-            found.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin, end, None, "readings moved"))
             continue
         kept = inside[rests[0] : rests[1] + 1]
         low, high = max(begin, shifted[kept[0]] - margin), min(end, shifted[kept[-1]] + margin)
         middle = 0.5 * (low + high) if len(kept) > 1 else float(shifted[kept[0]])
         if len(inside) > 1 and high - low < least:
-            found.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin, end, None, "readings moved"))
             continue
         frame = first + int(np.argmin(np.abs(frame_times[first : last + 1] - middle)))
-        found.append(Still(begin, end, frame))
+        stills.append(Still(begin, end, frame))
         used.append(kept.tolist())
-    return found, used
+    return stills, used

@@ -78,7 +78,7 @@ def directions(
     *length* is that of a leg [m], by which turns count.
     """
     names = list(parameters.names)
-    found = []
+    steps = []
     for weak in result.weakest:
         step = np.zeros(len(names))
         for name, component in zip(weak.parameters, weak.components, strict=True):
@@ -87,9 +87,9 @@ def directions(
                 per = length if parameters.units[i] == "rad" else 1.0
                 step[i] = weak.sigma_m * component / per
         if np.any(step):
-            found.append((f"1 sigma along: {weak.in_words}", step))
+            steps.append((f"1 sigma along: {weak.in_words}", step))
     order = [result.kinematic.names.index(name) for name in names]
     for words, row in zip(result.held, result.kinematic.held, strict=False):
         step = _HELD * length * np.array(row)[order]
-        found.append((f"{1e3 * _HELD * length:.2g} mm along what is held: {words}", step))
-    return found
+        steps.append((f"{1e3 * _HELD * length:.2g} mm along what is held: {words}", step))
+    return steps

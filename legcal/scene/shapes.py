@@ -44,11 +44,11 @@ def ellipsoids(result: Result) -> dict[str, Array]:
 
     Columns are axes, in the link; they are zero along what is fixed or defines a frame.
     """
-    found = {}
+    half_axes = {}
     for side, block in (result.links or {}).items():
         value, vector = np.linalg.eigh(np.array([joint.covariance for joint in block.joints]))
-        found[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
-    return found
+        half_axes[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+    return half_axes
 
 
 def enlargement(axes: Mapping[str, Array], radius: float) -> float:

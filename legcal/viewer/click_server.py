@@ -43,12 +43,12 @@ class ClickServer:
     """Serves the folder of a detection until it is closed."""
 
     def __init__(
-        self, found: Examination, detection: Detection, folder: Path, port: int = 0
+        self, examination: Examination, detection: Detection, folder: Path, port: int = 0
     ) -> None:
         self.detection = detection
         self.folder = folder
         self.token = secrets.token_urlsafe(16)
-        self._page = examination_page(found, detection, self.token).encode()
+        self._page = examination_page(examination, detection, self.token).encode()
         handler = partial(_Handler, self)
         self._server = _Server((HOST, port), handler)
         files = (*detection.photograph_files.values(), *detection.overlay_files.values())
@@ -95,10 +95,10 @@ class ClickServer:
         answer: dict[str, Any] = {
             "image": image, "problems": [], "notes": [], "legs": [], "joints": {},
         }  # fmt: skip
-        own = landmarks.choose(m.view[landmarks.row] == v)
-        if not len(own):
+        landmarks_here = landmarks.choose(m.view[landmarks.row] == v)
+        if not len(landmarks_here):
             return answer
-        camera = cameras_by_landmarks(Path(LANDMARKS_NAME), machine, m, own)[v]
+        camera = cameras_by_landmarks(Path(LANDMARKS_NAME), machine, m, landmarks_here)[v]
         answer |= {"problems": camera.problems, "notes": camera.notes}
         if camera.T_base_camera is not None:
             rows = np.array([row], dtype=np.intp)
@@ -151,11 +151,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send the page or a picture of it."""
-        found = self.clicks.content(urlsplit(self.path).path) if self._is_for_here() else None
-        if found is None:
+        content = self.clicks.content(urlsplit(self.path).path) if self._is_for_here() else None
+        if content is None:
             self.send_error(404)
             return
-        self._send(*found)
+        self._send(*content)
 
     def do_POST(self) -> None:
         """Take clicks."""
@@ -185,7 +185,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send("application/json", json.dumps(answer).encode())
 
     def _is_for_here(self) -> bool:
-        """Say whether a request names this machine: other names may be those of other pages."""
+        """Return whether a request names this machine: other names may be those of other pages."""
         port = self.clicks.address.port
         return self.headers.get("Host", "") in (f"{HOST}:{port}", f"localhost:{port}")
 

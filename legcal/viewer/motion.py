@@ -53,7 +53,7 @@ class Motion:
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
-        self.own = own_coordinates(machine)
+        self.columns = own_coordinates(machine)
         self._follower = Follower(machine) if machine.is_determined else None
         self.posture = self.home()
 
@@ -68,7 +68,7 @@ class Motion:
     def coordinates(self) -> Array:
         """The own coordinates of the pose, (m,) [m, rad]."""
         values, _ = coordinates_of(self.posture.T.as_matrix()[None, :3])
-        return np.asarray(values[0, self.own])
+        return np.asarray(values[0, self.columns])
 
     @property
     def at_end(self) -> BoolArray:
@@ -100,22 +100,22 @@ class Motion:
         The others as at home, it goes a little farther than the legs, where travels end.
         """
         machine, home = self.machine, self.machine.home.as_matrix()[:3]
-        centre = coordinates_of(home[None])[0][0, self.own]
+        centre = coordinates_of(home[None])[0][0, self.columns]
         scale = machine.size
         lower, upper = self.travel.T
-        found = np.zeros((len(self.own), 2))
-        for k, which in enumerate(self.own.tolist()):
+        ranges = np.zeros((len(self.columns), 2))
+        for k, which in enumerate(self.columns.tolist()):
             most = _WAY * scale if which < 3 else _TURN
             for side, sign in enumerate((-1.0, 1.0)):
                 steps = sign * most * np.arange(1, _TICKS + 1) / _TICKS
                 wanted = np.repeat(centre[None], _TICKS, axis=0)
                 wanted[:, k] += steps
-                poses, reached = poses_at_coordinates(machine, self.own, wanted, home)
+                poses, reached = poses_at_coordinates(machine, self.columns, wanted, home)
                 q = readings_at_poses(machine, poses)
                 inside = reached & (((q >= lower) & (q <= upper)) | ~self._slides).all(axis=1)
                 last = int(np.argmin(inside)) if not inside.all() else _TICKS
-                found[k, side] = centre[k] + _BEYOND * steps[max(last - 1, 0)]
-        return found
+                ranges[k, side] = centre[k] + _BEYOND * steps[max(last - 1, 0)]
+        return ranges
 
     def read(self, leg: int, value: float) -> Posture:
         """Return the machine with a motor at a reading [m], the others where they are.
@@ -152,7 +152,7 @@ class Motion:
         wanted = self.coordinates
         wanted[coordinate] = value
         near = self.posture.T.as_matrix()[:3]
-        poses, reached = poses_at_coordinates(self.machine, self.own, wanted[None], near)
+        poses, reached = poses_at_coordinates(self.machine, self.columns, wanted[None], near)
         if not reached[0]:
             return self._stay("The joints of the legs allow no pose with these coordinates.")
         return self._follow(motion_of(poses[0, :, :3], poses[0, :, 3]))

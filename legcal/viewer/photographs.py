@@ -134,26 +134,28 @@ class Photographs:
         none = np.zeros((0, 2, 3)), np.zeros(0, dtype=np.bool_)
         if self._dataset is None or self._dataset.observations is None:
             return none
-        found = self._dataset.observations
-        chosen = np.flatnonzero((found.row == row) & np.isfinite(found.ends).all(axis=(1, 2)))
+        observations = self._dataset.observations
+        chosen = np.flatnonzero(
+            (observations.row == row) & np.isfinite(observations.ends).all(axis=(1, 2))
+        )
         if len(chosen) == 0:
             return none
-        xy = place.camera.undistort(found.ends[chosen].reshape(-1, 2))
+        xy = place.camera.undistort(observations.ends[chosen].reshape(-1, 2))
         rays = depth * np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-        return place.T_base_camera.apply(rays).reshape(-1, 2, 3), found.used[chosen]
+        return place.T_base_camera.apply(rays).reshape(-1, 2, 3), observations.used[chosen]
 
 
 def _places(dataset: Dataset, result: EarlierResult | None) -> tuple[Place, ...]:
     """Return the cameras whose place is known."""
-    found: list[Place] = []
+    places: list[Place] = []
     for v, view in enumerate(dataset.measurements.views):
         T = view.T_base_camera
         if result is not None and view.name in result.result.views:
             pose = result.result.views[view.name].T_base_camera
             T = motion_from_xyz_quat(pose.xyz, pose.quat_xyzw)
-        if T is not None and len(found) < MAX_CAMERAS:
-            found.append(Place(v, view.name, view.camera, T, _half(view.camera)))
-    return tuple(found)
+        if T is not None and len(places) < MAX_CAMERAS:
+            places.append(Place(v, view.name, view.camera, T, _half(view.camera)))
+    return tuple(places)
 
 
 def _half(camera: Camera) -> Array:

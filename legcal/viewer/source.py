@@ -73,8 +73,8 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
             )
         from legcal.data.dataset import load_dataset
 
-        found = load_dataset(path, check_images=False)
-        return Source(found.machine, dataset=found)
+        loaded = load_dataset(path, check_images=False)
+        return Source(loaded.machine, dataset=loaded)
     subject = load_subject(given)
     if dataset is None:
         return Source(subject.machine, subject.nominal, subject.result)

@@ -194,10 +194,10 @@ class Stage:
     def _skeleton(self, placed: PlacedModel) -> Array:
         """Return legs, motors and rims as lines (m, 2, 3)."""
         A, B = placed.A[0], placed.B[0]
-        found = [np.stack([A, B], axis=1), _motors(placed)]
+        lines = [np.stack([A, B], axis=1), _motors(placed)]
         for joints, rim in zip((corners_of_base(A, placed.anchors), B), self.rims, strict=True):
-            found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
-        return np.concatenate(found)
+            lines.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
+        return np.concatenate(lines)
 
     def _rods(self, A: Array, B: Array) -> Rods:
         """Return the cylinders of legs from A to B (n, 3)."""
@@ -228,7 +228,7 @@ def _between(ends: Array, radii: Array) -> Rods:
 def from_z(u: Array) -> Array:
     """Return quaternions wxyz (m, 4) of the shortest turns from z to unit vectors (m, 3)."""
     zero = np.zeros(len(u))
-    found = np.stack([1.0 + u[:, 2], -u[:, 1], u[:, 0], zero], axis=1)
-    length = np.linalg.norm(found, axis=1)
-    found[length < 1e-6] = [0.0, 1.0, 0.0, 0.0]
-    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None])
+    quaternions = np.stack([1.0 + u[:, 2], -u[:, 1], u[:, 0], zero], axis=1)
+    length = np.linalg.norm(quaternions, axis=1)
+    quaternions[length < 1e-6] = [0.0, 1.0, 0.0, 0.0]
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1)[:, None])

@@ -293,7 +293,7 @@ class Window:
         for k, (slider, value) in enumerate(
             zip(self._pose_sliders, motion.coordinates.tolist(), strict=True)
         ):
-            slider.value = _shown(value * _scale(int(motion.own[k])), slider.min, slider.max)
+            slider.value = _shown(value * _scale(int(motion.columns[k])), slider.min, slider.max)
         legs = [self.source.machine.legs[j] for j in np.flatnonzero(motion.at_end)]
         ends = dict.fromkeys(leg.motor_label for leg in legs)
         lines = []
@@ -302,9 +302,9 @@ class Window:
         if posture.problem:
             lines.append(f"**Not reached.** {_plain(posture.problem)}")
         if seen.beside is not None:
-            what = "The motion" if self._shown_motion is not None else "The calibration"
+            subject = "The motion" if self._shown_motion is not None else "The calibration"
             times = "" if self._factor == 1.0 else f", shown {self._factor:g} times as large"
-            lines.append(f"{what} moves joints by up to {1e3 * seen.apart:.3g} mm here{times}.")
+            lines.append(f"{subject} moves joints by up to {1e3 * seen.apart:.3g} mm here{times}.")
         self._words.content = "\n\n".join(lines) or "Drag to turn, scroll to zoom."
 
     # Controls
@@ -351,7 +351,7 @@ class Window:
         with gui.add_folder("Pose of the platform [mm, deg]"):
             values = motion.coordinates
             for k, (low, high) in enumerate(motion.ranges_of_coordinates().tolist()):
-                which = int(motion.own[k])
+                which = int(motion.columns[k])
                 low = float(np.floor(low * _scale(which)))
                 high = float(np.ceil(high * _scale(which)))
                 slider = gui.add_slider(
@@ -369,7 +369,7 @@ class Window:
         return SHOWN_IN[self.source.machine.legs[leg].reading_unit][0]
 
     def _place(self, k: int, value: float) -> None:
-        self.motion.place(k, value / _scale(int(self.motion.own[k])))
+        self.motion.place(k, value / _scale(int(self.motion.columns[k])))
 
     def _add_session(self) -> None:
         """Add what steps through the photographs."""
