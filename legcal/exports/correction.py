@@ -25,7 +25,7 @@ from legcal.machine.configurations import workspace
 from legcal.machine.coordinates import (
     COORDINATES,
     coordinates_of,
-    own_coordinates,
+    independent_coordinates,
     poses_at_coordinates,
     turned_back,
 )
@@ -97,7 +97,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     if nominal is None:
         raise ValueError("a model without a result has no correction")
     calibrated = subject.machine
-    columns = own_coordinates(calibrated)
+    columns = independent_coordinates(calibrated)
     n_nodes = _number_of_nodes(options.nodes, len(columns))
     models = _Model(calibrated, columns), _Model(nominal, columns)
     ticks, nodes, corrected = _grid(models, n_nodes)

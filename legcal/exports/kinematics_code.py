@@ -28,7 +28,7 @@ from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
-from legcal.machine.coordinates import COORDINATES, own_coordinates
+from legcal.machine.coordinates import COORDINATES, independent_coordinates
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.model import Machine
@@ -109,7 +109,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
     scale = machine.size
     first = sorted(set(machine.reads))  # the leg of each reading
     home_readings = inverse_kinematics(machine, machine.home)[first]
-    columns = own_coordinates(machine)
+    columns = independent_coordinates(machine)
     return {
         "version": __version__,
         "base": machine.base,

@@ -1,7 +1,7 @@
-"""The platform's own coordinates: as many of x, y, z, roll, pitch, yaw as it has freedoms.
+"""Independent coordinates of the platform: as many of x, y, z, roll, pitch, yaw as its freedoms.
 
 A pose is that of the platform link in the base link; roll, pitch and yaw turn about the fixed axes
-x, y, z in this order. The coordinates that are not the machine's own follow from its constraints.
+x, y, z in this order. The other coordinates follow from the constraints of the machine.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
 COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
-_REACHED = 1e-9  # of a leg length
-_FREE = 0.1
+_REACHED = 1e-9  # largest error of a pose reached, relative to the size of the machine
+_FREE = 0.1  # least independent motion of a chosen coordinate
 
 
-def own_coordinates(machine: Machine) -> IntArray:
-    """Return which coordinates a machine has of its own, positions before angles.
+def independent_coordinates(machine: Machine) -> IntArray:
+    """Return the independent coordinates of a machine as indices, positions before angles.
 
-    A coordinate is taken where the motions that the constraints leave at home, and that those taken
-    before do not yet tell apart, move it by at least a tenth of a motion; rotations count in leg
-    lengths.
+    Coordinates are chosen in order. One is chosen if a motion that the constraints allow at home,
+    and that keeps those chosen before, moves it by at least a tenth of the motion; rotations count
+    in leg lengths.
     """
     pose = machine.home.as_matrix()[None, :3]
     equations = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
@@ -35,7 +35,7 @@ def own_coordinates(machine: Machine) -> IntArray:
     slopes = coordinates_of(pose)[1][0]
     moved = (slopes @ free.T) * np.array([1.0] * 3 + [scale] * 3)[:, None]
     chosen: list[int] = []
-    for least in (_FREE, 0.0):  # the second time, if need be, whatever is left
+    for least in (_FREE, 0.0):  # the second pass takes any that is left
         for k in range(len(COORDINATES)):
             basis = np.linalg.qr(moved[chosen].T)[0] if chosen else np.zeros((machine.mobility, 0))
             new = moved[k] - basis @ (basis.T @ moved[k])
@@ -92,7 +92,7 @@ def coordinates_of(poses: Array) -> tuple[Array, Array]:
 
 
 def turned_back(differences: Array, columns: IntArray) -> Array:
-    """Return differences of coordinates with angles within half a turn."""
+    """Return differences of coordinates, those of angles within half a turn."""
     turns = np.where(columns < 3, 0.0, 2.0 * np.pi)
     return np.asarray(
         differences - turns * np.round(differences / np.where(columns < 3, 1.0, turns))

@@ -1,10 +1,9 @@
 """A CSV of joints as the mapping that the same table would be in YAML.
 
-Headings are those that people write, and three layouts are understood: a row for each leg (``bx by
-bz px py pz``, ``base_x``, ``x_base``), a row with all joints (``B1x``), and a row for each joint
-(``B1, x, y, z``, or side and number in two columns; headings may be missing there). A and B are
-base and platform where both are there, as in the paper; otherwise B is the base and P, or T, the
-platform.
+Common headings are understood, in three layouts: a row for each leg (``bx by bz px py pz``,
+``base_x``, ``x_base``), a row with all joints (``B1x``), and a row for each joint (``B1, x, y, z``,
+or side and number in two columns; headings are optional there). If both A and B occur they are base
+and platform, as in the paper; otherwise B is the base and P, or T, the platform.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
 
 WHAT = "table"
-MAX_NUMBER = 1e9  # of any number, whatever its unit
-UNITS = {"m": 0, "mm": -3}  # powers of ten
+MAX_NUMBER = 1e9  # largest number, in any unit
+UNITS = {"m": 0, "mm": -3}  # units of length, as powers of ten
 SIDES = {
     "base": ("base", "bottom", "fixed", "ground", "lower", "a"),
     "platform": ("platform", "plat", "top", "moving", "mobile", "upper", "effector", "p", "t"),
@@ -47,7 +46,7 @@ _COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
 _COORDINATE_FIRST = re.compile(rf"([xyz])({_WORDS})(\d*)")
 _NAMED = re.compile(rf"({_WORDS})(?:joints?|points?|legs?)?0*(\d{{1,3}})")
 _XYZ = ("x", "y", "z")
-MOTIONS = ("direction", "point", "axis")  # of what rods hang on
+MOTIONS = ("direction", "point", "axis")  # columns of the motor that carries a rod
 _RADII = ("radius", "tube", "rod")
 _AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
@@ -82,8 +81,8 @@ COLUMNS = (
 def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     """Return a CSV as the mapping that the same table would be in YAML.
 
-    ``unit`` is that of its lengths, unless a column states it. Raises DatasetError with one
-    sentence for each wrong column or cell.
+    ``unit`` is the unit of lengths if no column states it. Raises DatasetError with one sentence
+    for each wrong column or cell.
     """
     names = [column.name for column in COLUMNS]
     table = read_table(
@@ -110,7 +109,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "types": cells.texts("type") if "type" in table else None,
         "base_joints": cells.points("base"),
         "platform_joints": cells.points("platform"),
-        # The travel of a leg that hangs on a motor is that of the motor.
+        # The travel of a leg carried by a motor is the travel of the motor.
         "travel": [
             travel if motor is None else None
             for travel, motor in zip(cells.pairs("travel"), hangs_on, strict=True)
@@ -136,7 +135,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
 
 
 class _Cells:
-    """The cells of a table by row: None where they are empty."""
+    """The cells of a table by row; None if empty."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -165,9 +164,9 @@ def _is_there(value: Any) -> bool:
 
 
 def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict[str, Any]:
-    """Return the motors on which legs hang, and their readings at home.
+    """Return the motors that carry legs, and their readings at home.
 
-    What is said of a motor may stand in any row of a leg that hangs on it, or in several.
+    The numbers of a motor may be in any row of a leg that it carries, or in several.
     """
     columns = {
         **{key: cells.vectors(key) for key in MOTIONS},
@@ -207,7 +206,7 @@ def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict
 
 
 def _shared(table: Table, name: str) -> str | None:
-    """Return what a column says that has the same text in all rows, None for an empty one."""
+    """Return the text of a column that is the same in all rows, None for an empty column."""
     stated = sorted(set(filter(None, table.text(name))))
     if len(stated) > 1:
         raise DatasetError(
@@ -231,8 +230,8 @@ def _unit(table: Table, given: str | None) -> str:
 def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     """Return a table with a row for each leg under the names of its columns.
 
-    ``names`` are those of the columns. Headings that mean nothing stay as they are, in small
-    letters, and a column ``unit`` is added where headings of joints have one.
+    ``names`` are the names of the columns. Unknown headings stay, in lower case, and a column
+    ``unit`` is added if headings of joints state one.
     """
     lines = _with_headings(lines, path)
     number, header = lines[0]
@@ -277,7 +276,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
 
 
 def _with_headings(lines: Lines, path: object) -> Lines:
-    """Return lines with headings: a list of named points needs none."""
+    """Return lines with headings, which a list of named points may omit."""
     first = lines[0][1]
     if sum(is_number(text) for text in first) < 2:
         return lines
@@ -291,7 +290,7 @@ def _with_headings(lines: Lines, path: object) -> Lines:
 
 
 def _coordinate(key: str) -> tuple[str, str, str] | None:
-    """Return side, number ("" without) and coordinate of the heading of a joint."""
+    """Return side, number ("" if none) and coordinate of the heading of a joint."""
     if match := _COORDINATE.fullmatch(key):
         return None if match[2] and match[4] else (match[1], match[2] or match[4], match[3])
     if match := _COORDINATE_FIRST.fullmatch(key):
@@ -300,7 +299,7 @@ def _coordinate(key: str) -> tuple[str, str, str] | None:
 
 
 def _sides(words: Iterable[str]) -> dict[str, str]:
-    """Return which side each word means: B is the platform beside A."""
+    """Return the side of each word; B is the platform if there is an A."""
     side_of = {word: side for side, all_words in SIDES.items() for word in all_words}
     return side_of | {"b": "platform" if "a" in set(words) else "base"}
 
@@ -311,7 +310,7 @@ def _from_one_row(
     sides: dict[str, str],
     path: object,
 ) -> Lines:
-    """Return a row for each leg of a table with all joints in one row."""
+    """Return a row for each leg, from a table with all joints in one row."""
     (number, header), rows = lines[0], lines[1:]
     if len(rows) != 1 or any(len(cells) != len(header) for _, cells in rows):
         raise DatasetError(
@@ -333,9 +332,9 @@ def _from_one_row(
 
 
 def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
-    """Return a row for each leg of a table with a row for each joint.
+    """Return a row for each leg, from a table with a row for each joint.
 
-    A joint is named by one column, or by two: its side, and the number of the leg.
+    A joint is named in one column, or in two: side and number of the leg.
     """
     number, header = lines[0]
     axes = {key: i for i, key in enumerate(keys) if key in _XYZ}

@@ -1,9 +1,9 @@
-"""The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states.
+"""The table of a machine: YAML or CSV, read strictly, lengths in its stated unit.
 
-A CSV becomes the mapping that the same table would be in YAML (:func:`read_columns`); the mapping
-is validated as a :class:`TableFile`, whose entries are checked against each other before they
-become a :class:`Description` in metres, whose legs are checked against their types. An entry is
-one value for all legs, or a list with one (or null) for each leg.
+A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`); the mapping is
+validated as a :class:`TableFile`, whose entries are checked against each other and converted to a
+:class:`Description` in metres, whose legs are checked against their types. An entry is one value
+for all legs, or a list with one (or null) for each leg.
 """
 
 from collections.abc import Callable, Mapping
@@ -77,13 +77,13 @@ _ROW = {"type": "array", "items": _NUMBER}
 
 
 def _schema_of_legs(of_leg: dict[str, Any]) -> WithJsonSchema:
-    """Return the JSON Schema of what :func:`_of_legs` takes."""
+    """Return the JSON Schema of the input of :func:`_of_legs`."""
     of_each = {"type": "array", "items": {"anyOf": [of_leg, {"type": "null"}]}}
     return WithJsonSchema({"anyOf": [of_leg, of_each]})
 
 
 def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
-    """Return a validator of one value for all legs, or of a list with one (or null) for each."""
+    """Return a validator of one value for all legs, or a list with one (or null) for each."""
 
     def check(value: Any) -> Any:
         of_each = isinstance(value, list) and all(x is None or fits(x) for x in value)
@@ -169,7 +169,7 @@ Lengths = Annotated[
 ]
 Travel = Annotated[
     Any,
-    BeforeValidator(_lower_first),  # the last one is applied first
+    BeforeValidator(_lower_first),  # validators run from the last to the first
     _of_legs(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
     _schema_of_legs({**_ROW, "minItems": 2, "maxItems": 2}),
 ]
@@ -227,17 +227,17 @@ Direction = Annotated[
 
 
 class ActuatorEntry(FileSchema):
-    """A motor that rods hang on: a carriage that slides, or an arm that turns, in the base link."""
+    """A motor that carries rods: a sliding carriage or a turning arm, in the base link."""
 
     direction: Direction | None = None
     point: Vector | None = None
     axis: Direction | None = None
     travel: Ends | None = None
     travel_deg: Ends | None = None
-    travel_us: Ends | None = None  # of a hobby servo, with the two numbers of its pulses
+    travel_us: Ends | None = None  # of a hobby servo, with centre_us and us_per_deg
     centre_us: Number | None = None
     us_per_deg: Number | None = None
-    arm_radius: Annotated[Number, Field(gt=0.0)] | None = None  # of an arm that is a cylinder
+    arm_radius: Annotated[Number, Field(gt=0.0)] | None = None  # of a cylindrical arm
 
     @property
     def turns(self) -> bool:
@@ -246,11 +246,11 @@ class ActuatorEntry(FileSchema):
 
     @property
     def pulses(self) -> Pulses | None:
-        """The pulses of a hobby servo. Raises ValueError if what is stated is none."""
+        """The pulses of a hobby servo. Raises ValueError if its numbers are implausible."""
         return Pulses.stated(self.centre_us, self.us_per_deg, turns=self.turns)
 
     def problem(self, unit: str) -> str | None:
-        """Return what does not fit together, None if all does; *unit* is that of lengths."""
+        """Return the contradiction between the entries, None if there is none."""
         given = [key for key in MOTIONS if getattr(self, key) is not None]
         if given not in (["direction"], ["point", "axis"]):
             return (
@@ -276,7 +276,7 @@ class ActuatorEntry(FileSchema):
         )
 
     def travel_in_metres(self, unit: str) -> tuple[float, float]:
-        """Return the lowest and the highest reading [m or rad]; *unit* is that of lengths."""
+        """Return the lowest and highest reading [m or rad]; *unit* is the unit of lengths."""
         if self.travel_us and (pulses := self.pulses):
             low, high = sorted(pulses.angles(np.array(self.travel_us)).tolist())
             return low, high
@@ -323,7 +323,7 @@ class TableFile(FileSchema):
 
     @property
     def motors_of_legs(self) -> list[str | None]:
-        """The motor that each leg hangs on: as stated, or in the order of the motors."""
+        """The motor that carries each leg: as stated, or in the order of the motors."""
         n, motors = len(self.base_joints), list(self.actuators or ())
         if self.hangs_on is None:
             return [*motors] if len(motors) == n else [None] * n
@@ -338,7 +338,7 @@ OPTIONS = {
     "home": "--height",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
-_SAME = 1e-6  # of the span of the joints: so near, joints are one
+_SAME = 1e-6  # largest distance of coincident joints, relative to the span of the joints
 
 
 def read_description(
@@ -347,9 +347,10 @@ def read_description(
     name: str | None = None,
     given: Mapping[str, Any] | None = None,
 ) -> Description:
-    """Return the machine that a table describes.
+    """Return the machine described by a table.
 
-    ``given`` are entries beside the table, in its unit, which it must not have itself.
+    ``given`` holds entries from the command line, in the unit of the table, which must not have
+    them.
     """
     given = {} if given is None else given
     try:
@@ -387,12 +388,12 @@ def read_description(
 
 
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
-    """Return the machine of a table as YAML has it; messages name its source.
+    """Return the machine of a table (as in YAML); messages name its source.
 
     Raises
     ------
     ModelError
-        With one sentence for each entry that cannot be, or does not fit the others.
+        With one sentence for each entry that is impossible or contradicts others.
     """
     try:
         file = validate(TableFile, table, source)
@@ -411,7 +412,7 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
 
 
 def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Refuse entries that the table has and the command too."""
+    """Refuse entries that are both in the table and on the command line."""
     twice = [
         f"{OPTIONS[key]} beside {key if key in table else other}"
         for key in given
@@ -426,23 +427,23 @@ def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]
 
 
 def _says_something(value: Any) -> bool:
-    """Return whether an entry of a table, or of one of its legs, is there."""
+    """Return whether an entry of a table, or any of its list, is not null."""
     return any(x is not None for x in value) if isinstance(value, list) else value is not None
 
 
 def in_metres(value: float, unit: str) -> float:
-    """Return a length in metres: the float nearest to its decimal digits, whatever the unit."""
+    """Return a length in metres: the float nearest to its decimal digits in any unit."""
     return float(Decimal(repr(float(value))).scaleb(UNITS[unit]))
 
 
 def _types(file: TableFile, n: int) -> list[LegType]:
-    """Return the type of each leg."""
+    """Return the types of the legs."""
     texts = file.types or [(file.type or "").split("-")[-1]] * n
     return [type_ for text in texts if (type_ := leg_type(text)) is not None]
 
 
 def _conflicting_entries(file: TableFile, source: str) -> list[str]:
-    """Return which entries of a table do not fit together: counts, names, types."""
+    """Return the contradictions between counts, names and types of a table."""
     if (file.type is None) == (file.types is None):
         stated = "both" if file.type else "neither"
         return [
@@ -503,7 +504,7 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_actuators(file: TableFile, source: str) -> list[str]:
-    """Return what does not fit together of motors that rods hang on, and of these rods."""
+    """Return the contradictions between motors and the rods that they carry."""
     names, motors, actuators = file.leg_names, file.motors_of_legs, file.actuators or {}
     problems = [
         f"{source}: actuators.{name} could not be used: {problem}"
@@ -554,7 +555,7 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
 
 
 def _actuators(file: TableFile) -> dict[str, Actuator]:
-    """Return the motors that rods hang on, in the base link."""
+    """Return the motors that carry rods, in the base link."""
     actuators, motors = {}, file.motors_of_legs
     for name, entry in (file.actuators or {}).items():
         along = np.array(entry.axis or entry.direction, dtype=float)
@@ -578,7 +579,7 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
 
 
 def _home_readings(file: TableFile) -> dict[str, float]:
-    """Return the readings of motors at home that a table states [m or rad]."""
+    """Return the stated readings of motors at home [m or rad]."""
     return {
         **{name: in_metres(q, file.unit) for name, q in (file.home_readings or {}).items()},
         **{name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
@@ -586,7 +587,7 @@ def _home_readings(file: TableFile) -> dict[str, float]:
 
 
 def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
-    """Return which readings at home are of no motor of their kind."""
+    """Return the problems of home readings without a motor of their kind."""
     problems = []
     for key, turns in (("home_readings", False), ("home_readings_deg", True)):
         right = [name for name, entry in (file.actuators or {}).items() if entry.turns is turns]
@@ -601,7 +602,7 @@ def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_home(file: TableFile, source: str) -> list[str]:
-    """Return what does not fit together in the block ``home``."""
+    """Return the contradictions in the block ``home``."""
     problems = []
     home = file.home
     if home is None:
@@ -628,7 +629,7 @@ def _wrong_home(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_lengths(file: TableFile, source: str) -> list[str]:
-    """Return lengths of legs of which one is missing, too much or wrong."""
+    """Return the problems of shortest and longest lengths: missing, redundant or impossible."""
     problems = []
     n = len(file.base_joints)
     for name, low, high, _, travel in zip(
@@ -654,18 +655,18 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
 
 
 def _laws(file: TableFile) -> tuple[Any, ...]:
-    """Return what a table says of lengths: shortest, longest, at reading zero, travel."""
+    """Return the entries of the length law: shortest, longest, at reading zero, travel."""
     travel = [file.travel] * len(file.base_joints) if _is_pair(file.travel) else file.travel
     return file.min_length, file.max_length, file.offsets, travel
 
 
 def _of_each(value: Any, n: int) -> list[Any]:
-    """Return an entry for each leg."""
+    """Return a list with an entry for each leg."""
     return value if isinstance(value, list) else [value] * n
 
 
 def _useless_entries(file: TableFile, source: str) -> list[str]:
-    """Return which entries are for legs that have no use for them."""
+    """Return the problems of entries for legs whose type does not have them."""
     names = file.leg_names
     has_slider = [leg.has_slider for leg in _types(file, len(names))]
     problems = []
@@ -692,7 +693,7 @@ def _useless_entries(file: TableFile, source: str) -> list[str]:
 
 
 def _description(file: TableFile, source: str) -> Description:
-    """Return the machine of a table, its lengths in metres."""
+    """Return the machine of a table, in metres."""
     n = len(file.base_joints)
 
     def metres(value: Any) -> Any:
@@ -725,7 +726,7 @@ def _description(file: TableFile, source: str) -> Description:
                     "give offsets, the length at reading zero, if the encoders count otherwise."
                 ]
             limits = [_less(low, offset or 0.0), _less(high, offset or 0.0)]
-        reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
+        reads_length = kind is LegKind.PASSIVE and offset is None  # a single pair means readings
         limits = metres(limits)
         if constant or (reads_length and _is_pair(file.travel)):
             limits = None
@@ -753,12 +754,10 @@ def _description(file: TableFile, source: str) -> Description:
 
 
 def _less(minuend: float, subtrahend: float) -> float:
-    """Return a difference by its decimal digits."""
     return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 
 def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
-    """Return the radii of tube and rod [m]."""
     radii = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
     tube, rod = (
         None if radii.get(part) is None else in_metres(radii[part], unit)
@@ -768,7 +767,7 @@ def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
 
 
 def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
-    """Return one direction of a list, of length one."""
+    """Return the unit vector of one direction of a list, None if it has none."""
     if axes is None or axes[j] is None:
         return None
     axis = np.array(axes[j], dtype=float)
@@ -776,7 +775,6 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
 
 
 def _home(file: TableFile) -> Home | None:
-    """Return the home of a table."""
     if file.home is None or file.home.xyz is None:
         return None
     xyz = tuple(in_metres(x, file.unit) for x in file.home.xyz)
@@ -786,15 +784,14 @@ def _home(file: TableFile) -> Home | None:
 
 
 def _turn(home: HomeEntry) -> Rotation:
-    """Return the rotation of a home."""
     if home.quat_xyzw is not None:
         return Rotation.from_quat(home.quat_xyzw)
     return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
 def _impossible_legs(described: Description) -> list[str]:
-    """Return what legs lack or cannot have by their types, and which legs coincide."""
-    lacking: dict[str, list[str]] = {}  # names of the legs for each thing that is wrong
+    """Return the contradictions between legs and their types, and coincident legs."""
+    lacking: dict[str, list[str]] = {}  # names of legs by problem
     for leg in described.legs:
         if leg.kind is LegKind.ACTUATED and leg.offset is None:
             lacking.setdefault(
@@ -829,7 +826,7 @@ def _impossible_legs(described: Description) -> list[str]:
         f"{described.source}: {legs_in_words(names)} could not be used: found {mistake}"
         for mistake, names in lacking.items()
     ]
-    # Legs that begin and end in the same two points, and joints all in one point.
+    # Coincident legs, and joints that all coincide.
     legs = described.legs
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]

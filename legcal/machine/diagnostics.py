@@ -1,4 +1,4 @@
-"""What deserves attention in a machine that was loaded, one sentence each."""
+"""Notes on a loaded machine, one sentence each."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.ties import ties_in_words
 
-_AT_MIDDLE = 1e-6  # of the travel
-_MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
+_AT_MIDDLE = 1e-6  # largest distance from mid-travel, relative to the travel
+_MIN_SINGULARITY = 1e-4  # singularity measure below which it is the rounding of a file
 
 
 def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
-    """Return what deserves attention in a mechanism, one sentence each."""
+    """Return the notes on a mechanism, one sentence each."""
     notes = []
     q = readings_at(machine, machine.home)
     if not home_is_given:
@@ -42,7 +42,7 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
 
 
 def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, ...]:
-    """Return what of the block ``legcal`` was proposed because the file does not have it."""
+    """Return the entries of the block ``legcal`` that were proposed, as notes."""
     frame = ", ".join(machine.leg_names[j] for j in machine.frame_legs)
     if written is None:
         return (
@@ -59,7 +59,7 @@ def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, 
 
 
 def singularity_note(machine: Machine) -> str | None:
-    """Return that the motors do not hold the platform at home, None where they do."""
+    """Return a note if the motors do not hold the platform at home, else None."""
     if not 0 < machine.mobility <= len(machine.motors):
         return None
     measure = singularity(machine, machine.home)
@@ -74,7 +74,7 @@ def singularity_note(machine: Machine) -> str | None:
 
 
 def _unseen_notes(machine: Machine) -> list[str]:
-    """Return which legs show no cylinder."""
+    """Return notes on legs without visible cylinder."""
     unseen = [leg.name for leg in machine.legs if not leg.cylinders]
     if not unseen:
         return []
@@ -87,7 +87,7 @@ def _unseen_notes(machine: Machine) -> list[str]:
 
 
 def _motor_notes(machine: Machine) -> list[str]:
-    """Return where forward kinematics has too few motors, or too many, or a singular start."""
+    """Return notes on too few or too many motors, and on a singular home."""
     notes = []
     if machine.mobility == 0:
         return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
@@ -108,7 +108,7 @@ def _motor_notes(machine: Machine) -> list[str]:
 
 
 def _spin_notes(machine: Machine) -> list[str]:
-    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
+    """Return notes on idle spins: legs with an S joint at both ends, redundant revolutes."""
     notes = []
     n_spinning = sum(
         leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs

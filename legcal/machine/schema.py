@@ -20,7 +20,7 @@ from legcal.files.schema import (
     validate,
 )
 from legcal.machine.actuator import Actuator
-from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
+from legcal.machine.files import DATASET_YAML, dataset_as_model, read_file
 
 WHAT = "mechanism file"
 MAX_LOOPS = 100
@@ -110,7 +110,7 @@ def _check_kind(document: Mapping[str, Any], path: Path) -> None:
             )
         )
     if path.name == DATASET_YAML:
-        raise ModelError(what_a_dataset_is_for(path))
+        raise ModelError(dataset_as_model(path))
 
 
 def _without_nulls(document: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import LegcalError
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.coordinates import coordinates_of, own_coordinates, poses_at_coordinates
+from legcal.machine.coordinates import coordinates_of, independent_coordinates, poses_at_coordinates
 from legcal.machine.kinematics import Follower, followed_poses
 from legcal.machine.model import Machine, joint_values, readings_at, readings_at_poses
 from legcal.machine.redundancy import consistent_readings
@@ -53,7 +53,7 @@ class Motion:
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
-        self.columns = own_coordinates(machine)
+        self.columns = independent_coordinates(machine)
         self._follower = Follower(machine) if machine.is_determined else None
         self.posture = self.home()
 
