@@ -1,4 +1,4 @@
-"""Platform poses from the equations of the legs alone: nearest ones, and those at readings."""
+"""Platform poses from the equations of the legs alone: nearest poses, and poses at readings."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -26,18 +26,18 @@ from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
-TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # of a leg length
-MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
-DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
+TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # residuals of a solved pose, in leg lengths
+MAX_POSE_ERROR = 0.01  # largest distance of a given pose from a closed one, in leg lengths
+DEPENDENT = 1e-7  # singular value of dependent equations, relative to the largest
 
 
 class SolvedPoses(NamedTuple):
-    """Platform poses of R_e in R_b at which legs miss least."""
+    """Platform poses of R_e in R_b with the least residuals of legs."""
 
     R: Array  # (k, 3, 3)
     t: Array  # (k, 3) [m]
-    missed: Array  # (k,) the largest of what legs still miss [m]
-    # (k,) the last step [rad], mean leg lengths: not small where a pose has not come to rest
+    missed: Array  # (k,) largest remaining residual [m]
+    # (k,) last step [rad, mean leg lengths]; not small if a pose has not converged
     size: Array
 
 
@@ -50,14 +50,14 @@ def solve_poses(
     steps: int = 60,
     scale: Array | None = None,
 ) -> SolvedPoses:
-    """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
+    """Return the poses of R_e in R_b, near R, t, at which the leg equations hold at readings.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad], NaN
-    where unknown; without it poses move
-    to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
-    truth) the one with least squares is found; of redundant motors that with least squares of the
-    lengths, the constraints exact. After few *steps* poses are only nearer. Poses are near by their
-    numbers over *scale* (6,), by default 1 rad and the mean leg length.
+    if unknown; without it the nearest poses that meet the constraints are returned. If no pose
+    meets all equations (parameters far from the truth) the result is the least-squares pose; with
+    redundant motors it minimises the squares of the lengths, with exact constraints. After few
+    *steps* poses may not have converged. Distances are relative to *scale* (6,), by default 1 rad
+    and the mean leg length.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
@@ -105,7 +105,7 @@ def solve_postures(
 ) -> tuple[SolvedPoses, Array]:
     """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
 
-    Both move together, as little as possible over *scale* (6 + n,); q are those of actuators.
+    Both move as little as possible, relative to *scale* (6 + n,); q are readings of actuators.
     """
     free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
     fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
@@ -135,9 +135,9 @@ def solve_postures(
 def project_pose(
     machine: Machine, T: RigidTransform, max_error: float = MAX_POSE_ERROR
 ) -> tuple[RigidTransform, str | None]:
-    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
+    """Return the nearest pose that meets all constraints, and the obstacle if none is near.
 
-    Constraints may be missed by *max_error* leg lengths at the start, T_base_platform.
+    Residuals at the start, T_base_platform, may be up to *max_error* leg lengths.
     """
     if not is_constrained(machine):
         return T, None

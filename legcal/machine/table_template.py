@@ -1,4 +1,4 @@
-"""A table to start from: that of a family as commented YAML, of a hexapod as CSV too."""
+"""A table template: a family as commented YAML, a hexapod also as CSV."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ home: {home}
 
 
 def write_template(folder: Path, given: Dimensions, *, force: bool = False) -> list[Path]:
-    """Write ``NAME.yaml``, of a hexapod ``NAME.csv`` too; files that are there only with *force*.
+    """Write ``NAME.yaml``, and ``NAME.csv`` of a hexapod; existing files only with *force*.
 
-    The numbers are those of a family with the given dimensions.
+    The numbers are of a family with the given dimensions.
     """
     family = str(given.family or "hexapod").lower()
     name = str(given.name or f"my-{family}")
@@ -139,7 +139,7 @@ def _csv(table: dict[str, Any]) -> str:
 
 
 def _flow(value: Any) -> str:
-    """Return a value as YAML writes it in one line."""
+    """Return a value as YAML on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in value.items()) + "}"
     if isinstance(value, list):
