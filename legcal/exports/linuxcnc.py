@@ -4,7 +4,7 @@ genhexkins documents (manual page ``kins``): base and platform joint coordinates
 ``genhexkins.base.N.x|y|z`` and ``genhexkins.platform.N.x|y|z`` in machine units; a pose X Y Z A B C
 is the position and the angles about fixed x, y and z [deg], R = Rz(C) Ry(B) Rx(A); joint N is the
 length |xyz + R platform_N - base_N|. ``spindle-offset`` and ``tool-offset`` shift all joints along
-z, ``screw-lead`` corrects screws that turn with their leg: all three are zero in the model.
+z, ``screw-lead`` corrects screws that rotate with their leg: all three are zero in the model.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from legcal.version import __version__
 
 N_STRUTS = 6
 _MM = 1e3
-_PARALLEL = 0.99  # cosine between the rails of a linear Delta
+_PARALLEL = 0.99  # least cosine between the rails of a linear Delta
 
 
 def linuxcnc_refusal(subject: Subject) -> str | None:
-    """Return why a machine is none of genhexkins, or None."""
+    """Return the reason for refusing a machine unsupported by genhexkins, or None."""
     machine, legs = subject.machine, subject.machine.legs
     needed = "needed six legs with motors between universal and spherical joints (genhexkins)"
     if machine.actuators:
@@ -50,7 +50,7 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
 
 
 def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the HAL file; what belongs into the INI file stands in its comments."""
+    """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
     home = readings_at(machine, machine.home)
     lines = [

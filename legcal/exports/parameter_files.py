@@ -1,7 +1,7 @@
 """Parameters for people and scripts, in millimetres and degrees: ``table``, ``csv``, ``json``.
 
-Every joint stands there twice: in the link that carries it, as its owner knows it, and in R_b or
-R_e, in which it was estimated and which the joints of the ``base_frame`` legs define.
+Every joint is listed twice: in the link that carries it, and in the frame of estimation, R_b or
+R_e, defined by the joints of the ``base_frame`` legs.
 """
 
 from __future__ import annotations
@@ -27,32 +27,35 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from legcal.calibration.documents import JointInLink
 
-UNITS = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}  # of files; others stay
+UNITS = {
+    "m": (1e3, "mm"),
+    "rad": (float(np.degrees(1.0)), "deg"),
+}  # units in files; others are unchanged
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
-_DIGITS = 6  # of the table, behind the point
+_DIGITS = 6  # decimals in the table
 _OF_FRAME = re.compile(r"\.(base|platform)(\.[xyz]|_axis\.[12])$")
-_MODEL = "model"  # the status of numbers without a result
+_MODEL = "model"  # status of numbers without a result
 
 
 class Row(NamedTuple):
-    """A number of a machine, in a unit of files."""
+    """A number of a machine, in a unit of the files."""
 
     name: str
-    frame: str  # a link, R_b or R_e; "" where the number does not depend on one
+    frame: str  # a link, R_b or R_e; "" if independent of a frame
     unit: str
     value: float
     nominal: float | None  # None without a result
-    sigma: float | None  # None where it was not estimated
+    sigma: float | None  # None if not estimated
     status: str  # estimated, fixed, weak, frame (defines R_b or R_e), derived (axes) or model
 
     @property
     def change(self) -> float | None:
-        """Value less nominal."""
+        """Value minus nominal."""
         return None if self.nominal is None else self.value - self.nominal
 
 
 def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return one row for each number; numbers are read back exactly."""
+    """Return a CSV with a row for each number, read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -62,7 +65,7 @@ def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
 
 
 def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return aligned text."""
+    """Return a text table with aligned columns."""
     rows = [
         ["" if getattr(row, c) is None else _shown(getattr(row, c)) for c in COLUMNS]
         for row in rows_of(subject)
@@ -118,12 +121,12 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
 
 
 def rows_of(subject: Subject) -> list[Row]:
-    """Return all numbers of a subject."""
+    """Return the rows of a subject."""
     return [*_joint_rows(subject), *_parameter_rows(subject)]
 
 
 def _joint_rows(subject: Subject) -> Iterator[Row]:
-    """Give joint centres and axes in their links."""
+    """Yield the rows of joint centres and axes in their links."""
     machine, nominal = subject.machine, subject.nominal
     joints = _joints(subject)
     for side, link in (("base", machine.base), ("platform", machine.platform)):
@@ -134,7 +137,7 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
             if nominal is not None:
                 before, turned = _end(nominal.legs_of_frames[j], side)
             if axis is not None and turned is not None and axis @ turned < 0.0:
-                turned = -turned  # an axis is a line
+                turned = -turned  # axes are lines
             for k, letter in enumerate("xyz"):
                 sigma = None if joint is None else joint.sigma[k]
                 yield Row(
@@ -157,7 +160,7 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
 
 
 def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
-    """Give directions and axes of what moves joints at A, in the base link."""
+    """Yield the rows of directions and axes of actuators, in the base link."""
     before = (
         {}
         if nominal is None
@@ -178,7 +181,7 @@ def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
 
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
-    """Return what a result knows of joints in their links, by side and leg."""
+    """Return the joints of a result in their links, by side and leg."""
     links = None if subject.result is None else subject.result.document.links
     return {
         (side, joint.leg): joint for side, block in (links or {}).items() for joint in block.joints
@@ -191,7 +194,7 @@ def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
 
 
 def _parameter_rows(subject: Subject) -> Iterator[Row]:
-    """Give the parameters in R_b and R_e: those of the result, or of the model."""
+    """Yield the rows of the parameters in R_b and R_e, from the result or the model."""
     if subject.result is not None:
         for row in subject.result.document.parameters:
             if not row.is_shown:
@@ -215,7 +218,7 @@ def _parameter_rows(subject: Subject) -> Iterator[Row]:
 
 
 def _frame_of(name: str) -> str:
-    """Return the frame of a parameter by its name."""
+    """Return the frame of a parameter."""
     side = _OF_FRAME.search(name)
     return "" if side is None else {"base": "R_b", "platform": "R_e"}[side[1]]
 
@@ -223,7 +226,7 @@ def _frame_of(name: str) -> str:
 def _leg(
     name: str, in_links: Leg, in_frames: Leg, joints: Mapping[tuple[str, str], JointInLink]
 ) -> dict[str, Any]:
-    """Return a leg of the document."""
+    """Return the entry of a leg in the document."""
     actuator = in_links.actuator
     has_travel = in_links.has_value and bool(np.isfinite(in_links.travel).all())
     scale = UNITS["m" if actuator is None else actuator.unit][0]
@@ -252,7 +255,7 @@ def _leg(
 
 
 def _actuators(machine: Machine) -> dict[str, Any]:
-    """Return what moves joints at A, by joint, in the base link and in R_b."""
+    """Return the entries of actuators, in the base link and in R_b."""
     in_frames = {actuator.joint: actuator for actuator in actuators_of(geometries(machine))}
     actuators = {}
     for actuator in machine.actuators:
@@ -274,7 +277,7 @@ def _point(point: Array) -> list[float]:
 
 
 def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
-    """Return what is known of a joint centre in its link [mm, mm^2]."""
+    """Return the uncertainty of a joint centre in its link [mm, mm^2]."""
     if joint is None:
         return {}
     return {
@@ -284,7 +287,7 @@ def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
 
 
 def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str, Any] | None:
-    """Return a direction in its link and frame."""
+    """Return a direction in its link and in its frame."""
     if in_link is None or in_frame is None:
         return None
     return {"link": in_link.tolist(), frame: in_frame.tolist()}
@@ -299,5 +302,5 @@ def _millimetres(matrix: Array) -> list[list[float]]:
 
 
 def _shown(value: str | float) -> str:
-    """Return a cell of the table."""
+    """Return the text of a cell of the table."""
     return value if isinstance(value, str) else f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"

@@ -1,8 +1,8 @@
-"""URDF of one file with its loops, and the folder for ROS.
+"""A single URDF file with loops, and the folder for ROS.
 
-The tree is the machine's own, number for number. What a single file cannot hold (meshes) is left
-out; loops become ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
-reads the file without a YAML; other programs skip elements they do not know.
+The tree has exactly the numbers of the machine. Meshes, which a single file cannot hold, are left
+out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
+reads the file without a YAML; other programs skip unknown elements.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from legcal.files.motions import motion_to_xyz_quat
 from legcal.machine.model import Machine
 from legcal.version import __version__
 
-STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about all axes of the link
+STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about each axis of the link
 _SHAPES = ("visual", "collision")
 
 
 def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the URDF."""
+    """Return the URDF file."""
     content, notes = urdf_text(subject.machine, inertia=options.inertia)
     return Rendered((ExportedFile("", content),), notes)
 
 
 def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the URDF and the numbers of the calibration beside it."""
+    """Return the URDF and the numbers of the calibration."""
     content, notes = urdf_text(subject.machine, inertia=options.inertia)
     name = identifier(subject.name)
     document = {
@@ -46,7 +46,7 @@ def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
 
 
 def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...]]:
-    """Return a URDF that stands alone, and what was left out of it."""
+    """Return a self-contained URDF, and the elements left out."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     robot = etree.fromstring(machine.urdf.content, parser)
     meshes = _without_meshes(robot)
@@ -82,7 +82,7 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
 
 
 def _without_meshes(robot: etree._Element) -> list[str]:
-    """Remove shapes and textures of other files; return what they were."""
+    """Remove shapes and textures in other files; return their names."""
     removed = []
     for link in robot.iterfind("link"):
         for shape in [part for part in link if part.tag in _SHAPES]:
@@ -99,7 +99,7 @@ def _without_meshes(robot: etree._Element) -> list[str]:
 
 
 def _stub() -> etree._Element:
-    """Return an inertia that simulators accept."""
+    """Return an inertia accepted by simulators."""
     inertial = etree.Element("inertial")
     etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=repr(STUB_MASS))
@@ -130,7 +130,7 @@ def _calibration(subject: Subject) -> dict[str, object]:
             for leg in machine.legs
         },
     }
-    if machine.actuators:  # which carry the joints of their legs: these are at reading 0
+    if machine.actuators:  # joints carried by actuators are at reading 0
         calibration["actuators"] = {a.joint: a.document() for a in machine.actuators}
     if subject.result is not None:
         result = subject.result.document

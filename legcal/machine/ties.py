@@ -98,7 +98,7 @@ class Ties:
         return TieRows(np.concatenate(values), np.concatenate(rows))
 
     def _point(self, legs: Sequence[Leg], leg: int) -> tuple[float, Array]:
-        """Return the distance of B of a leg past its frame point, and the derivative (n_legs, 12)."""
+        """Return the distance of B of a leg past its frame point, with derivative (n_legs, 12)."""
         B, u = legs[leg].B, np.asarray(legs[leg].platform_axis)
         others = [j for j in self.frame_legs if j not in self.points]
         row = np.zeros((len(legs), LegColumns.COUNT))
