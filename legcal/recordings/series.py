@@ -1,4 +1,4 @@
-"""Readings over time: of a table with a column of times, or of the joint states in a bag."""
+"""Readings over time, from a table with a column of times or from joint states in a bag."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
 def unix_seconds(number: float) -> float | None:
-    """Return a Unix time [s] of one in s, ms, us or ns: the years 2001 to 2286 tell them apart.
+    """Return a Unix time [s] from s, ms, us or ns, distinguished by years 2001 to 2286.
 
-    Numbers that are none, as 20261123101500, are None; those before 2001 are seconds.
+    Other numbers, such as 20261123101500, give None; numbers before 2001 are seconds.
     """
     for unit in (1e9, 1e6, 1e3, 1.0):
         if number >= 1e9 * unit:
@@ -38,15 +38,15 @@ class Series:
     Attributes
     ----------
     source : str
-        Where they were read, for messages.
+        Source of the readings, for messages.
     times : (n,) array
-        Increasing [s], of their own clock.
+        Increasing times [s], by their own clock.
     q : (n, n_motors) array
         Readings [m or rad], in the order of the actuated legs.
     taken : mapping
-        What each heading was taken for.
+        Interpretation of each heading.
     unit : str
-        Unit in the table, and where it was found, in words.
+        Unit in the table and its origin, in words.
     """
 
     source: str
@@ -58,7 +58,7 @@ class Series:
 
 
 def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
-    """Return the readings of a CSV with a column of times, in the order of these."""
+    """Return the readings of a CSV with a column of times, in the order of times."""
     sheet = ReadingsSheet(path, machine, "time")
     if "time" not in sheet:
         raise DatasetError(
@@ -77,7 +77,7 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
 def series_of_joints(
     source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
 ) -> Series:
-    """Return the readings of joint states: positions [m or rad] by the names of joints."""
+    """Return the readings of joint states: positions [m or rad] by joint name."""
     joints = [column.name for column in reading_columns(machine.legs)]
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:
@@ -99,7 +99,7 @@ def series_of_joints(
 
 
 def _in_order(series: Series) -> Series:
-    """Return a series in the order of its times; of equal times the first counts."""
+    """Return a series in the order of its times; of equal times the first is kept."""
     times, first = np.unique(series.times, return_index=True)
     if len(times) < 3:
         raise DatasetError(

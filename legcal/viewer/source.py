@@ -23,10 +23,10 @@ _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 class Source:
     """A machine, with its calibration and its session, if any."""
 
-    machine: Machine  # the calibrated one of a result
-    nominal: Machine | None = None  # of which only the legs are looked at; None without a result
+    machine: Machine  # the calibrated machine of a result
+    nominal: Machine | None = None  # nominal machine (legs only); None without a result
     result: EarlierResult | None = None
-    dataset: Dataset | None = None  # its readings in the order of the machine's legs
+    dataset: Dataset | None = None  # session, with readings in the order of the legs
 
     @property
     def name(self) -> str:
