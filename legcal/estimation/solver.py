@@ -77,9 +77,9 @@ def minimise(
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
 
-    A pseudo-Huber loss starts wide enough for most residuals and is narrowed while converging. At its
-    final width the first of three criteria stops the iteration: the predicted decrease of the cost is
-    at rounding, it is below *tolerance*, or, after the first 30 steps, it is below
+    A pseudo-Huber loss starts wide enough for most residuals and is narrowed while converging. At
+    its final width the first of three criteria stops the iteration: the predicted decrease of the
+    cost is at rounding, it is below *tolerance*, or, after the first 30 steps, it is below
     *relative_tolerance* times the cost.
 
     Parameters
