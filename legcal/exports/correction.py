@@ -122,7 +122,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     lines = [
         f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
         "# Command the columns corrected_* to a controller with the nominal model: the calibrated",
-        "# platform then stands at the others. Pose of the platform link in the base link; roll,",
+        "# platform then is at the other columns. Pose of the platform link in the base link; roll,",
         "# pitch, yaw about fixed x, y, z. Nodes of a grid, the last coordinate changes fastest.",
         *(f"# {sentence}" for sentence in sentences),
         ",".join([*names, *(f"corrected_{name}" for name in names)]),

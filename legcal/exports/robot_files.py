@@ -77,7 +77,7 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
         )
     if meshes:
         named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
-        notes.append(f"Meshes lie in files of their own and were left out: {named_meshes}.")
+        notes.append(f"Meshes are in separate files and were left out: {named_meshes}.")
     return content, tuple(notes)
 
 

@@ -405,8 +405,8 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         elif not outside[1] and abs(other - chosen) > 1e-9:
             problems.append(
                 f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the one in home_readings, or give it a "
-                f"travel on one side of where {_rods_in_words(rods)} stands across the motion."
+                f"{unit}, {needed} and not two; write the right one in home_readings, or limit the "
+                f"travel to one side of the turning point of {_rods_in_words(rods)}."
             )
     _refuse(problems)
     return readings

@@ -80,10 +80,11 @@ def classify_leg(
                 else f"the slider '{axes[0].name}' on the base itself, so that the joint at A moves"
             )
             raise OutOfClass(
-                f"the leg of joint '{leg}' is outside the method: found {reason}, needed a joint "
+                f"the leg of joint '{leg}' is not supported: found {reason}, needed a joint "
                 "whose centre is fixed in the base, at most one slider, and a joint whose centre "
                 "is fixed in the platform, or a motor that moves the joint at A and then a rod; "
-                "name this motor in name_mot, otherwise the machine cannot be calibrated this way."
+                "name this motor in name_mot, otherwise the machine cannot be calibrated with "
+                "legcal."
             )
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
@@ -114,16 +115,16 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
     second = next((c.joint for c in onward if c.joint in motors), None)
     if second is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found a second motor '{second}' "
+            f"the leg of joint '{leg}' is not supported: found a second motor '{second}' "
             f"beyond the motor '{leg}' on the base, needed one motor for each leg; remove it from "
-            "name_mot if it has none, otherwise this machine cannot be calibrated this way."
+            "name_mot if it has none, otherwise this machine cannot be calibrated with legcal."
         )
     slider = next((c.joint for c in onward if c.type == "prismatic"), None)
     if slider is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the slider '{slider}' beyond "
+            f"the leg of joint '{leg}' is not supported: found the slider '{slider}' beyond "
             f"the motor '{leg}' on the base, needed a rod of constant length there; this machine "
-            "cannot be calibrated this way."
+            "cannot be calibrated with legcal."
         )
 
 
@@ -138,10 +139,10 @@ def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
     turns = chain.steps[0].connection.type == "revolute"
     if turns and axis.distance(chain.A) < within:
         raise OutOfClass(
-            f"the leg of motor '{axis.name}' is outside the method: found the joint at A on the "
+            f"the leg of motor '{axis.name}' is not supported: found the joint at A on the "
             "axis of the motor, which turns the rod and does not move its joint, needed an arm "
             "between them; remove it from name_mot if it has no motor, otherwise this machine "
-            "cannot be calibrated this way."
+            "cannot be calibrated with legcal."
         )
 
 
@@ -399,14 +400,14 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
     left, twisting = sum(spare), [end.type.twists_freely for end in ends]
     if ends[0].type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the axis of "
+            f"the leg of joint '{leg}' is not supported: found the axis of "
             f"'{base.spins[0].name}' along the leg, needed one perpendicular to it within "
-            f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated this way."
+            f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated with legcal."
         )
     if left and not any(twisting):
         name = (*base.spins, *platform.spins)[0].name
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the axis of '{name}' along the "
+            f"the leg of joint '{leg}' is not supported: found the axis of '{name}' along the "
             "leg, and no S joint; needed the inner axis of a universal joint perpendicular to the "
             f"leg within {np.degrees(PERPENDICULAR):.2g} deg; correct its axis."
         )
@@ -424,7 +425,7 @@ def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
                 is_revolute = end.type is JointType.REVOLUTE
                 axis_kind = "a revolute axis" if is_revolute else "an inner axis of a U joint"
                 raise OutOfClass(
-                    f"the leg of joint '{leg}' is outside the method: found the axis of "
+                    f"the leg of joint '{leg}' is not supported: found the axis of "
                     f"'{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from perpendicular to the "
                     f"leg, needed {axis_kind} within {np.degrees(PERPENDICULAR):.2g} deg; "
                     "correct it."
@@ -466,13 +467,13 @@ def _rod(
     where = f"{len(places)} joints in different places" if several else "all joints in one place"
     if on is not None:
         raise OutOfClass(
-            f"the leg of motor '{on}' is outside the method: found no slider and {where} beyond "
+            f"the leg of motor '{on}' is not supported: found no slider and {where} beyond "
             "it, needed a rod of constant length with a joint at each end; this machine cannot be "
-            "calibrated this way."
+            "calibrated with legcal."
         )
     hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
     raise OutOfClass(
-        f"the leg of joint '{leg}' is outside the method: found no slider and {where}{hangs}, "
+        f"the leg of joint '{leg}' is not supported: found no slider and {where}{hangs}, "
         "needed a joint whose centre is fixed in the base, then a slider or a rod of constant "
         "length, and a joint whose centre is fixed in the platform, or a motor that moves the "
         "joint at A; name this motor in name_mot, otherwise the machine cannot be calibrated this "
@@ -487,7 +488,7 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found both its joints in one "
+            f"the leg of joint '{leg}' is not supported: found both its joints in one "
             "point, needed a distance between them; correct their origins."
         )
     u = (B - A) / length
@@ -495,7 +496,7 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     base, platform, idle_spins = _with_spins(base, platform, leg)
     if platform.type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found a rod that only turns "
+            f"the leg of joint '{leg}' is not supported: found a rod that only turns "
             "about itself at the platform, needed a joint there; correct its axes."
         )
     _check_axes(base, platform, u, leg)
@@ -578,7 +579,7 @@ def _telescope(
             miss, misfit = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
     if miss > within:
         raise OutOfClass(
-            f"the leg of slider '{axes[slider].name}' is outside the method: {misfit} "
+            f"the leg of slider '{axes[slider].name}' is not supported: {misfit} "
             f"{'axis' if base.centre is None else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
             f"{1e3 * within:.2g} mm; correct the origins along the leg."
         )

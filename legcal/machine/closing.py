@@ -79,7 +79,7 @@ def close_at(
         gap = worst_closure(machine, metre * left)
         problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
     elif off[0] > tolerance[0] or off[1] > tolerance[1]:
-        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
+        problem = f"the platform moved {_away(off)} away, needed a pose that the legs allow"
     else:
         return configuration
     raise _not_closed(machine, T_base_platform, problem)

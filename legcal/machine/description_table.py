@@ -722,8 +722,8 @@ def _description(file: TableFile, source: str) -> Description:
             if offset is None and kind is LegKind.ACTUATED:
                 offset = low
                 notes = [
-                    "Readings are taken to be zero at the shortest length of a leg (min_length): "
-                    "give offsets, the length at reading zero, if the encoders count otherwise."
+                    "Readings are assumed to be zero at the shortest length of a leg (min_length): "
+                    "give offsets, the length at reading zero, if they are not."
                 ]
             limits = [_less(low, offset or 0.0), _less(high, offset or 0.0)]
         reads_length = kind is LegKind.PASSIVE and offset is None  # a single pair means readings

@@ -21,12 +21,12 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         away = [(q[j] - 0.5 * sum(ends)) / np.ptp(ends) for j, ends in travels.items()]
         middle = "with all legs at mid-travel"
         if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
-            middle = "with all motors as near mid-travel as they are together"
+            middle = "with all motors as near to mid-travel as possible"
         xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
         quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
             f"{machine.urdf.wording.no_home}: a pose {middle} was taken, xyz "
-            f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
+            f"[{xyz}], quat_xyzw [{quat}]; add it to the file if it is the right assembly."
         )
     outside = legs_outside(machine)
     for name, reading, travel in dict.fromkeys(
@@ -48,12 +48,12 @@ def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, 
         return (
             f"the file has no block legcal: base '{machine.base}', platform "
             f"'{machine.platform}', legs {', '.join(machine.leg_names)} and base_frame "
-            f"[{frame}] were taken from its bodies; write them down to choose others.",
+            f"[{frame}] were taken from its bodies; add the block to choose others.",
         )
     if written.base_frame is None:
         return (
-            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
-            "it down to choose others.",
+            f"legcal.base_frame is not given: [{frame}] was taken, the legs with the largest span "
+            "of joints; add it to choose others.",
         )
     return ()
 
@@ -66,7 +66,7 @@ def singularity_note(machine: Machine) -> str | None:
     if measure > _MIN_SINGULARITY:
         return None
     return (
-        "the mechanism is singular at home: the platform moves there although all motors stand "
+        "the mechanism is singular at home: the platform can move there with all motors locked "
         f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
         f"{machine.urdf.wording.correct_home}, or the joints if they make similar figures on base "
         "and platform."
@@ -101,7 +101,7 @@ def _motor_notes(machine: Machine) -> list[str]:
     elif machine.is_redundant:
         notes.append(
             f"there are more motors than the pose needs: mobility {machine.mobility}, motors "
-            f"{n_motors}; the pose at readings is that of least squares."
+            f"{n_motors}; the pose at readings is a least-squares pose."
         )
     singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular]
@@ -122,7 +122,7 @@ def _spin_notes(machine: Machine) -> list[str]:
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(
-            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
-            "as mobility."
+            f"{joints} the motion of an S joint of the leg, or of another revolute; this is not "
+            "counted as mobility."
         )
     return notes

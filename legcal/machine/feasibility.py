@@ -197,7 +197,7 @@ class Feasibility:
         collision = self.collision(T)
         if collision is not None:
             first, second = collision
-            return Cause.COLLISION, f"legs '{first}' and '{second}' run through each other"
+            return Cause.COLLISION, f"legs '{first}' and '{second}' collide"
         return None
 
     def led(

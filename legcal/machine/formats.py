@@ -99,7 +99,7 @@ def _read_xml(path: Path) -> Source:
         raise ModelError(
             Problem(
                 f"the mechanism could not be read: found <{root.tag}> "
-                "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give "
+                "as the root element, needed <robot> (URDF) or <mujoco> (MJCF); give "
                 "one of them.",
                 file=str(path),
                 line=cast("int", root.sourceline),
@@ -421,7 +421,7 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
         if element.get("name") not in urdf.joints:
             problems.add(
                 element,
-                "is a motor of no joint of the file",
+                "names no joint of the file",
                 closest(str(element.get("name")), urdf.joints).rstrip("."),
             )
     motors = list(dict.fromkeys(str(e.get("name")) for e in named))

@@ -283,8 +283,8 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     problem = violated_constraint(mechanism, T_base_platform)
     if problem is not None:
         raise UsageError(
-            f"The platform cannot stand there: {problem}, needed a pose that every leg "
-            "allows; choose one that keeps it."
+            f"The platform cannot take this pose: {problem}, needed a pose that every leg "
+            "allows; choose a pose that meets this constraint."
         )
     q = readings_at(mechanism, T_base_platform)
     q[[not leg.has_value for leg in mechanism.legs]] = 0.0
@@ -446,8 +446,8 @@ def follow(
             Problem(
                 f"the pose at the readings{which} could not be reached: at "
                 f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
-                "legs meet no more or the mechanism is singular, needed a regular path; check the "
-                f"readings and {machine.urdf.wording.home}.",
+                "legs no longer close or the mechanism is singular, needed a regular path; check "
+                f"the readings and {machine.urdf.wording.home}.",
                 file=str(machine.yaml_path),
             )
         )

@@ -379,7 +379,7 @@ def _readings_at_home(
                         f"legcal.home_readings.{leg.actuator.joint} could not be used",
                         f"{wanted:g} {leg.reading_unit}, outside the travel of "
                         f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                        f"the one of {said} that is that of home",
+                        f"the one of {said} at home",
                         f"correct it{degrees}",
                         str(path),
                     )
@@ -587,17 +587,17 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
         where = "in space" if spatial else "in a plane"
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {where}",
                 f"at least {n_d}, whose joints define the frames of base and platform",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
     if len(chains) > MAX_LEGS:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{len(chains)} legs",
                 f"at most {MAX_LEGS}, since the work grows with their cube",
                 "leave out passive legs",
@@ -608,20 +608,20 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
     if fixed and not spatial:
         raise OutOfClass(
             Problem(
-                f"the leg of joint '{any_joint(fixed[0])}' is outside the method",
+                f"the leg of joint '{any_joint(fixed[0])}' is not supported",
                 "it fixed to the platform of a planar mechanism",
                 "a revolute joint there",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 "a planar machine whose joints at A move on carriages or arms",
                 "a machine in space, or sliders along the legs",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
@@ -663,19 +663,19 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
         elif kind != "prismatic" and motor not in moving:
             problems.append(
                 Problem(
-                    f"the motor '{motor}' is outside the method",
+                    f"the motor '{motor}' is not supported",
                     f"a {kind} joint in name_mot that does not stand between the base and an "
                     "arm with rods",
                     "sliders of legs, or joints on the base that carry the joints of rods",
                     "remove it from name_mot if it has no motor, otherwise this machine "
-                    "cannot be calibrated this way",
+                    "cannot be calibrated with legcal",
                     str(path),
                 )
             )
         elif motor not in moving:
             problems.append(
                 Problem(
-                    f"the motor '{motor}' is outside the method",
+                    f"the motor '{motor}' is not supported",
                     "it on no leg",
                     "the slider of a leg",
                     "remove it from name_mot",
@@ -847,9 +847,9 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
                 f"the mechanism '{machine.name}' could not be used",
                 f"that {nearly} of the {n} constraints of its joints follow from the "
                 "others to 1 mrad but not exactly",
-                "an overconstrained machine to have its mobility exactly",
-                "write axes that are parallel, perpendicular or meet with all digits (12 "
-                "decimals or more)",
+                "exactly dependent constraints in an overconstrained machine",
+                "write parallel, perpendicular or intersecting axes with all digits (12 decimals "
+                "or more)",
                 str(machine.yaml_path),
             )
         )
@@ -871,17 +871,16 @@ def _check_ties(machine: Machine) -> None:
         remedy = "give its rods spherical joints"
         if joints == {JointType.SPHERICAL}:
             remedy = (
-                "leave out rods that hold nothing new (between the same joints as another, a third "
-                "one on a motor, those of a fourth arm), otherwise this machine cannot be "
-                "calibrated this way"
+                "leave out redundant rods (between the same joints as another, a third one on a "
+                "motor, those of a fourth arm), otherwise this machine cannot be calibrated with "
+                "legcal"
             )
         raise OutOfClass(
             Problem(
-                f"the mechanism '{machine.name}' is outside the method",
-                f"it overconstrained ({n_dependent_at_home(machine)} of the {n} "
-                "constraints of its joints follow from the others) with joints at A that "
-                "move",
-                "none that follow",
+                f"the mechanism '{machine.name}' is not supported",
+                f"an overconstrained machine ({n_dependent_at_home(machine)} of the {n} "
+                "constraints of its joints follow from the others) with moving joints at A",
+                "independent constraints",
                 remedy,
                 str(machine.yaml_path),
             )
@@ -889,11 +888,11 @@ def _check_ties(machine: Machine) -> None:
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(
             Problem(
-                f"the mechanism '{machine.name}' is outside the method",
-                f"it overconstrained ({ties.n_dependent} of the {n} constraints of its "
-                "joints follow from the others) and no errors of its parameters near the "
-                f"model with which it keeps its mobility {machine.mobility}",
-                "parameters that can be tied so",
+                f"the mechanism '{machine.name}' is not supported",
+                f"an overconstrained machine ({ties.n_dependent} of the {n} constraints of its "
+                f"joints follow from the others) that loses its mobility {machine.mobility} with "
+                "small errors of its parameters, however they are tied",
+                "parameters with errors that keep the mobility",
                 "give a leg another joint, or leave out a leg without a motor",
                 str(machine.yaml_path),
             )
@@ -963,7 +962,7 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
                     problems.setdefault(
                         name,
                         Problem(
-                            f"leg '{name}' is outside the method",
+                            f"leg '{name}' is not supported",
                             f"{problem} at a closed pose",
                             "",
                             "check the origins and axes along the leg",

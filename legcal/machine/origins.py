@@ -243,7 +243,7 @@ class Handles:
             raise problem
         raise OutOfClass(
             Problem(
-                f"leg '{leg}' is outside the method",
+                f"leg '{leg}' is not supported",
                 f"several welds between joint '{joint.name}' and the link '{body}'",
                 "one, which moves with the parameters of the leg",
                 "close the leg once",

@@ -95,11 +95,11 @@ class Contradiction:
         off, *distances = [1e3 * distance for distance in self.distances]
         also = list(zip(others, distances, strict=True))
         words = ", ".join(["{} by {:.1f} mm"] * len(also))
-        alike = f" (or as likely one of {words})" if also else ""
+        alike = f" (or, equally likely, of {words})" if also else ""
         whose = "leg" if legs[0].actuator is None else "motor"
         return Cause(
-            f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from where the other motors put it, "
-            "needed at most {:.1f} mm",
+            f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from the value given by the other "
+            "motors, needed at most {:.1f} mm",
             (first, *(value for pair in also for value in pair), off, 1e3 * self.allowed),
         )
 

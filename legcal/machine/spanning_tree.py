@@ -248,7 +248,7 @@ def travel_note(sliders: Sequence[str], travel: tuple[float, float]) -> str:
     names = ", ".join(f"'{name}'" for name in sliders[:6])
     return (
         f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[1]:g} m to either "
-        "side of where it is closed was assumed; write their limits."
+        "side of the closed pose was assumed; add their limits."
     )
 
 

@@ -35,18 +35,18 @@ platform_joints:
 {platform_joints}
 
 # Shortest and longest length of a leg, from joint centre to joint centre. Readings are zero at the
-# shortest then. If yours are not, give in place of these the length at reading zero and the lowest
-# and highest reading:
+# shortest then. Otherwise give instead the length at reading zero and the lowest and highest
+# reading:
 #   offsets: 380
 #   travel: [0, 120]
 min_length: {min_length}
 max_length: {max_length}
 
-# Radius (half of the diameter) of what is seen of a leg: the thick part at the base, the thin one
-# at the platform.
+# Radius (half of the diameter) of the visible parts of a leg: the thick one at the base, the thin
+# one at the platform.
 radius: {radius}
 
-# Height of the platform's origin over that of the base when the machine stands level.
+# Height of the platform origin above the base origin at home, with a level platform.
 home: {home}
 
 # Rods of constant length that hang on carriages or arms (type 6-PSS, 6-RSS, 3-PRS) need motors:
@@ -77,7 +77,7 @@ platform_joints:
 lengths: {lengths}
 radius: {radius}
 
-# Height of the platform's origin over that of the base when the machine stands level.
+# Height of the platform origin above the base origin at home, with a level platform.
 home: {home}
 """
 

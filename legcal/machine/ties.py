@@ -237,7 +237,7 @@ def ties_in_words(machine: Machine) -> str | None:
     tied = sparse_basis(independent(rows, by_step(rows, parametrization.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
     alone = [parametrization.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
-    words = [f"{_named(alone, machine)} stay as they are"] if alone else []
+    words = [f"{_named(alone, machine)} do not change"] if alone else []
     together = np.flatnonzero(np.any(np.abs(tied[~is_alone]) > SHOWN, axis=0))
     names = [parametrization.names[i] for i in together]
     if names:
@@ -245,7 +245,7 @@ def ties_in_words(machine: Machine) -> str | None:
     n = n_pose_constraints(machine.legs)
     return (
         f"The machine is overconstrained: {ties.n_dependent} of the {n} constraints of its joints "
-        f"follow{'s' * (ties.n_dependent == 1)} from the others. So that this stays so, "
+        f"follow{'s' * (ties.n_dependent == 1)} from the others. To keep this so, "
         f"{len(tied)} combinations of its parameters are tied: {'; '.join(words)}."
     )
 

@@ -303,7 +303,7 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
     if joint.type not in ("floating", "planar"):
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"a {joint.type} joint",
                 "a floating or planar one, which only says where the platform is",
                 "correct it, or write null if a leg carries the platform",
@@ -314,7 +314,7 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
         axis = ", ".join(f"{x:g}" for x in joint.axis)
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+                f"legcal.platform_joint '{joint.name}' is not supported: found a planar joint "
                 f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
                 "plane of its frame; turn its origin rpy instead.",
                 file=str(path),
@@ -337,7 +337,7 @@ def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> 
     if carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"it between the parent '{joint.parent}' and the child '{joint.child}'",
                 f"'{block.base}' and '{block.platform}'",
                 "name the joint that carries the platform, or write null",
@@ -364,7 +364,7 @@ def check_plane(
     if normals is None:
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 "a planar joint",
                 "a floating one, because the axes of the legs do not let the platform "
                 "move in one plane",
@@ -378,7 +378,7 @@ def check_plane(
         tilt = 90.0 - np.degrees(off_square(z, normal))
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"its plane {tilt:.4g} deg from the plane in which the legs move",
                 "the same plane within 0.057 deg",
                 "correct its origin rpy",
@@ -458,7 +458,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     ):
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
                 "at most the virtual one that carries the platform",
                 "name that one in legcal.platform_joint",
@@ -468,7 +468,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     if connection.bodies[0] == connection.bodies[1]:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{_name(connection)} between two links that are rigidly connected",
                 "a joint that can move",
                 "remove it",
@@ -478,7 +478,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     if set(connection.bodies) == {base, platform}:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{_name(connection)} directly between base and platform",
                 "legs",
                 "name it in legcal.platform_joint if it is the virtual joint that "
@@ -501,13 +501,13 @@ def _several_bodies(
         return None
     if len(on_base) == 1:
         return Problem(
-            "this machine is outside the method",
+            "this machine is not supported",
             f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
             f"closed at link '{body}'",
             "chains without loops that end on the platform itself",
             "if these are the rods of a parallelogram on an arm or a carriage, close "
             "each on the platform as a leg of its own, otherwise this machine cannot "
-            "be calibrated this way",
+            "be calibrated with legcal",
             str(urdf.path),
         )
     if len(on_base) > 1:
@@ -518,12 +518,12 @@ def _several_bodies(
 def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Problem:
     """Return the problem of a platform that carries a body on which legs end."""
     return Problem(
-        "this machine is outside the method",
+        "this machine is not supported",
         "a platform of several bodies (as of an H4 or I4), because legs end on "
         f"link '{body}', which {_name(joint)} connects to the platform",
         "legs that end on one rigid platform",
         f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-        "cannot be calibrated this way",
+        "cannot be calibrated with legcal",
         str(urdf.path),
     )
 
@@ -567,13 +567,13 @@ def _not_a_chain(
     if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
         moves = first.joint in motors
         return Problem(
-            f"the leg that starts with {_name(first)} is outside the method",
+            f"the leg that starts with {_name(first)} is not supported",
             f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}",
             "the motor of an arm or a carriage on the base itself",
-            "arms on arms cannot be calibrated this way"
+            "arms on arms cannot be calibrated with legcal"
             if moves
             else "make joints between it and the base fixed if they do not move, otherwise "
-            "this machine cannot be calibrated this way",
+            "this machine cannot be calibrated with legcal",
             str(urdf.path),
         )
     if body == base:
@@ -686,12 +686,12 @@ def _platform_body(
         raise reasons[0]
     raise OutOfClass(
         Problem(
-            "this mechanism is outside the method",
+            "this mechanism is not supported",
             "one closed chain in which no link is a platform on legs, because on "
             "each side of any link more than a slider or a rod moves the joint at A; "
             "needed legs of type joint, slider or rod, joint",
             "",
-            "this machine cannot be calibrated this way",
+            "this machine cannot be calibrated with legcal",
             str(path),
         )
     )

@@ -33,7 +33,7 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
         raise ModelError(
             Problem(
                 f"the URDF could not be read: found <{robot.tag}> "
-                "as its outermost element, needed <robot>; give the URDF of the mechanism.",
+                "as its root element, needed <robot>; give the URDF of the mechanism.",
                 file=str(path),
                 line=cast("int", robot.sourceline),
             )

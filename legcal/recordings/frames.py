@@ -135,7 +135,7 @@ class ImageFolder:
             raise DatasetError(
                 f"{self.path}: {lost[0]} could not be used: found no time in its name or EXIF "
                 "data, needed one for each image (a Unix time in the name, or the date of the "
-                "camera); for photographs of poses that were held use legcal init."
+                "camera); for photographs of single poses use legcal init."
             )
         ordered = sorted(photographs, key=lambda p: times[p.name] or 0.0)
         for number, photograph in enumerate(ordered):

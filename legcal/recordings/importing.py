@@ -303,8 +303,8 @@ def _view(
     for signal, motion in (("frames", frames_move), ("readings", moves)):
         if motion is None:
             raise DatasetError(
-                f"{start} found {signal} that change alike all the time, needed a machine that "
-                "rests at each pose and moves between; for photographs of poses that were held use "
+                f"{start} found {signal} that change at one rate all the time, needed a machine "
+                "that rests at each pose and moves between; for photographs of single poses use "
                 f"legcal init. ({series.source if signal == 'readings' else recording.path})"
             )
     assert frames_move is not None

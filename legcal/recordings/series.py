@@ -64,7 +64,7 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
-            f"poses that were held. {' '.join(sheet.notes)}".rstrip()
+            f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
     readings = sheet.readings(lengths=lengths)
     times = _seconds(sheet.text("time"), path)

@@ -91,5 +91,5 @@ def directions(
     order = [result.kinematic.names.index(name) for name in names]
     for words, row in zip(result.held, result.kinematic.held, strict=False):
         step = _HELD * length * np.array(row)[order]
-        steps.append((f"{1e3 * _HELD * length:.2g} mm along what is held: {words}", step))
+        steps.append((f"{1e3 * _HELD * length:.2g} mm along a held direction: {words}", step))
     return steps

@@ -437,7 +437,7 @@ class Window:
                 segments.colors = np.repeat(colours, 2, axis=1).astype(np.uint8)
         title = f"Pose {pose + 1} of {len(self.photographs.poses)}"
         if not self.photographs.places:
-            said.append("No camera stands anywhere yet: the dataset has no hints.")
+            said.append("No camera has a pose yet: the dataset has no hints.")
         self._pose_words.content = "\n\n".join([title, *said])
 
     def _add_comparison(self) -> None:
