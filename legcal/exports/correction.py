@@ -121,9 +121,9 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in columns]
     lines = [
         f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
-        "# Command the columns corrected_* to a controller with the nominal model: the calibrated",
-        "# platform then is at the other columns. Pose of the platform link in the base link; roll,",
-        "# pitch, yaw about fixed x, y, z. Nodes of a grid, the last coordinate changes fastest.",
+        "# Command the columns corrected_* to a controller with the nominal model, to move the",
+        "# calibrated platform to the other columns. Poses are of the platform link in the base",
+        "# link; roll, pitch, yaw are about fixed x, y, z. The last coordinate changes fastest.",
         *(f"# {sentence}" for sentence in sentences),
         ",".join([*names, *(f"corrected_{name}" for name in names)]),
     ]
