@@ -22,7 +22,7 @@ from legcal.files.schema import Document, Number, SparseDocument
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
 
-def _every_machine(subject: Subject) -> str | None:
+def _accept_all(subject: Subject) -> str | None:
     """Accept every machine."""
     return None
 
@@ -32,7 +32,7 @@ class Format:
     """A format: its renderer, its restrictions and its options."""
 
     render: Render  # files from a subject, options and the requested path
-    refusal: Callable[[Subject], str | None] = _every_machine  # reason for refusing a machine
+    refusal: Callable[[Subject], str | None] = _accept_all  # reason for refusing a machine
     is_folder: bool = False
     options: tuple[str, ...] = ()  # supported fields of ExportOptions
 

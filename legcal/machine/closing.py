@@ -171,8 +171,8 @@ def _off(
 
 def _away(off: tuple[float, float]) -> str:
     """Return a distance and an angle in words, without one that is negligible beside the other."""
-    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
-    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
+    parts = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
+    return " and ".join(text for text, x in zip(parts, off, strict=True) if x > 1e-6 * max(off))
 
 
 def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str) -> DidNotConverge:

@@ -360,15 +360,15 @@ def random_postures_of_legs(
         if len(postures[1]) >= count:
             return postures[0][:count], postures[1][:count]
         share = max(SHRINKING * share, MIN_SHARE)
-    said = f"found {len(postures[1])} of {count} random poses inside the travel"
+    reached = f"found {len(postures[1])} of {count} random poses inside the travel"
     if 2 * near_singular > tried and drive.hold() < LOOSE:
         raise DidNotConverge(
-            f"The observations could not be predicted: {said}, needed all; most ways there come "
+            f"The observations could not be predicted: {reached}, needed all; most ways there come "
             "near a singular pose, in which motors and joints do not hold the platform: choose a "
             "home further from it, or joints that do not make the same figure on base and platform."
         )
     raise DidNotConverge(
-        f"The observations could not be predicted: {said}, needed all; check the travel (limit "
+        f"The observations could not be predicted: {reached}, needed all; check the travel (limit "
         "lower, upper) and the home pose of the model."
     )
 

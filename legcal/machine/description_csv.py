@@ -20,7 +20,7 @@ from legcal.errors import DatasetError
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
 
-WHAT = "table"
+FILE_KIND = "table"
 MAX_NUMBER = 1e9  # largest number, in any unit
 UNITS = {"m": 0, "mm": -3}  # units of length, as powers of ten
 SIDES = {
@@ -54,7 +54,7 @@ _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
-    *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
+    *(f"{vector}_{i}" for vector in ("direction", "point", "axis") for i in _XYZ),
     *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
     *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
@@ -87,7 +87,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     names = [column.name for column in COLUMNS]
     table = read_table(
         path,
-        WHAT,
+        FILE_KIND,
         "leg",
         COLUMNS,
         needed="one row for each leg; add them",

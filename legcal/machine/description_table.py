@@ -42,7 +42,7 @@ from legcal.machine.description import (
     legs_in_words,
     look_like_base,
 )
-from legcal.machine.description_csv import MAX_NUMBER, MOTIONS, UNITS, WHAT, read_columns
+from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, UNITS, read_columns
 from legcal.machine.leg import MAX_LEGS, LegKind
 
 
@@ -364,7 +364,7 @@ def read_description(
                     "give it a name with --name NAME."
                 )
         else:
-            table = read_yaml(path, WHAT)
+            table = read_yaml(path, FILE_KIND)
             table = {key: value for key, value in table.items() if value is not None}
             if name is not None:
                 table["name"] = name

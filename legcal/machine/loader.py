@@ -59,7 +59,7 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.occluders import occluders_of, visual_solids, with_covers
-from legcal.machine.origins import with_own_origins
+from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
@@ -72,10 +72,10 @@ from legcal.machine.topology import (
     check_bodies,
     check_plane,
     check_type,
+    distinct_joint,
     find_chains,
     normals_in_links,
     normals_of_closures,
-    own_joint,
     plane_of_motion,
     propose_block,
     propose_frame,
@@ -134,7 +134,7 @@ def _load(source: Source) -> Machine:
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
-    urdf, extended_closures = with_own_origins(source.urdf, closures, machine)
+    urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
     if urdf is not source.urdf:
         machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
     # A closed home.
@@ -368,7 +368,7 @@ def _readings_at_home(
             continue
         readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
         size, unit = SHOWN_IN[leg.reading_unit]
-        said = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
+        choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         if leg.actuator.joint in given:
             wanted = given[leg.actuator.joint]
             q[j] = min(readings, key=lambda x: abs(x - wanted))
@@ -379,7 +379,7 @@ def _readings_at_home(
                         f"legcal.home_readings.{leg.actuator.joint} could not be used",
                         f"{wanted:g} {leg.reading_unit}, outside the travel of "
                         f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                        f"the one of {said} at home",
+                        f"the one of {choices} at home",
                         f"correct it{degrees}",
                         str(path),
                     )
@@ -394,7 +394,7 @@ def _readings_at_home(
             raise ModelError(
                 Problem(
                     f"the assembly of leg '{leg.name}' at home is ambiguous",
-                    f"that its rod reaches the platform at {said} of '{leg.actuator.joint}', "
+                    f"that its rod reaches the platform at {choices} of '{leg.actuator.joint}', "
                     "both inside its travel",
                     "one",
                     f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
@@ -450,7 +450,7 @@ def _legs_in_order(
     problems += [
         Problem(
             "legcal.legs is incomplete",
-            f"no name for the leg with joint '{own_joint(chain)}'",
+            f"no name for the leg with joint '{distinct_joint(chain)}'",
             "every leg",
             "add a line for it",
             str(path),

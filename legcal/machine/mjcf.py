@@ -444,20 +444,20 @@ class MjcfReader:
             self.problems.add(element, "has no anchor", "write the point in the frame of body1")
         if any(name not in self.poses for name in names):
             return None
-        T_one_two = self.poses[names[0]].inv() * self.poses[names[1]]
+        T_body1_body2 = self.poses[names[0]].inv() * self.poses[names[1]]
         at = np.zeros(3) if anchor is None else anchor
         if element.tag == "connect":  # the anchor is in body1
-            T_one = RigidTransform.from_translation(at)
-            T_two = RigidTransform.from_translation(T_one_two.inv().apply(at))
-            return (names[0], T_one), (names[1], T_two)
+            T_body1 = RigidTransform.from_translation(at)
+            T_body2 = RigidTransform.from_translation(T_body1_body2.inv().apply(at))
+            return (names[0], T_body1), (names[1], T_body2)
         relpose = self._numbers(element, attributes, "relpose", (7,))
-        T_two = RigidTransform.from_translation(at)  # the anchor of a weld is in body2
+        T_body2 = RigidTransform.from_translation(at)  # the anchor of a weld is in body2
         if relpose is not None and relpose[3:].any():  # MuJoCo moves the anchor to this point
             rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
-            T_one = RigidTransform.from_components(relpose[:3], rotation)
+            T_body1 = RigidTransform.from_components(relpose[:3], rotation)
         else:  # as in the configuration of the file
-            T_one = T_one_two * T_two
-        return (names[0], T_one), (names[1], T_two)
+            T_body1 = T_body1_body2 * T_body2
+        return (names[0], T_body1), (names[1], T_body2)
 
     def motors(self) -> list[str]:
         """Return the joints with an encoder: driven joints, and measured slides."""

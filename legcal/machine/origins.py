@@ -5,7 +5,7 @@ its slider or a joint of its rod. For a rod on a carriage or an arm the origin o
 holds the axis, and the origin of the joint at A holds A at reading 0. An origin that moves only
 this leg is a :class:`Handle`. If a tree has no such origin, because the last joint of a leg carries
 the platform or a closure frame is on a shared link, a separate link is added
-(:func:`with_own_origins`).
+(:func:`with_separate_origins`).
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
     return arms
 
 
-def with_own_origins(
+def with_separate_origins(
     urdf: Urdf, closures: Sequence[Closure], machine: Machine
 ) -> tuple[Urdf, list[Closure]]:
     """Return the tree of a machine and its closures with an origin for every number of a leg.

@@ -22,7 +22,7 @@ from legcal.files.schema import (
 from legcal.machine.actuator import Actuator
 from legcal.machine.files import DATASET_YAML, dataset_as_model, read_file
 
-WHAT = "mechanism file"
+FILE_KIND = "mechanism file"
 MAX_LOOPS = 100
 GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a wrong unit
 MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
@@ -86,9 +86,9 @@ class MechanismFile(BaseModel):
 
 def read_mechanism_file(path: Path) -> MechanismFile:
     """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
-    content = read_file(path, WHAT)
+    content = read_file(path, FILE_KIND)
     try:
-        document = parse_yaml(content, path, WHAT)
+        document = parse_yaml(content, path, FILE_KIND)
         _check_kind(document, path)
         file = validate(MechanismFile, _without_nulls(document), path)
     except DatasetError as error:
@@ -104,8 +104,8 @@ def _check_kind(document: Mapping[str, Any], path: Path) -> None:
     if "legcal_table" in document:
         raise ModelError(
             Problem(
-                f"the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
-                f"model; write the model of the table with: legcal new {path} -o DIR",
+                f"the {FILE_KIND} could not be read: found a table of legs (legcal_table), needed "
+                f"a model; write the model of the table with: legcal new {path} -o DIR",
                 file=str(path),
             )
         )
@@ -207,12 +207,12 @@ def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
     """Return the YAML entries of actuators that a URDF cannot hold, by joint."""
     entries = dict[str, dict[str, float]]()
     for actuator in actuators:
-        said = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
+        entry = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
         if actuator.pulses is not None:
-            said["centre_us"] = actuator.pulses.centre
-            said["us_per_deg"] = actuator.pulses.per_degree
-        if said:
-            entries[actuator.joint] = said
+            entry["centre_us"] = actuator.pulses.centre
+            entry["us_per_deg"] = actuator.pulses.per_degree
+        if entry:
+            entries[actuator.joint] = entry
     return entries
 
 

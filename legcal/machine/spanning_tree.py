@@ -287,12 +287,12 @@ def close_loop(
     loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
 ) -> tuple[list[str], str]:
     """Add the frames of a loop to a tree and return the closure."""
-    T_first, T_second = loop.T_link_frame
+    T_first_frame, T_second_frame = loop.T_link_frame
     if loop.kind in ("revolute", "universal"):
-        T_first, T_second = _with_axes(loop, poses)
+        T_first_frame, T_second_frame = _with_axes(loop, poses)
     ends = []
     for number, (link, T_link_frame) in enumerate(
-        zip(loop.links, (T_first, T_second), strict=True), start=1
+        zip(loop.links, (T_first_frame, T_second_frame), strict=True), start=1
     ):
         frame = text.unused(f"{loop.name}_{number}")
         text.link(frame)
@@ -311,28 +311,28 @@ def _with_axes(
     loop: Loop, poses: Mapping[str, RigidTransform]
 ) -> tuple[RigidTransform, RigidTransform]:
     """Return the frames turned onto the axes of the joint, equal if the loop is closed."""
-    T_first, T_second = loop.T_link_frame
+    T_first_frame, T_second_frame = loop.T_link_frame
     first, second = (
         T.rotation.apply(axis) for T, axis in zip(loop.T_link_frame, loop.axes, strict=True)
     )
-    R_two_one = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
+    R_second_first = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
     if loop.kind == "revolute":
         across = _across(first, np.roll(first, 1))
-        across_two = _across(second, R_two_one.apply(across))
+        across_second = _across(second, R_second_first.apply(across))
         rotations = (
             _columns(across, cross(first, across), first),
-            _columns(across_two, cross(second, across_two), second),
+            _columns(across_second, cross(second, across_second), second),
         )
     else:
-        along_y = _across(first, R_two_one.inv().apply(second))
-        along_x = _across(second, R_two_one.apply(first))
+        along_y = _across(first, R_second_first.inv().apply(second))
+        along_x = _across(second, R_second_first.apply(first))
         rotations = (
             _columns(first, along_y, cross(first, along_y)),
             _columns(along_x, second, cross(along_x, second)),
         )
     return (
-        RigidTransform.from_components(T_first.translation, rotations[0]),
-        RigidTransform.from_components(T_second.translation, rotations[1]),
+        RigidTransform.from_components(T_first_frame.translation, rotations[0]),
+        RigidTransform.from_components(T_second_frame.translation, rotations[1]),
     )
 
 

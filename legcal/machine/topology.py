@@ -172,7 +172,7 @@ def propose_block(
     link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
     bodies = rigid_bodies(urdf, closures, joint)
     chains = in_order(find_chains(bodies, urdf, urdf.root, link, motors), motors, urdf)
-    joints = [own_joint(chain) for chain in chains]
+    joints = [distinct_joint(chain) for chain in chains]
     names = _leg_names(joints)
     block = LegcalBlock(
         version=1,
@@ -223,7 +223,7 @@ def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> l
     return sorted(chains, key=lambda chain: rank[any_joint(chain)])
 
 
-def own_joint(chain: LegChain) -> str:
+def distinct_joint(chain: LegChain) -> str:
     """Return a joint that identifies a single leg: on an actuator not the motor."""
     if chain.actuator is None:
         return any_joint(chain)

@@ -149,10 +149,10 @@ class Bag:
             with AnyReader([self.path], default_typestore=get_typestore(Stores.LATEST)) as reader:
                 yield reader
         except (AnyReaderError, OSError, ValueError, EOFError) as error:
-            said = str(error).strip().splitlines()
+            lines = str(error).strip().splitlines()
             raise DatasetError(
                 f"{self.path}: the bag could not be read: found "
-                f"{describe(said[0]) if said else 'an error'}, needed a complete bag of ROS 1 "
+                f"{describe(lines[0]) if lines else 'an error'}, needed a complete bag of ROS 1 "
                 "(.bag) or 2 (its folder, .mcap); close its recording in order, or repair it "
                 "(rosbag reindex, ros2 bag reindex, mcap recover)."
             ) from error

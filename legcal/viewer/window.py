@@ -414,7 +414,7 @@ class Window:
 
     def _show_photographs(self) -> None:
         """Send the photographs and outlines of the current pose."""
-        pose, said = int(self._pose.value) - 1, []
+        pose, sentences = int(self._pose.value) - 1, []
         depth = _DEPTH * self.stage.size
         for place, frustum, segments in zip(
             self.photographs.places, self._frusta, self._segments, strict=True
@@ -425,7 +425,7 @@ class Window:
                 name = self.photographs.name(row)
                 if self._show_pictures.value:
                     picture, problem = self.photographs.picture(place, row)
-                said.append(_plain(problem or f"{place.name}: {name}"))
+                sentences.append(_plain(problem or f"{place.name}: {name}"))
             frustum.image = picture
             ends, used = np.zeros((0, 2, 3)), np.zeros(0, dtype=np.bool_)
             if row is not None and self._show_outlines.value:
@@ -437,8 +437,8 @@ class Window:
                 segments.colors = np.repeat(colours, 2, axis=1).astype(np.uint8)
         title = f"Pose {pose + 1} of {len(self.photographs.poses)}"
         if not self.photographs.places:
-            said.append("No camera has a pose yet: the dataset has no hints.")
-        self._pose_words.content = "\n\n".join([title, *said])
+            sentences.append("No camera has a pose yet: the dataset has no hints.")
+        self._pose_words.content = "\n\n".join([title, *sentences])
 
     def _add_comparison(self) -> None:
         """Add the controls that compare nominal and calibrated, and play weak directions."""
