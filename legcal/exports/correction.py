@@ -207,11 +207,11 @@ def _residuals(
     for asked in (np.mean(corners, axis=0), commands):
         asked_poses, _ = nominal.poses(asked, home)
         reached, _ = calibrated.forward(nominal.readings(asked_poses), X)
-        residuals.append(_apart(calibrated.machine, reached, X))
+        residuals.append(_pose_errors(calibrated.machine, reached, X))
     return residuals[0], residuals[1]
 
 
-def _apart(machine: Machine, poses: Array, references: Array) -> Array:
+def _pose_errors(machine: Machine, poses: Array, references: Array) -> Array:
     """Return the displacement of the origin of R_e, and the rotation, (k, 2) [m, rad]."""
     point = machine.T_platform_Re.as_matrix()[:3, 3]
     off = (poses[:, :, :3] - references[:, :, :3]) @ point + poses[:, :, 3] - references[:, :, 3]

@@ -74,12 +74,14 @@ def close_at(
             equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True
         )
         configuration, left = solution.points[0], solution.values[0]
-    off = _off(machine, T_base_platform, configuration)
+    off = _pose_error(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
         gap = worst_closure(machine, metre * left)
         problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
     elif off[0] > tolerance[0] or off[1] > tolerance[1]:
-        problem = f"the platform moved {_away(off)} away, needed a pose that the legs allow"
+        problem = (
+            f"the platform moved {_error_in_words(off)} away, needed a pose that the legs allow"
+        )
     else:
         return configuration
     raise _not_closed(machine, T_base_platform, problem)
@@ -113,13 +115,13 @@ def _placed(
             machine.platform,
             T_base_platform,
         )
-        off = _off(machine, T_base_platform, configuration)
+        off = _pose_error(machine, T_base_platform, configuration)
         if off[0] > tolerance[0] or off[1] > tolerance[1]:
             raise _not_closed(
                 machine,
                 T_base_platform,
-                f"the virtual joint '{machine.platform_joint}' leaves it {_away(off)} away, "
-                "needed a joint that reaches it",
+                f"the virtual joint '{machine.platform_joint}' leaves it "
+                f"{_error_in_words(off)} away, needed a joint that reaches it",
             )
     q = readings_at(machine, T_base_platform)
     sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
@@ -158,7 +160,7 @@ def closure_equations(
     return equations, retract
 
 
-def _off(
+def _pose_error(
     machine: Machine, T_base_platform: RigidTransform, configuration: Array
 ) -> tuple[float, float]:
     """Return distance [m] and angle [rad] of the platform from its required pose."""
@@ -169,7 +171,7 @@ def _off(
     return float(np.linalg.norm(t - matrix[:3, 3])), turn
 
 
-def _away(off: tuple[float, float]) -> str:
+def _error_in_words(off: tuple[float, float]) -> str:
     """Return a distance and an angle in words, without one that is negligible beside the other."""
     parts = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
     return " and ".join(text for text, x in zip(parts, off, strict=True) if x > 1e-6 * max(off))

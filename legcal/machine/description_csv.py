@@ -130,7 +130,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "platform_axes": cells.vectors("platform_axis"),
         "hangs_on": hangs_on,
     }
-    document |= {key: of_legs for key, of_legs in optional.items() if any(map(_is_there, of_legs))}
+    document |= {key: of_legs for key, of_legs in optional.items() if any(map(_is_given, of_legs))}
     return document | motors
 
 
@@ -159,7 +159,7 @@ class _Cells:
         return [None if pair == (None, None) else list(pair) for pair in pairs]
 
 
-def _is_there(value: Any) -> bool:
+def _is_given(value: Any) -> bool:
     return value is not None
 
 

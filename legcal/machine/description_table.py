@@ -76,13 +76,13 @@ _POSITIVE = {**_NUMBER, "exclusiveMinimum": 0}
 _ROW = {"type": "array", "items": _NUMBER}
 
 
-def _schema_of_legs(of_leg: dict[str, Any]) -> WithJsonSchema:
-    """Return the JSON Schema of the input of :func:`_of_legs`."""
+def _schema_per_leg(of_leg: dict[str, Any]) -> WithJsonSchema:
+    """Return the JSON Schema of the input of :func:`_value_per_leg`."""
     of_each = {"type": "array", "items": {"anyOf": [of_leg, {"type": "null"}]}}
     return WithJsonSchema({"anyOf": [of_leg, of_each]})
 
 
-def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
+def _value_per_leg(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
     """Return a validator of one value for all legs, or a list with one (or null) for each."""
 
     def check(value: Any) -> Any:
@@ -158,28 +158,28 @@ Points = Annotated[
 Directions = Annotated[
     list[Any],
     BeforeValidator(_directions),
-    _schema_of_legs({**_ROW, "minItems": 3, "maxItems": 3}),
+    _schema_per_leg({**_ROW, "minItems": 3, "maxItems": 3}),
 ]
 Lengths = Annotated[
     Any,
-    _of_legs(
+    _value_per_leg(
         _is_number, f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"
     ),
-    _schema_of_legs(_NUMBER),
+    _schema_per_leg(_NUMBER),
 ]
 Travel = Annotated[
     Any,
     BeforeValidator(_lower_first),  # validators run from the last to the first
-    _of_legs(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
-    _schema_of_legs({**_ROW, "minItems": 2, "maxItems": 2}),
+    _value_per_leg(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
+    _schema_per_leg({**_ROW, "minItems": 2, "maxItems": 2}),
 ]
 Radius = Annotated[
     Any,
-    _of_legs(
+    _value_per_leg(
         _is_radius,
         "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
     ),
-    _schema_of_legs(
+    _schema_per_leg(
         {
             "anyOf": [
                 _POSITIVE,
@@ -304,7 +304,7 @@ class TableFile(FileSchema):
     travel: Travel = None
     radius: Radius = None
     kinds: Annotated[
-        Any, BeforeValidator(_kinds), _schema_of_legs({"enum": [kind.value for kind in LegKind]})
+        Any, BeforeValidator(_kinds), _schema_per_leg({"enum": [kind.value for kind in LegKind]})
     ] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
@@ -417,7 +417,7 @@ def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]
         f"{OPTIONS[key]} beside {key if key in table else other}"
         for key in given
         for other in (key, *("types" for _ in [0] if key == "type"))
-        if _says_something(table.get(other))
+        if _is_given(table.get(other))
     ]
     if twice:
         raise ModelError(
@@ -426,7 +426,7 @@ def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]
         )
 
 
-def _says_something(value: Any) -> bool:
+def _is_given(value: Any) -> bool:
     """Return whether an entry of a table, or any of its list, is not null."""
     return any(x is not None for x in value) if isinstance(value, list) else value is not None
 
@@ -540,7 +540,7 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
         for name in actuators
         if name not in motors
     ]
-    lengths = _of_each(file.lengths, len(names))
+    lengths = _entries_per_leg(file.lengths, len(names))
     lacking = [
         leg
         for leg, motor, length in zip(names, motors, lengths, strict=False)
@@ -633,7 +633,7 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
     problems = []
     n = len(file.base_joints)
     for name, low, high, _, travel in zip(
-        file.leg_names, *(_of_each(value, n) for value in _laws(file)), strict=False
+        file.leg_names, *(_entries_per_leg(value, n) for value in _laws(file)), strict=False
     ):
         if low is None and high is None:
             continue
@@ -660,7 +660,7 @@ def _laws(file: TableFile) -> tuple[Any, ...]:
     return file.min_length, file.max_length, file.offsets, travel
 
 
-def _of_each(value: Any, n: int) -> list[Any]:
+def _entries_per_leg(value: Any, n: int) -> list[Any]:
     """Return a list with an entry for each leg."""
     return value if isinstance(value, list) else [value] * n
 
@@ -702,10 +702,10 @@ def _description(file: TableFile, source: str) -> Description:
         return None if value is None else in_metres(value, file.unit)
 
     def per_leg(value: Any) -> list[Any]:
-        return _of_each(value, n)
+        return _entries_per_leg(value, n)
 
     names, actuators, motors = file.leg_names, _actuators(file), file.motors_of_legs
-    laws = [_of_each(value, n) for value in _laws(file)]
+    laws = [_entries_per_leg(value, n) for value in _laws(file)]
     notes = list[str]()
     legs = []
     for j, (name, kind_of_leg, kind, radius) in enumerate(
@@ -725,7 +725,10 @@ def _description(file: TableFile, source: str) -> Description:
                     "Readings are assumed to be zero at the shortest length of a leg (min_length): "
                     "give offsets, the length at reading zero, if they are not."
                 ]
-            limits = [_less(low, offset or 0.0), _less(high, offset or 0.0)]
+            limits = [
+                _decimal_difference(low, offset or 0.0),
+                _decimal_difference(high, offset or 0.0),
+            ]
         reads_length = kind is LegKind.PASSIVE and offset is None  # a single pair means readings
         limits = metres(limits)
         if constant or (reads_length and _is_pair(file.travel)):
@@ -753,7 +756,7 @@ def _description(file: TableFile, source: str) -> Description:
     return described
 
 
-def _less(minuend: float, subtrahend: float) -> float:
+def _decimal_difference(minuend: float, subtrahend: float) -> float:
     return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 

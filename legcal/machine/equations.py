@@ -103,7 +103,9 @@ def pose_equations(
     for alike in groups.values():
         leg, a = legs[alike[0]], on[alike[0]]
         at = None if q is None or a < 0 else q[:, a]
-        length, *equations, by_reading = _of_alike([legs[j] for j in alike], R, t, by_local, at)
+        length, *equations, by_reading = _equations_of_similar(
+            [legs[j] for j in alike], R, t, by_local, at
+        )
         by_q = np.zeros((*equations[0].shape, 0 if q is None else q.shape[1]))
         if at is not None:
             by_q[..., a] = by_reading[..., 0]
@@ -212,7 +214,7 @@ def leg_equations(
     All rows but the length are dimensionless; a passive leg has a length row, too. For a rod on an
     actuator *q* (k,) are the readings, zero by default.
     """
-    _, *equations = _of_alike([leg], R, t, by_local, q)
+    _, *equations = _equations_of_similar([leg], R, t, by_local, q)
     values, by_pose, local, by_q = (x[:, 0] for x in equations)
     owner = np.zeros(len(leg.equations), dtype=np.intp)
     return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
@@ -229,14 +231,14 @@ def _measured(leg: Leg) -> BoolArray:
     )
 
 
-def _of_alike(
+def _equations_of_similar(
     legs: Sequence[Leg],
     R: Array,
     t: Array,
     by_local: bool,
     q: Array | None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the equations of n legs with the same joints and equations; n is 1 where one moves.
+    """Return the equations of n legs with the same joints and equations; n is 1 for moving A.
 
     The result is lengths (k, n), and for m rows values (k, n, m) and derivatives (k, n, m, 6) by
     the pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the reading q (k,).

@@ -454,7 +454,7 @@ def completed(source: Source) -> Source:
     configuration = start if closed is None else closed
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    off = _off(chain, start)
+    off = _loop_error(chain, start)
     if sliders and closed is not None and off > CLOSED:
         configuration = closed = _levelled(chain, closed, source, closures, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
@@ -532,7 +532,7 @@ def closed_near(
     Of the results of several starts, the one with the smallest rotations of links is taken. *unit*
     (nv,) is the size of the machine [m], 1 for angles.
     """
-    if _off(chain, start) <= CLOSED:
+    if _loop_error(chain, start) <= CLOSED:
         return start
     rng = np.random.default_rng(1965)
     best: tuple[float, Array] | None = None
@@ -588,7 +588,7 @@ def _solved(
     return solution.points[0] if solution.worst[0] <= CLOSED else None
 
 
-def _off(chain: ClosedChain, configuration: Array) -> float:
+def _loop_error(chain: ClosedChain, configuration: Array) -> float:
     """Return the largest residual of the loops."""
     residual = chain.residual(configuration)
     return float(np.abs(residual).max()) if len(residual) else 0.0

@@ -294,11 +294,11 @@ def vectors_at(machine: Machine, poses: Array) -> Array:
     Moving joints at A are at the position where the first rod of their actuator reaches B.
     """
     B = B_at(machine, poses)
-    A = machine.A_at(_of_actuators(machine, B)) if machine.actuators else machine.A_base
+    A = machine.A_at(_actuator_readings(machine, B)) if machine.actuators else machine.A_base
     return np.asarray(B - A)
 
 
-def _of_actuators(machine: Machine, B: Array) -> Array:
+def _actuator_readings(machine: Machine, B: Array) -> Array:
     """Return the joint values (k, n_legs) of actuators whose rods reach B (k, n_legs, 3)."""
     q = np.zeros(B.shape[:2])
     for j, first in enumerate(machine.reads):
@@ -317,7 +317,7 @@ def readings_at_poses(machine: Machine, poses: Array) -> Array:
     lengths = np.linalg.norm(B - machine.A_base, axis=2)
     hangs = np.array([leg.actuator is not None for leg in machine.legs])
     of_sliders = machine.sign * (lengths - machine.q0)
-    return np.asarray(np.where(hangs, _of_actuators(machine, B), of_sliders))
+    return np.asarray(np.where(hangs, _actuator_readings(machine, B), of_sliders))
 
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:

@@ -318,10 +318,12 @@ def _load(path: Path, temporary: Path, source: str) -> None:
     try:
         load_mechanism(path)
     except LegcalError as error:
-        raise error.told(lambda problem: _of_source(problem, temporary, source)) from error
+        raise error.told(
+            lambda problem: _attributed_to_source(problem, temporary, source)
+        ) from error
 
 
-def _of_source(problem: Problem, temporary: Path, source: str) -> Problem:
+def _attributed_to_source(problem: Problem, temporary: Path, source: str) -> Problem:
     """Return a problem of a file in the temporary folder as a problem of the source."""
     file = Path(problem.file)
     if not file.is_relative_to(temporary):
