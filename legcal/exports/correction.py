@@ -158,9 +158,7 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
     there = centre + turned_back(there - centre, columns)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
     for part in SHRINKING ** np.arange(ATTEMPTS):
-        for n in sorted(
-            {2, min(n_nodes, 3), n_nodes}
-        ):  # corners first: they are most likely outside
+        for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: most likely outside
             ticks = list(np.linspace(middle - part * reach, middle + part * reach, n).T)
             nodes = np.array(list(product(*ticks)))
             corrected, reached = _corrected(models, nodes)

@@ -121,9 +121,8 @@ class _Writer:
         self._body[link] = body
         if is_free:
             etree.SubElement(body, "freejoint", name=joint.name)
-        elif (
-            joint.type == "planar"
-        ):  # as in Pinocchio: x and y of the joint frame, then rotation about z
+        elif joint.type == "planar":
+            # As in Pinocchio: x and y of the joint frame, then rotation about z.
             x, y, cosine, sine = home[chain.q_index(joint.name) :][:4]
             turned = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
             for name, kind, axis, value in (

@@ -49,9 +49,7 @@ class JointMotion(NamedTuple):
     A: Array  # (k, 3) [m]
     by_A: Array  # (k, 3, 3) derivative by A at reading 0, which is also the rotation of the arm
     by_axis: Array  # (k, 3, 2) derivative by rotations of the axis about its normal_basis
-    by_point: (
-        Array  # (k, 3, 2) derivative by displacements of a revolute axis along its normal_basis
-    )
+    by_point: Array  # (k, 3, 2) derivative by displacements of the axis along its normal_basis
     by_gain: Array  # (k, 3)
     by_q: Array  # (k, 3) derivative by the reading [1, or m/rad]
     angle: Array  # (k,) rotation of a revolute [rad]; zero for a prismatic

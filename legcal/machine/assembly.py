@@ -45,9 +45,7 @@ class AssembledLeg:
     name: str
     type: LegType
     kind: LegKind
-    A_base: (
-        Array  # (3,) joint centre in the base link [m], with a motor that carries it at reading 0
-    )
+    A_base: Array  # (3,) joint centre in the base link [m], with its motor at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]

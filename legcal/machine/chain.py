@@ -84,9 +84,8 @@ class ClosedChain:
         for joint, gain in self.gains.items():
             q, v = self._joints[joint]
             self._of_value[q] = self._of_rate[v] = gain
-        self._placed_at = self._linearized_at = (
-            b""  # configurations (bytes) last evaluated in Pinocchio's work space
-        )
+        # Last configurations evaluated in the work space of Pinocchio, as bytes.
+        self._placed_at = self._linearized_at = b""
         self._linear = np.zeros(0), np.zeros((0, 0))  # last result of linearize
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:

@@ -21,9 +21,7 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
-CONCURRENT = (
-    1.5e-5  # largest gap of axes that meet, relative to the span of base or platform joints
-)
+CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
 PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
 
 
@@ -602,9 +600,7 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
             across = cross(v.along, u)
             return v.foot(origin), w.foot(origin), abs(float((w.point - v.point) @ across))
         directions = np.stack([v.along, u, -w.along], axis=1)
-        if (
-            abs(np.linalg.det(directions)) < _COPLANAR
-        ):  # one axis is not perpendicular to the slider
+        if abs(np.linalg.det(directions)) < _COPLANAR:  # an axis is not normal to the slider
             s, _, t = np.linalg.lstsq(directions, w.point - v.point)[0]
         else:
             s, _, t = np.linalg.solve(directions, w.point - v.point)

@@ -75,17 +75,13 @@ class LegEntry:
     name: str  # its name
     type: LegType  # joints
     kind: LegKind  # actuated, passive or without slider
-    A_base: (
-        Array  # (3,) joint centre in the base link [m], with a motor that carries it at reading 0
-    )
+    A_base: Array  # (3,) joint centre in the base link [m], with its motor at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     offset: float | None  # length at reading zero [m] of an actuated leg, length of a constant one
     travel: tuple[float, float] | None  # lowest and highest reading [m]
     tube: float | None  # radius of the half at the base [m]
     rod: float | None  # radius of the half at the platform [m]
-    base_axis: (
-        Array | None
-    )  # (3,) in the base link, with its motor at reading 0; None for the default
+    base_axis: Array | None  # (3,) in the base link, at motor reading 0; None for the default
     platform_axis: Array | None  # (3,) in the platform link; None for the default
     actuator: Actuator | None = None  # the motor that carries A, in the base link
 

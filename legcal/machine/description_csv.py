@@ -323,9 +323,8 @@ def _from_one_row(
     others = {}
     for coordinate, text, cell in zip(coordinates, header, cells, strict=True):
         if coordinate is not None and coordinate[1]:
-            joints.setdefault(int(coordinate[1]), {})[f"{sides[coordinate[0]]}_{coordinate[2]}"] = (
-                cell
-            )
+            side, number, letter = coordinate
+            joints.setdefault(int(number), {})[f"{sides[side]}_{letter}"] = cell
         else:
             others[text.lower()] = cell
     return _rows(joints, others, (number, rows[0][0]))

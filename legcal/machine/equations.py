@@ -67,9 +67,8 @@ class PoseEquations:
     def by_parameters(self, parametrization: Parametrization) -> Array:
         """Return the derivatives by parameters, (k, m, p)."""
         k, m, _ = self.by_local.shape
-        wide = np.zeros(
-            (k, m, len(parametrization) + 1)
-        )  # the last column collects numbers that are no parameters
+        # The last column collects numbers that are no parameters.
+        wide = np.zeros((k, m, len(parametrization) + 1))
         wide[:, np.arange(m)[:, None], parametrization.place[self.leg]] = self.by_local
         return wide[..., :-1]
 
@@ -92,9 +91,7 @@ def pose_equations(
         return _without_readings(legs, there)
     if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
         return _lengths(legs, R, t, by_local, q)
-    groups: dict[
-        tuple[object, ...], list[int]
-    ] = {}  # similar legs together, legs on actuators alone
+    groups: dict[tuple[object, ...], list[int]] = {}  # of similar legs; those on actuators alone
     for j, leg in enumerate(legs):
         alone = j if on[j] >= 0 else -1
         joints = leg.base_joint, leg.platform_joint

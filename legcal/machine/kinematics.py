@@ -48,9 +48,7 @@ MIN_STEP = 1.0 / 4096.0  # least step, relative to the path between readings
 LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
 RANDOM_ANGLES = 6  # random starts for the angles of all legs
 FEW_RESTARTS = 2  # restarts of single legs that do not close
-SAME_START = (
-    2.5e-9  # tolerance of a start equal to the last pose [mean leg lengths, rotation matrix]
-)
+SAME_START = 2.5e-9  # tolerance of a start at the last pose [mean leg lengths, rotation matrix]
 FEW_STEPS = 12  # largest number of Newton steps
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 

@@ -235,12 +235,8 @@ class LegChain:
     """The joints of one leg, and its geometry with all of them at zero, in the base body."""
 
     steps: tuple[Step, ...]  # from base to platform
-    poses: tuple[
-        Array, ...
-    ]  # (4, 4) of the base body, the bodies of the leg, and the platform body
-    n_lower: (
-        int  # number of joints on the base side of the slider, or of the rod, with its actuator
-    )
+    poses: tuple[Array, ...]  # (4, 4) of the bodies from base to platform
+    n_lower: int  # number of joints below the slider, or the rod, with its actuator
     slider: Step | None  # None for a leg of constant length
     base: Pivot
     platform: Pivot

@@ -239,9 +239,8 @@ class PlacedOccluders:
         """
         planes = self.occluders[i].planes
         normal = planes[:, :3] @ self.R[i].T
-        outside = (
-            planes[:, 3] - normal @ self.t[i] - reach[:, None]
-        )  # distance of the origin, (n, k)
+        # Distance of the origin from the planes, (n, k).
+        outside = planes[:, 3] - normal @ self.t[i] - reach[:, None]
         slope = points @ normal.T
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -outside / slope
@@ -376,9 +375,8 @@ def _places(
     """Return the carrier of each body, and the pose (4, 4) of the body in the carrier frame."""
     T_base, T_platform = (matrix_inverse(bodies.T_body_link[link]) for link in (base, platform))
     free = [j for j, leg in enumerate(legs) if not leg.is_fixed_to_platform]
-    free = (
-        free if len(free) >= 3 else list(range(len(legs)))
-    )  # B of the others is arbitrary on their line
+    # B of the other legs is arbitrary on their line.
+    free = free if len(free) >= 3 else list(range(len(legs)))
     held = (_none(),) * 2 if normals is None else (normals[1][None], normals[0][None])
     on_base = Carrier()
     on_platform = Carrier(

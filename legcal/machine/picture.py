@@ -27,12 +27,7 @@ from legcal.machine.drawing import (
 )
 from legcal.machine.model import Machine, vectors_A_to_B
 
-_SIDE, _EDGE, _HEAD, _LINE = (
-    420.0,
-    46.0,
-    44.0,
-    15.0,
-)  # width of a panel, margin, title, text line [px]
+_SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # panel, margin, title, text line [px]
 _ARM = 34.0  # length of the axis of a frame [px]
 _MARK = b"<!-- legcal inspect -->"
 

@@ -37,9 +37,7 @@ class Source:
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
     is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
-    drawn: Mapping[str, float] = field(
-        default_factory=dict
-    )  # values of motors in the drawing [m, rad]
+    drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
 
 
 FULL_TURN = 2.0 * pi

@@ -118,7 +118,7 @@ class Motion:
         return ranges
 
     def read(self, leg: int, value: float) -> Posture:
-        """Return the posture with a motor at a reading [m], the others unchanged.
+        """Move a motor to a reading [m], the others unchanged, and return the posture.
 
         With redundant motors the others change as little as possible.
         """
@@ -148,7 +148,7 @@ class Motion:
         return self._stand(T, joint_values(self.machine, self._follower.configuration))
 
     def place(self, coordinate: int, value: float) -> Posture:
-        """Return the posture with one independent coordinate at a value [m, rad]."""
+        """Move one independent coordinate to a value [m, rad], and return the posture."""
         wanted = self.coordinates
         wanted[coordinate] = value
         near = self.posture.T.as_matrix()[:3]
@@ -158,7 +158,7 @@ class Motion:
         return self._follow(motion_of(poses[0, :, :3], poses[0, :, 3]))
 
     def show(self, q: Array) -> Posture:
-        """Return the posture at readings (n_legs,) [m] of a session, from any posture."""
+        """Move to readings (n_legs,) [m] of a session, from any posture, and return the posture."""
         if self._follower is None:
             return self._stay(f"Readings do not give the pose: {self.machine.undetermined}.")
         try:
@@ -168,7 +168,7 @@ class Motion:
         return self._stay(str(failure)) if failure is not None else self._follow(T)
 
     def _follow(self, T: RigidTransform) -> Posture:
-        """Return the posture at a pose, with the chain closed."""
+        """Move to a pose, with the chain closed, and return the posture."""
         if self._follower is not None:
             try:
                 T = self._follower.place(T)

@@ -500,9 +500,8 @@ def _serve(name: str, address: Address) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    logging.getLogger("websockets").setLevel(
-        logging.CRITICAL
-    )  # errors of clients that are no browsers
+    # Not the errors of clients that are no browsers.
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with redirect_stdout(io.StringIO()):
         server = Server(address.host, address.port, label=name, verbose=False)
     server.gui.configure_theme(
