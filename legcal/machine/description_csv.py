@@ -323,8 +323,8 @@ def _from_one_row(
     others = {}
     for coordinate, text, cell in zip(coordinates, header, cells, strict=True):
         if coordinate is not None and coordinate[1]:
-            side, number, letter = coordinate
-            joints.setdefault(int(number), {})[f"{sides[side]}_{letter}"] = cell
+            side, leg, letter = coordinate
+            joints.setdefault(int(leg), {})[f"{sides[side]}_{letter}"] = cell
         else:
             others[text.lower()] = cell
     return _rows(joints, others, (number, rows[0][0]))
