@@ -50,7 +50,7 @@ def find_model(model: str | Path) -> Path:
                 )
             )
         if (path / DATASET_YAML).is_file():
-            raise ModelError(dataset_as_model(path))
+            raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
             Problem(
                 "the mechanism could not be read",
@@ -84,7 +84,7 @@ def find_model(model: str | Path) -> Path:
     )
 
 
-def dataset_as_model(path: Path) -> Problem:
+def what_a_dataset_is_for(path: Path) -> Problem:
     """Return the problem of a dataset given as a model, with the commands for datasets."""
     folder = path.parent if path.name == DATASET_YAML else path
     return Problem(

@@ -58,7 +58,7 @@ class Machine:
     diagnostics: tuple[str, ...] = ()  # notes for the reader, one sentence each
     base_normal: Array | None = None  # (3,) normal of the plane of motion in the base link
     platform_normal: Array | None = None  # the same in the platform link; both None in space
-    occluders: tuple[Occluder, ...] = ()  # solids that hide, besides legs and arms
+    occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
 
     @property
     def upward(self) -> Array:

@@ -20,7 +20,7 @@ from legcal.files.schema import (
     validate,
 )
 from legcal.machine.actuator import Actuator
-from legcal.machine.files import DATASET_YAML, dataset_as_model, read_file
+from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 FILE_KIND = "mechanism file"
 MAX_LOOPS = 100
@@ -37,7 +37,7 @@ class MotorEntry(FileSchema):
 
 
 class LegcalBlock(FileSchema):
-    """The block ``legcal``: base, platform and legs.
+    """The block ``legcal``: what belongs to base, platform and legs.
 
     Missing entries are proposed, see :mod:`legcal.machine.topology`.
     """
@@ -110,7 +110,7 @@ def _check_kind(document: Mapping[str, Any], path: Path) -> None:
             )
         )
     if path.name == DATASET_YAML:
-        raise ModelError(dataset_as_model(path))
+        raise ModelError(what_a_dataset_is_for(path))
 
 
 def _without_nulls(document: dict[str, Any]) -> dict[str, Any]:
