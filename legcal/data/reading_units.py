@@ -92,14 +92,14 @@ def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit
             f"found {name} for '{motor}', which {does}, needed one of {', '.join(unit_names)}; "
             "correct it."
         )
-    found = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
-    if found is None:
+    described = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
+    if described is None:
         raise ValueError(
             f"found pulses of '{motor}' and neither centre nor us for one degree, needed both: "
             f"{{{motor}: {{unit: us, centre_us: 1500, us_per_deg: 11.1}}}}, or centre_us and "
             "us_per_deg of it in legcal.motors of the model; add them."
         )
-    return unit_of_pulses(found)
+    return unit_of_pulses(described)
 
 
 class ReadingsEntry(FileSchema):

@@ -227,14 +227,12 @@ def parse_yaml(content: bytes, path: Path, noun: str) -> dict[str, Any]:
             bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
         raise DatasetError(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        document, needed = _first_line(error), "YAML text in UTF-8"
+        actual, needed = _first_line(error), "YAML text in UTF-8"
     else:
         if isinstance(document, dict):
             return typing.cast("dict[str, Any]", document)
-        document, needed = _kind_of(document), "'key: value' lines"
-    raise DatasetError(
-        replace(unread, found=document, needed=needed, remedy="write the file again")
-    )
+        actual, needed = _kind_of(document), "'key: value' lines"
+    raise DatasetError(replace(unread, found=actual, needed=needed, remedy="write the file again"))
 
 
 def _loaded(content: bytes) -> Any:
