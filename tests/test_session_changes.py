@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from simulated import simulated
 
 from legcal import calibrate, load_dataset
-from legcal.calibration.session_changes import Finding, session_findings
+from legcal.calibration.session_changes import Finding, session_tests
 from legcal.data.dataset import Dataset
 from legcal.data.image_order import image_sequences
 from legcal.geometry.types import Array, BoolArray
@@ -31,7 +31,7 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def _findings(dataset: Dataset) -> tuple[Finding, ...]:
     m = dataset.measurements
-    return session_findings(calibrate(dataset).solution.posterior, m, image_sequences(m, {}))
+    return session_tests(calibrate(dataset).solution.posterior, m, image_sequences(m, {})).findings
 
 
 def _with_readings(change: Callable[[Array], Array]) -> Callable[[Dataset], Dataset]:

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -151,10 +151,26 @@ class _Test(NamedTuple):
     at: tuple[int, int] | None  # the blocks before and after a change
 
 
-def session_findings(
+@dataclass(frozen=True)
+class SessionTests:
+    """Tests of a session.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        The numbers that the fit lacks, the most certain first.
+    least_slips : dict
+        The least changes of encoders that would show half of the time, by motor [m or rad].
+    """
+
+    findings: tuple[Finding, ...] = ()
+    least_slips: Mapping[str, float] = field(default_factory=dict)
+
+
+def session_tests(
     posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
-) -> tuple[Finding, ...]:
-    """Return the numbers that a fit lacks, the most certain first.
+) -> SessionTests:
+    """Test a fit for numbers that it lacks.
 
     Parameters
     ----------
@@ -167,7 +183,7 @@ def session_findings(
         :func:`legcal.data.image_order.image_sequences`.
     """
     if not len(posterior.problem.outlines) or not len(sequences):
-        return ()
+        return SessionTests()
     posterior = replace(posterior, problem=_with_rejected(posterior))
     problem, state = posterior.problem, posterior.state
     course = _Course.of(posterior, measurements, sequences)
@@ -183,8 +199,14 @@ def session_findings(
         )
     ]
     if not tests:
-        return ()
+        return SessionTests()
     scores = _Scores.of(posterior, normal, hypotheses, course.n_blocks)
+    least = math.sqrt(chdtri(1.0, SIGNIFICANCE / len(tests)))
+    slips = dict[str, list[float]]()
+    for test in tests:
+        if hypotheses[test.hypothesis].kind == "encoder":
+            sigma = math.sqrt(scores.estimate(test)[1][0, 0])
+            slips.setdefault(hypotheses[test.hypothesis].subject, []).append(least * sigma)
     findings = list[Finding]()
     while len(findings) < MAX_FINDINGS:
         values = [scores.value(test) for test in tests]
@@ -210,7 +232,8 @@ def session_findings(
         tests = [t for t in tests if t.hypothesis != test.hypothesis]
         if not tests:
             break
-    return tuple(findings)
+    least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
+    return SessionTests(tuple(findings), least_slips)
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:
