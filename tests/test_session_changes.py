@@ -87,7 +87,7 @@ def _turned(rays: Array) -> Array:
 
 
 def _zoomed(rays: Array) -> Array:
-    return rays * np.array([1.0 + ZOOM, 1.0 + ZOOM, 1.0])
+    return np.asarray(rays * [1.0 + ZOOM, 1.0 + ZOOM, 1.0])
 
 
 CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {

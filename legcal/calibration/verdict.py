@@ -25,9 +25,13 @@ from legcal.calibration.joint_fit.scale import SCALE
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.notes import Note, Topic
 from legcal.calibration.result import Calibration, Verdict
+from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
+from legcal.data.image_order import image_sequences
+from legcal.geometry.types import IntArray
 
+MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
 
@@ -71,7 +75,10 @@ def judge(
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
-    doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners)
+    taken_at = {image: facts.taken_at for image, facts in dataset.facts.items()}
+    sequences = image_sequences(measurements, taken_at)
+    session = session_tests(solution.posterior, measurements, sequences)
+    doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
         found += f"; what is in doubt may add {_mm_deg(displacement, rotation)}"
@@ -88,12 +95,44 @@ def judge(
         (
             *notes,
             *Note.about(Topic.IMAGES, click_notes(dataset, solution)),
+            *Note.about(Topic.READINGS, _untested(dataset, sequences, session, platform)),
             *closeness(dataset.folder, measurements.n_rows, platform),
         ),
         held_out,
         corners,
         tuple(diagnosis),
     )
+
+
+def _untested(
+    dataset: Dataset,
+    sequences: Sequence[IntArray],
+    session: SessionTests,
+    platform: PlatformAccuracy | None,
+) -> list[str]:
+    """Return notes on changes in the course of a session that would not show."""
+    m = dataset.measurements
+    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES:
+        return []
+    if not sequences:
+        return [
+            "Changes in the course of the session could not be tested: images have neither times "
+            "nor numbers in their names; add a column time to measurements.csv."
+        ]
+    hidden = {
+        motor: size
+        for motor, size in session.least_slips.items()
+        if platform is not None and size > MOST_HIDDEN * platform.sigma.mean_displacement
+    }
+    turning = {leg.motor_label for leg in dataset.machine.legs if leg.reads_angle}
+    hidden = {motor: size for motor, size in hidden.items() if motor not in turning}
+    if not hidden:
+        return []
+    motor = max(hidden, key=lambda name: hidden[name])
+    return [
+        f"A slip of an encoder below {1e3 * hidden[motor]:.2g} mm ({motor}) would not show in so "
+        "few images."
+    ]
 
 
 def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
