@@ -195,7 +195,9 @@ def session_tests(
         _Test(i, holds, at)
         for i, hypothesis in enumerate(hypotheses)
         for holds, at in (
-            course.changes(_blocks_of(hypothesis)) if hypothesis.changes else course.always
+            course.changes(_blocks_of(hypothesis, course.n_blocks))
+            if hypothesis.changes
+            else course.always
         )
     ]
     if not tests:
@@ -386,10 +388,9 @@ class _Course:
         return np.where(row >= 0, self.block[row], -1)
 
 
-def _blocks_of(hypothesis: _Hypothesis) -> BoolArray:
-    """Return the blocks in which a hypothesis can be told from others."""
-    n = 1 + max((int(block.max(initial=-1)) for block in hypothesis.block.values()), default=-1)
-    seen = np.zeros(n, dtype=np.bool_)
+def _blocks_of(hypothesis: _Hypothesis, n_blocks: int) -> BoolArray:
+    """Return the blocks in which a hypothesis can be told from others, (n_blocks,)."""
+    seen = np.zeros(n_blocks, dtype=np.bool_)
     for name, block in hypothesis.block.items():
         has_effect = np.any(hypothesis.columns[name] != 0.0, axis=(1, 2)) & (block >= 0)
         seen[block[has_effect]] = True
@@ -515,9 +516,7 @@ class _Scores:
         columns, c = list[IntArray](), 0
         for hypothesis in hypotheses:
             d = next(iter(hypothesis.columns.values())).shape[-1]
-            seen = np.zeros(n_blocks, dtype=np.bool_)
-            inside = _blocks_of(hypothesis)
-            seen[: len(inside)] = inside
+            seen = _blocks_of(hypothesis, n_blocks)
             column = np.full((d, n_blocks), -1, dtype=np.intp)
             column[:, seen] = c + np.arange(d * int(seen.sum())).reshape(d, -1)
             c += d * int(seen.sum())
