@@ -130,11 +130,11 @@ def test_few_images_of_a_hexapod_show_an_encoder_that_slipped_and_else_raise_no_
     tmp_path: Path,
 ) -> None:
     """Of one pose before three cameras other minima fit as well, millimetres away."""
-    before = _simulated(tmp_path / "set", "hexapod", poses=14, views=3, seed=1)
-    calibrate(before, output=tmp_path / "out")
-    new = load_dataset(_simulated(tmp_path / "new", "hexapod", poses=40, views=3, seed=1))
-    for pose in (7, 15, 27, 36, 39):
-        images = dataset_at(new, np.flatnonzero(new.measurements.pose == pose))
+    session = load_dataset(_simulated(tmp_path / "set", "hexapod", poses=16, views=3, seed=1))
+    pose = session.measurements.pose
+    calibrate(dataset_at(session, np.flatnonzero(pose < 14)), output=tmp_path / "out")
+    for new in (14, 15):
+        images = dataset_at(session, np.flatnonzero(pose == new))
         assert not check(images, tmp_path / "out").movement.moved
         q = images.measurements.q.copy()
         q[:, 1] -= 3e-3

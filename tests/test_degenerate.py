@@ -163,7 +163,7 @@ def test_a_3_upu_near_its_constraint_singularity_is_judged_and_at_it_is_named(
 def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outlines of a hexapod in two views."""
     folder = tmp_path_factory.mktemp("two") / "set"
-    return simulated(folder, "hexapod", poses=8, seed=1).folder
+    return simulated(folder, "hexapod", poses=6, seed=1).folder
 
 
 def test_a_leg_that_no_view_shows_is_found_from_its_readings(

@@ -164,7 +164,7 @@ def test_weights_improve_the_model_where_weights_of_one_make_it_worse(
 ) -> None:
     means = np.zeros(2)
     for seed in range(2):
-        session, nominal = noisy_session(seed, noise)
+        session, nominal = noisy_session(seed, noise, n_poses=8)
         poses = extreme_poses(session.machine, 5, 99)
         found = staged(session, nominal, criteria)
         for k, legs in enumerate((nominal.legs, found.legs)):

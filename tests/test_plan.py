@@ -312,6 +312,7 @@ def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -
     assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 
 
+FAR: dict[str, Any] = {"images": 4, "setting": FEW}
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 0}, UsageError, "--images 0"),
     ({"images": 401}, UsageError, "1 to 400"),
@@ -334,12 +335,12 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"setting": Setting(50.0, 2e-3)}, UsageError, "off by 50 m"),
     ({"setting": Setting(0.05, 3.0)}, UsageError, "a model error of 3 m"),
     (
-        {"setting": Setting(0.05, 0.5), "images": 4},
+        {"setting": Setting(0.05, 0.5, draws=3), "images": 4},
         DidNotConverge,
         "; plan with a smaller length",
     ),
-    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
-    ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
+    (FAR | {"bounds": np.array([[5.0, 6.0]] * 3)}, NotVisible, "bounds, nearer"),
+    (FAR | {"bounds": np.array([[0.3, 0.31]] * 3)}, NotVisible, "bounds, farther"),
 ]
 
 
