@@ -27,7 +27,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, joint_values, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
-DRAWN = 8
+DRAWN = 5
 
 
 @cache
