@@ -93,24 +93,6 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
     assert files_of(images) == before
 
 
-@pytest.mark.parametrize(
-    ("model", "sigma"),
-    [
-        pytest.param("3-upu", 1e-3, marks=pytest.mark.slow),
-        pytest.param("3-upu-tilted", 2e-3, marks=pytest.mark.slow),
-        pytest.param("tricept", 2e-3, marks=pytest.mark.slow),  # in test_recorded_sessions.py: RPS
-    ],
-)
-def test_a_calibrated_machine_with_axes_has_not_moved(
-    model: str, sigma: float, tmp_path: Path
-) -> None:
-    calibrate(_simulated(tmp_path / "set", model, poses=6, views=2), output=tmp_path / "result")
-    found = check(_simulated(tmp_path / "new", model, views=2), tmp_path / "result")
-    assert not found.movement.moved
-    assert found.movement.dof >= 15
-    assert 1e-5 < found.at_platform.expected_displacement < sigma
-
-
 def test_an_encoder_that_slipped_is_found_with_its_size(
     result: Path, images: Path, tmp_path: Path
 ) -> None:

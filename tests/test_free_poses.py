@@ -171,7 +171,7 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
 
 @pytest.mark.parametrize(
     ("n_motors", "by_clicks"),
-    [pytest.param(0, False, marks=pytest.mark.slow), (3, False), (0, True)],
+    [(3, False), (0, True)],
 )
 def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
     machine = by_hand(n_motors, tmp_path)

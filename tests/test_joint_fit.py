@@ -195,6 +195,14 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
         between = np.linalg.norm(np.cross(a, b), axis=1)
         assert between.max() < 1e-6  # as far as the written model has them from parallel
     assert max(turned) > np.deg2rad(0.5)  # held where the nominal ones are, and harmless
+    assert found.estimates.status["leg1.base_axis.1"] == "weak"
+    spread = found.kinematic.held_covariance  # along what is held alone, as far as nominal errs
+    rank = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max())
+    assert rank == len(found.kinematic.held_basis)
+    change = session.legs.vector(legs) - session.legs.vector(session.legs.nominal)
+    is_length = np.array(session.legs.parametrization.units) == "m"
+    largest = np.sqrt(np.diagonal(spread)[is_length].max())
+    assert largest < 2.0 * np.abs(change[is_length]).max()
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> PredictedObservations:
