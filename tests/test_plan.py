@@ -66,7 +66,8 @@ def small_search() -> Iterator[None]:
         patch.setattr(planner, "MIN_POSES", 8)
         patch.setattr(planner, "POSES_EACH", 2)
         patch.setattr(planner, "ROUNDS", 1)
-        patch.setattr(camera_places, "_N_AZIMUTHS", 6)
+        patch.setattr(camera_places, "_N_AZIMUTHS", 5)
+        patch.setattr(camera_places, "_ACROSS", 3)
         yield
 
 
