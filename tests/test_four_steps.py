@@ -267,9 +267,6 @@ def test_scaling_all_lengths_scales_the_result() -> None:
     assert np.abs(apart).max() < 1e-7 * scale
 
 
-# Where cameras stand
-
-
 # Which legs and images take part, and refusals
 
 

@@ -242,9 +242,6 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
         forward_kinematics_many(other, readings)
 
 
-# --- random configurations ----------------------------------------------------------------------
-
-
 # --- refusals -----------------------------------------------------------------------------------
 
 

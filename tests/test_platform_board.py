@@ -117,7 +117,7 @@ def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
     """A dataset with corners of both boards, whose views name no leg and have no rough pose."""
     folder = tmp_path_factory.mktemp("boards") / "d"
     chosen = settings(
-        level=Level.OUTLINES, poses=10, views=1, board="charuco", platform_board="charuco",
+        level=Level.OUTLINES, poses=15, views=1, board="charuco", platform_board="charuco",
         sigma_px=0.02, hints=False, seed=1,
     )  # fmt: skip
     made = simulate("hexapod", folder, chosen)
