@@ -108,6 +108,7 @@ def test_an_encoder_that_slipped_is_found_with_its_size(
     assert found.at_platform.displacement > found.at_platform.expected_displacement
 
 
+@pytest.mark.system
 def test_few_images_of_a_hexapod_show_an_encoder_that_slipped_and_else_raise_no_alarm(
     tmp_path: Path,
 ) -> None:

@@ -151,6 +151,7 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
         assert miss.rotation.magnitude() < 1e-7
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("px", thinned([0.5, 20.0], [20.0]))
 def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px: float) -> None:
     session, rng = far_session("delta-round-arms", n_poses=4), np.random.default_rng(5)

@@ -159,6 +159,7 @@ def around(z: float) -> list[Place]:
     return tripods(**{f"t{k}": [np.cos(k), np.sin(k), z] for k in range(0, 8, 2)})
 
 
+@pytest.mark.system
 def test_the_command_writes_what_python_plans(
     planned: Plan,
     tmp_path: Path,

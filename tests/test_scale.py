@@ -31,6 +31,7 @@ def _recognised(folder: Path) -> tuple[Outlines, Array]:
     return seen.outlines, np.array(places) / data.machine.size
 
 
+@pytest.mark.system
 def test_photographs_show_the_same_legs_of_a_small_machine_and_a_large_one(tmp_path: Path) -> None:
     (small, cameras), (large, there) = (
         _recognised(scaled_dataset(FOLDER, tmp_path / f"{size}", size)) for size in SIZES
