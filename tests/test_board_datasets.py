@@ -100,7 +100,7 @@ def _same(one: Corners, other: Corners) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
 
 
-@settings(max_examples=40)
+@settings(deadline=None, max_examples=40)
 @given(tables())
 def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners) -> None:
     with tempfile.TemporaryDirectory() as name:

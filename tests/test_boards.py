@@ -74,7 +74,7 @@ def test_corners_are_numbered_as_opencv_and_kalibr_number_them() -> None:
         assert np.all((board.points >= low - 1e-12) & (board.points <= high + 1e-12))
 
 
-@settings(max_examples=40)
+@settings(deadline=None, max_examples=40)
 @given(
     st.sampled_from(["chessboard", "charuco", "aprilgrid"]),
     st.integers(2, 12),

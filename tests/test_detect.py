@@ -204,7 +204,6 @@ def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
 ) -> None:
     out = tmp_path / "out"
     detect(one_image.path, output=out)
-    detect(one_image.path, output=out)  # replaces its own files
     rows = read_rows(out / "observations.csv")
     rows[3] |= {"verdict": "rejected", "reason": "a cable", "source": "edited"}
     write_rows(out / "observations.csv", rows)

@@ -126,7 +126,8 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     )  # fmt: skip
     monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: (mistake,))
     session = spoiled(tmp_path / "set", 2, ("c1", "c3"))
-    session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
+    rough = session.entry["views"]["c3"]["T_base_camera"]
+    right, rough["xyz"] = rough["xyz"], [2.0, 2.0, 2.0]
     name = session.change("c1", 0, lambda picture: 0 * picture)
     folder = session.write()
     assert run(monkeypatch, "doctor", folder, "--json") == 1
@@ -139,7 +140,8 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     assert document["diagnosis"] == [mistake.document().document()]
     assert not document["ready"]
     assert document["usable"]
-    (session.path / name).unlink()
+    rough["xyz"] = right
+    (session.write() / name).unlink()
     assert run(monkeypatch, "doctor", folder) == 2
     shown = capsys.readouterr().out
     assert shown.index("error:") < shown.index("Columns a and b look exchanged")

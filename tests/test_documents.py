@@ -202,7 +202,7 @@ def _write_files_as_people_have_them() -> None:
     ]
     Path("joints.csv").write_text("\n".join(["point,x,y,z", *points]))
     lines = ["photo," + ",".join(f"L{j} [mm]" for j in range(1, 7))]
-    for row in read_rows(HEXAPOD / "measurements.csv"):
+    for row in read_rows(HEXAPOD / "measurements.csv")[::2]:
         name = row["image"].removeprefix("images/").upper()
         (path := Path("photos") / row["view"] / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(HEXAPOD / row["image"], path)

@@ -22,7 +22,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 
-FAST = settings(deadline=None, max_examples=12)
+FAST = settings(deadline=None, max_examples=6)
 SEEDS = st.integers(0, 2**32 - 1)
 TYPES = [f"{base}{platform}" for base, platform in product("RUS", ["R", "U", "S", ""])]
 FREEDOMS = {"R": 1, "U": 2, "S": 3, "": 0}

@@ -164,7 +164,7 @@ def test_weights_improve_the_model_where_weights_of_one_make_it_worse(
 ) -> None:
     means = np.zeros(2)
     for seed in range(2):
-        session, nominal = noisy_session(seed, noise)
+        session, nominal = noisy_session(seed, noise, n_poses=8)
         poses = extreme_poses(session.machine, 5, 99)
         found = staged(session, nominal, criteria)
         for k, legs in enumerate((nominal.legs, found.legs)):
@@ -265,9 +265,6 @@ def test_scaling_all_lengths_scales_the_result() -> None:
     second = staged(larger, replace(nominal, legs=point_like_legs(scaled)))
     apart = scale * vector(first.parameters) - vector(second.parameters)
     assert np.abs(apart).max() < 1e-7 * scale
-
-
-# Where cameras stand
 
 
 # Which legs and images take part, and refusals

@@ -171,7 +171,7 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
 
 @pytest.mark.parametrize(
     ("n_motors", "by_clicks"),
-    [pytest.param(0, False, marks=pytest.mark.slow), (3, False), (0, True)],
+    [(3, False), (0, True)],
 )
 def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
     machine = by_hand(n_motors, tmp_path)
@@ -295,7 +295,7 @@ def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
     tmp_path: Path,
 ) -> None:
     machine = made("5-sps", tmp_path / "model")
-    camera = small_camera(tmp_path, 640, 480)
+    camera = small_camera(tmp_path, 480, 360)
     photographs = settings(level=Level.PHOTOGRAPHS, seed=4, poses=6, hints=True, camera=camera)
     folder = tmp_path / "set"
     simulate(machine.yaml_path, folder, photographs)

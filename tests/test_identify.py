@@ -255,7 +255,7 @@ def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) ->
     assert any("a tenth of a leg" in note for note in report.notes) == noted
 
 
-@settings(deadline=None, max_examples=6)
+@settings(deadline=None, max_examples=3)
 @given(data=st.data())
 def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
     machine = loaded(data.draw(st.sampled_from(MODELS)))

@@ -151,9 +151,10 @@ def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
         assert miss.rotation.magnitude() < 1e-7
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("px", thinned([0.5, 20.0], [20.0]))
 def test_an_arm_that_is_no_cylinder_is_left_out_as_a_whole_and_bends_nothing(px: float) -> None:
-    session, rng = far_session("delta-round-arms", n_poses=3), np.random.default_rng(5)
+    session, rng = far_session("delta-round-arms", n_poses=4), np.random.default_rng(5)
     seen, legs = session.outlines, session.legs
     bent = np.array(seen.part) == "arm2_link"
     offsets = px * bent[:, None] * rng.choice([-1.0, 1.0], (len(seen), 2))
@@ -195,6 +196,14 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
         between = np.linalg.norm(np.cross(a, b), axis=1)
         assert between.max() < 1e-6  # as far as the written model has them from parallel
     assert max(turned) > np.deg2rad(0.5)  # held where the nominal ones are, and harmless
+    assert found.estimates.status["leg1.base_axis.1"] == "weak"
+    spread = found.kinematic.held_covariance  # along what is held alone, as far as nominal errs
+    rank = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max())
+    assert rank == len(found.kinematic.held_basis)
+    change = session.legs.vector(legs) - session.legs.vector(session.legs.nominal)
+    is_length = np.array(session.legs.parametrization.units) == "m"
+    largest = np.sqrt(np.diagonal(spread)[is_length].max())
+    assert largest < 2.0 * np.abs(change[is_length]).max()
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> PredictedObservations:

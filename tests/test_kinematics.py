@@ -27,7 +27,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, joint_values, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
-DRAWN = 8
+DRAWN = 5
 
 
 @cache
@@ -240,9 +240,6 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
     readings = random_configurations(cut, 8, 1).readings
     with pytest.raises(DidNotConverge, match=r"joints that were not closed there, .* right angles"):
         forward_kinematics_many(other, readings)
-
-
-# --- random configurations ----------------------------------------------------------------------
 
 
 # --- refusals -----------------------------------------------------------------------------------

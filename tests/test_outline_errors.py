@@ -472,7 +472,7 @@ def test_the_most_likely_gamma_is_that_of_the_same_outlines(
     session: HexapodSession, lost: float
 ) -> None:
     off = []
-    for seed in (3, 4, 5):
+    for seed in (3, 4):
         first, trials = gammas_tried(session, lost, seed)
         found = trials.found()
         assert found.keys() == {"c1", "c2", "c3"}

@@ -343,6 +343,3 @@ def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
     monkeypatch.setattr(convergence_study, "one_fit", shifted)
     (found,) = run_study(study, 1).document()["machines"]
     assert (found["right"], found["wrong"], found["met"]) == (0, 1, False)
-
-
-# Commands

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -21,7 +23,7 @@ RATE = 20.0  # frames a second
 AHEAD = 7.31  # [s] of the camera's clock
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """A machine that rests at poses for times of different length."""
 
@@ -88,23 +90,34 @@ def _stamps(motion: Motion) -> Array:
     return np.arange(0.5, motion.times[-1] - 0.3, 1.0 / RATE)
 
 
+@cache
+def _frames(motion: Motion) -> list[Array]:
+    rng = np.random.default_rng(0)
+    return [motion.frame(time, rng) for time in _stamps(motion)]
+
+
+@cache
+def _content_of_video(motion: Motion) -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "c1.avi")
+        video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
+        for frame in _frames(motion):
+            video.write(frame)
+        video.release()
+        return path.read_bytes()
+
+
 def _video(motion: Motion, folder: Path) -> Path:
     path = folder / "c1.avi"
     assert path.suffix in VIDEOS
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
-    rng = np.random.default_rng(0)
-    for time in _stamps(motion):
-        video.write(motion.frame(time, rng))
-    video.release()
-    return path
+    return _written(path, _content_of_video(motion))
 
 
 def _folder(motion: Motion, folder: Path) -> Path:
     (place := folder / "c1").mkdir()
-    rng = np.random.default_rng(0)
-    for time in _stamps(motion):
+    for time, frame in zip(_stamps(motion), _frames(motion), strict=True):
         stamp = round(1e9 * (1.7e9 + AHEAD)) + round(1e9 * time)
-        cv2.imwrite(str(place / f"{stamp}.png"), motion.frame(time, rng))
+        cv2.imwrite(str(place / f"{stamp}.png"), frame)
     return place
 
 
@@ -129,15 +142,14 @@ def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
         states = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
         for topic in extra.values():
             writer.add_connection(topic, image.__msgtype__, typestore=store)
-        rng, none = np.random.default_rng(0), np.zeros(0)
+        none = np.zeros(0)
         times = np.arange(0.2, motion.times[-1], 0.02)
         for time, q in zip(times, motion.readings(times), strict=True):
             ns, head = at(time)
             message = state(head, joints, q, none, none)
             writer.write(states, ns, store.serialize_cdr(message, state.__msgtype__))
-        for time in _stamps(motion):
+        for time, picture in zip(_stamps(motion), _frames(motion), strict=True):
             ns, head = at(time)
-            picture = motion.frame(time, rng)
             message = image(head, SIZE[1], SIZE[0], "bgr8", 0, 3 * SIZE[0], picture.reshape(-1))
             writer.write(pictures, ns, store.serialize_cdr(message, image.__msgtype__))
     return path
@@ -263,8 +275,15 @@ def _written(path: Path, content: bytes) -> Path:
     return path
 
 
+@cache
+def _content_of_ticks(motion: Motion) -> bytes:
+    with TemporaryDirectory() as folder:
+        times = np.arange(0.0, motion.times[-1], 0.02)
+        return _table(motion, Path(folder, "q.csv"), times).read_bytes()
+
+
 def _ticks(motion: Motion, folder: Path) -> Path:
-    return _table(motion, folder / "q.csv", np.arange(0.0, motion.times[-1], 0.02))
+    return _written(folder / "q.csv", _content_of_ticks(motion))
 
 
 def _timeless(motion: Motion, folder: Path) -> Path:

@@ -25,16 +25,14 @@ from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,
-    forward_kinematics_many,
     inverse_kinematics,
     platform_in_base,
-    platforms_in_base,
 )
 from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import generic_configurations
 from legcal.machine.model import Machine, slider_columns
-from legcal.machine.parameters import geometries, legs_in_links
-from legcal.machine.redundancy import Contradiction, contradictions, reading_residuals
+from legcal.machine.parameters import geometries
+from legcal.machine.redundancy import reading_residuals
 from legcal.machine.solved_poses import solve_poses
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
@@ -172,38 +170,6 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
     path.write_text(f"{header}\n{','.join(map(str, q))}\n{','.join(map(str, wrong))}\n")
     with pytest.raises(DatasetError, match=rf"row 2 \(line 3\).*{found}"):
         given_poses(machine, path)
-
-
-@pytest.mark.slow  # test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm sees it in fits
-def test_a_wrong_reading_is_told_from_errors_of_the_model_or_motors_that_explain_it_are() -> None:
-    rng = np.random.default_rng(8)
-    for name, most_alike in {"4-RPR": 4, "4-UPS + 2-SPS + RPS": 1}.items():
-        nominal = machine_of(name)
-        legs = [
-            dataclasses.replace(
-                leg,
-                A=leg.A + 2e-3 * rng.normal(size=3) * [1.0, 1.0, nominal.spatial],
-                q0=leg.q0 + 2e-3 * rng.normal(),
-            )
-            for leg in geometries(nominal)
-        ]
-        true = dataclasses.replace(nominal, legs=legs_in_links(nominal, legs))
-        q = random_configurations(true, 24, rng).readings
-        motors, row, i, off = list(nominal.motors), 7, 2, 0.012
-
-        def found(q: Array, nominal: Machine = nominal) -> dict[int, Contradiction]:
-            T = platforms_in_base(nominal, forward_kinematics_many(nominal, q))
-            return contradictions(nominal, T, q[:, list(nominal.motors)])
-
-        assert found(q) == {}
-        q[row, motors[i]] += off
-        ((pose, one),) = found(q).items()
-        assert pose == row
-        assert len(one.legs) <= most_alike
-        own = one.distances[one.legs.index(motors[i])]
-        assert own == pytest.approx(off, abs=1e-3 if most_alike == 1 else 3e-3)
-        assert one.distances == tuple(sorted(one.distances))
-        assert abs(one.off) == pytest.approx(one.distances[0])
 
 
 @pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3), ("7-pss", -2e-3)])

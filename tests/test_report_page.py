@@ -326,6 +326,7 @@ def test_other_commands_write_what_they_print_as_a_page(
     assert path.read_bytes() == before
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_a_check_writes_a_page_and_never_over_that_of_a_result(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

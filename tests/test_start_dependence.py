@@ -25,6 +25,7 @@ OUTLINES = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", thinned(OUTLINES, ["hexapod"]))
 def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> None:
     folder = session_folder(name, OUTLINES[name], tmp_path)

@@ -92,7 +92,7 @@ def test_expected_errors_are_the_mean_errors_of_parameters_drawn_from_the_covari
     expected = expected_errors(machine, root @ root.T, poses)
     drawn = [
         platform_errors(machine, _changed(machine, root @ rng.normal(size=30)), poses)
-        for _ in range(400)
+        for _ in range(150)
     ]
     assert np.mean([errors.dX for errors in drawn]) == pytest.approx(expected.dX, rel=0.1)
     assert np.mean([errors.dE for errors in drawn]) == pytest.approx(expected.dE, rel=0.1)
