@@ -30,6 +30,7 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.free_poses import (
     are_free,
     have_outliers,
+    in_other_assembly_modes,
     with_better_poses,
     with_free_poses,
 )
@@ -267,11 +268,25 @@ def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None
     try:
         if are_free(problem, begin):
             return _first_minimum_with_free_poses(problem, begin)
-        return first_minimum(*_held_at_start(problem, begin))
+        first = first_minimum(*_held_at_start(problem, begin))
+        return _in_best_assembly_modes(problem, first)
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
         raise naming_stated_values(problem, failure) from None
+
+
+def _in_best_assembly_modes(problem: FitProblem, first: Minimum[State]) -> Minimum[State]:
+    """First minimum with poses in another assembly mode where that lowers the cost.
+
+    Forward kinematics of a start that is a few millimetres off may close in a wrong one, and no
+    small step leads back: the images of such poses would be rejected as outliers.
+    """
+    state = in_other_assembly_modes(problem, first.state, _PART_OF_MODEL)
+    if state is first.state:
+        return first
+    other = first_minimum(*_held_at_start(problem, state), must_converge=False)
+    return other if other.cost < first.cost else first
 
 
 def _first_minimum_with_free_poses(problem: FitProblem, start_state: State) -> Minimum[State]:
