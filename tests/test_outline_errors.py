@@ -36,7 +36,6 @@ from legcal.calibration.joint_fit.gammas import (
     next_trial,
 )
 from legcal.calibration.joint_fit.outline_errors import (
-    LIMB_SIGMA,
     PLACES,
     RECOVERED_SHARE,
     EdgeBiases,
@@ -52,6 +51,7 @@ from legcal.calibration.joint_fit.rounds import (
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
+from legcal.calibration.tuning import LIMB_GAMMA_SIGMA
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, no_outlines
 from legcal.data.reasons import Reason
@@ -425,7 +425,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert gamma.measured_with == 1.0
     assert gamma.fitted_sigma < 0.02
     of_fit, unseen = gamma.fitted_sigma / RECOVERED_SHARE, np.log(gamma.gamma)  # as much again
-    assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_SIGMA**2))
+    assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_GAMMA_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
     as_linear = refine(session.legs, session.measurements, outlines, start)

@@ -19,6 +19,7 @@ from legcal.calibration.joint_fit.solution import Solution, in_file_order
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.outlier_images import outlier_images
+from legcal.calibration.tuning import LIMB_BIAS_PX
 from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
@@ -27,9 +28,7 @@ from legcal.errors import NotVisible
 from legcal.machine.model import Machine
 from legcal.perception.placement import Placement
 
-# Of all outlines that are measured in photographs: light at the limb that no model of shading
-# predicts looks like other radii, so that residuals never show it [px].
-LIMB_BIAS = {"bias of many edges": 0.02}
+LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
 # Of a session that looks wrong: neither other starts nor patience would mend it, and what it
 # contradicts is not to blame.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)

@@ -40,6 +40,7 @@ from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
+from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.calibration.verdict import judge
 from legcal.data.cache import fingerprint, plan_dataset, store_outlines
 from legcal.data.dataset import Dataset, load_dataset
@@ -72,7 +73,6 @@ from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
-TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
 
 
@@ -374,7 +374,7 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     )
     choices = resolve([*dataset.overrides, *overrides], known)
     twists = {
-        name: Prior(parameter.nominal, TWIST_SIGMA)
+        name: Prior(parameter.nominal, float(np.radians(TWIST_SIGMA_DEG)))
         for name, parameter in known.by_name.items()
         if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)

@@ -15,6 +15,7 @@ import numpy as np
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State
+from legcal.calibration.tuning import OUTLIER_POSE_COST
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import Frames, GaussianPrior, Linearization, linearize
 from legcal.estimation.solver import minimise, normal_equations
@@ -30,7 +31,6 @@ _DAMPING, _SLOW = 1e-3, 0.999  # first damping; ratio of costs of a step without
 _MODEL_PX, _MODEL_LENGTH = 2.0, 0.005  # errors of the nominal model [px], mean leg lengths
 _WIDTH = 3.0  # width of the loss in median residuals
 _RANK = 1e-6  # relative to the largest singular value
-_OUTLIER_COST = 10.0  # cost of a pose over the median
 _OPEN = 0.1  # mean leg lengths or rad: least uncertainty of an undetermined pose
 _BETTER = 0.5  # ratio of costs, below which another pose is accepted
 
@@ -145,7 +145,7 @@ def outlier_poses(problem: FitProblem, state: State) -> BoolArray:
     linear, n = linearize(problem, state), len(state.platform_pose.t)
     loss = PseudoHuber(_loss_width(problem, linear))
     cost = _cost_of_poses(problem, linear, loss, n)
-    is_large = cost > _OUTLIER_COST * np.median(cost)
+    is_large = cost > OUTLIER_POSE_COST * np.median(cost)
     if not is_large.any():
         return np.asarray(is_large)
     return np.asarray(is_large & _are_determined(problem, state))

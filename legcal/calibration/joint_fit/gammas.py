@@ -18,9 +18,9 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.calibration.joint_fit.outline_errors import GAMMA_SIGMA
 from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.tuning import GAMMA_SIGMA
 from legcal.data.measurements import few_views
 from legcal.data.outlines import Outlines
 from legcal.estimation.solver import minimise
@@ -29,7 +29,7 @@ from legcal.geometry.types import Array
 
 GAMMA_RANGE = (1.0, 3.0)  # of trials: from linear to beyond sRGB
 GAMMA_STEP = 0.4  # in ln gamma
-GAMMA_TOLERANCE = 0.12  # in ln gamma; smaller than LIMB_SIGMA
+GAMMA_TOLERANCE = 0.12  # in ln gamma; smaller than LIMB_GAMMA_SIGMA
 MAX_GAMMA_TRIALS = 4  # after the first one
 SIGNIFICANCE = 2.0  # standard deviations
 

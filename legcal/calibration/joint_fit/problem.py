@@ -52,6 +52,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
+from legcal.calibration.tuning import EDGE_BIAS_PX
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.outlines import Outlines
@@ -85,7 +86,6 @@ from legcal.vision.camera import (
     with_intrinsics,
 )
 
-_EDGE_BIAS_PX = 0.1  # by which light at the limb and blur may move all edges of a camera alike
 _MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of a frame: [rad], and any displacement
 
 
@@ -491,7 +491,7 @@ def _with_edge_bias(
     added to each radius, times their number.
     """
     stated = [name for name in radii if name in priors]
-    relative_bias = _EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
+    relative_bias = EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
     sigma_of = dict(zip(radii, np.sqrt(len(stated)) * relative_bias * nominal, strict=True))
     wider = {
         n: replace(priors[n], sigma=float(np.hypot(priors[n].sigma, sigma_of[n]))) for n in stated

@@ -43,6 +43,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.measurements import few
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
@@ -52,12 +53,10 @@ from legcal.estimation.uncertainty import explained_share, response, score_test,
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.cylinder import EPSILON
 
-_NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
 _READING_ROUNDS = 8  # each rejects at most one reading per pose
 _REJECTION_TOLERANCE = 0.005  # relative decrease of the cost, in rounds that reject outliers
 _PASSING = 1e-6  # tolerance of intermediate minima, in squared sigmas
-_TAPER = 0.2  # relative half-width of the weight's transition at the rejection distance
 _ACCEPTED = 0.5  # weight at the rejection distance
 _MIN_REDUNDANCY = 0.05  # mean redundancy of corners
 _MIN_SCALE = 0.1
@@ -146,7 +145,7 @@ def first_minimum(
     length = begin.mean_length
     metre = np.array([1.0 if unit == "m" else 1.0 / length for unit in problem.units[:n]])
     nominal_prior = GaussianPrior(
-        np.arange(n, dtype=np.intp), nominal, _NOMINAL_SIGMA * length * metre
+        np.arange(n, dtype=np.intp), nominal, FIRST_MINIMUM_SIGMA * length * metre
     )
     block = problem.block("legs")
     regularised = problem.with_parts((replace(block, prior=block.prior + nominal_prior),), ())
@@ -380,8 +379,8 @@ def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
     """
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
     begin, end = (
-        problem.settings.rejection * (1.0 - _TAPER),
-        problem.settings.rejection * (1.0 + _TAPER),
+        problem.settings.rejection * (1.0 - REJECTION_TAPER),
+        problem.settings.rejection * (1.0 + REJECTION_TAPER),
     )
     part = np.clip((end - np.sqrt(s)) / (end - begin), 0.0, 1.0)
     weight = np.asarray(part**2 * (3.0 - 2.0 * part))
