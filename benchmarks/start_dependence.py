@@ -276,11 +276,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 folder = session_folder(name, SESSIONS[name], scratch, options.seed)
             for start, off in compared(name, folder, Path(temporary), options.seed).items():
                 by_start.setdefault(start, []).append(off)
-    for start, off in by_start.items():
-        n_same = sum(sigmas <= TOLERANCE for sigmas in off)
+    for start, differences in by_start.items():
+        n_same = sum(off <= TOLERANCE for off in differences)
         print(
-            f"{start:9} {n_same} of {len(off)} within {TOLERANCE} sigma, at most "
-            f"{max(off):.4f} sigma"
+            f"{start:9} {n_same} of {len(differences)} within {TOLERANCE} sigma, at most "
+            f"{max(differences):.4f} sigma"
         )
 
 

@@ -177,7 +177,9 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
     leg = header.index("leg")
     with observations.open("w", newline="") as file:
         csv.writer(file).writerows([header, *(row for row in rows if row[leg] != "leg6")])
-    with pytest.raises(NotVisible, match=r"found no used outline of leg6 .* name the legs of each"):
+    with pytest.raises(
+        NotVisible, match=r"no image has a usable outline of leg6; .* list the visible legs of each"
+    ):
         calibrate(folder)
     text = (folder / "dataset.yaml").read_text()
     text = re.sub(r"    legs: .*\n", "", text)
@@ -197,7 +199,7 @@ def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path:
     before, after = errors(calibration, made_set.folder, tmp_path / "out")
     assert calibration.verdict.trustworthy
     assert after < 0.1 * before
-    assert re.search(r"Not determined, and without effect on the platform: \d", notes(calibration))
+    assert re.search(r"Undetermined, but without effect on the platform: \d", notes(calibration))
     solution = calibration.solution
     assert solution.estimates.status["leg1.base_axis.1"] == "weak"
     spread = (

@@ -40,7 +40,7 @@ def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path
     _exchange("leg2_prismatic", "leg3_prismatic")(session)
     calibration = calibrate(session.write())
     (found,) = calibration.diagnosis
-    assert found.what == "columns leg2_prismatic and leg3_prismatic look exchanged"
+    assert found.what == "columns leg2_prismatic and leg3_prismatic appear to be swapped"
     assert found.after == found.images == 10
     assert not calibration.verdict.trustworthy
     assert found.sentence in calibration.verdict.sentence
@@ -108,22 +108,30 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.parametrize(
     ("change", "what", "other"),
     [
-        (_exchanged, "columns leg3_prismatic and leg4_prismatic look exchanged", "legs leg3 and"),
+        (
+            _exchanged,
+            "columns leg3_prismatic and leg4_prismatic appear to be swapped",
+            "legs leg3 and",
+        ),
         pytest.param(
-            *(_another_zero, "column leg2_prismatic looks as if it had another zero: about 38 mm"),
+            *(_another_zero, "column leg2_prismatic appears to have a wrong zero: about 38 mm"),
             "",
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            *(_late_in_one_view, "the readings of view c2 look as if they stood 1 row too late"),
+            *(_late_in_one_view, "the readings of view c2 appear to be 1 row too late"),
             "",
             marks=pytest.mark.system,
         ),
         pytest.param(
-            *(_left_handed, "the joints of the model look mirrored", "the outlines look mirrored"),
+            *(
+                _left_handed,
+                "the model appears to be mirrored",
+                "the outlines appear to be mirrored",
+            ),
             marks=pytest.mark.system,
         ),
-        (_thick, "the radii of the legs in the model look twice as large as they are", ""),
+        (_thick, "the radii of the legs in the model appear to be twice too large", ""),
     ],
 )
 def test_given_outlines_name_a_mistake_as_photographs_do(
@@ -143,7 +151,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.images == 12
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
-    assert ("To tell these apart" in found.sentence) == bool(found.same_as)
+    assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
 
 @pytest.mark.system
@@ -159,9 +167,11 @@ def test_two_mistakes_at_once_are_named_together(
     monkeypatch.setattr(diagnosis, "mistakes", few)
     (found,) = diagnose(order_dataset(_exchanged(_thick(outlines)), in_turn, no_progress))
     assert set(found.kind.split(" and ")) == {"columns exchanged", "diameter for radius"}
-    assert "columns leg3_prismatic and leg4_prismatic look exchanged" in found.sentence.lower()
+    assert (
+        "columns leg3_prismatic and leg4_prismatic appear to be swapped" in found.sentence.lower()
+    )
     assert "correct the <visual> cylinders" in found.remedy
-    assert "exchange the headers" in found.remedy
+    assert "swap the headers" in found.remedy
     assert found.after >= 11 > found.before
 
 
@@ -185,12 +195,12 @@ def _with_readings(d: Dataset, change: Callable[[Array], Array]) -> Dataset:
         (np.deg2rad, {"unit", "direction of encoders"}, "the readings look like radians that"),
         pytest.param(
             *(lambda q: q * [1.0, 1.0, -1.0], {"direction of an encoder"}),
-            "column arm3 looks as if it had the opposite sign",
+            "column arm3 appears to have the opposite sign",
             marks=pytest.mark.slow,
         ),
         pytest.param(
             *(lambda q: q[:, [1, 0, 2]], {"columns exchanged"}),
-            "columns arm1 and arm2 look exchanged",
+            "columns arm1 and arm2 appear to be swapped",
             marks=pytest.mark.slow,
         ),
     ],
@@ -256,8 +266,8 @@ def test_a_view_whose_camera_was_moved_is_named(
     found = _diagnosed(d, {"readings shifted", "images upside down"}, monkeypatch)
     first = [row_names(d.measurements)[k] for k in (0, int(moved[0]))]
     assert found.what == (
-        f"the outlines of view c1 look as if they were taken from 2 places: {first[0]} and 5 more "
-        f"from one, {first[1]} and 4 more from another"
+        f"the outlines of view c1 appear to be taken from 2 camera positions: {first[0]} and 5 "
+        f"more from one, {first[1]} and 4 more from another"
     )
     assert (found.images, found.before, found.after, found.same_as) == (11, 6, 11, ())
 
@@ -273,9 +283,9 @@ def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     found = _diagnosed(d, kinds, monkeypatch)
     assert found.kind == "columns exchanged"
     assert len([one for one in found.same_as if one.startswith("columns")]) == 2
-    told = found.sentence.partition(": with the columns exchanged,")[0]
-    assert "or the outlines look mirrored, or the joints of the model look mirrored" in told
-    assert "or 2 more that are alike" in told
+    told = found.sentence.partition(": with the columns swapped,")[0]
+    assert "or the outlines appear to be mirrored, or the model appears to be mirrored" in told
+    assert "or 2 similar mistakes" in told
 
 
 def test_a_row_from_which_on_readings_are_late_is_named(
@@ -285,7 +295,7 @@ def test_a_row_from_which_on_readings_are_late_is_named(
     found = _diagnosed(d, {"readings shifted", "images mirrored"}, monkeypatch)
     row = row_names(d.measurements)[int(np.flatnonzero(d.measurements.view == 1)[3])]
     assert found.what.startswith(
-        f"the readings of view c2 look as if they stood 1 row too late from {row} on"
+        f"from {row} on, the readings of view c2 appear to be 1 row too late"
     )
     assert found.after > found.before
 

@@ -389,7 +389,7 @@ def test_inliers_that_change_have_not_converged() -> None:
     assert check_convergence(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
     assert check_convergence(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
     (note,) = check_convergence(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
-    assert "rejected 4 outlines anew, with 100 accepted" in note
+    assert "4 outlines were newly accepted or rejected (100 are accepted)" in note
     with pytest.raises(DidNotConverge, match="rejected 6 outlines anew"):
         check_convergence(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)
 
@@ -509,10 +509,13 @@ def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession
     other = replace(faint, gamma=np.full(len(faint), np.exp(GAMMA_STEP)))
     gammas = trials.next()
     (note,) = trials.tried(gammas, None).notes({})
-    assert "is undecided: the fit failed with every other gamma" in note
+    assert "could not be determined: the fit failed with every other gamma" in note
     trials = trials.tried(gammas, refine(session.legs, measurements, other, start))
     assert trials.found() == {}
     (note,) = trials.notes({})
-    assert "of views c1, c2, c3 is undecided: its outlines are about as likely with 1.49" in note
+    assert (
+        "of views c1, c2, c3 could not be determined: its outlines are about as likely with 1.49"
+        in note
+    )
     (note,) = trials.tried(gammas, None).notes({"c1": 2.0})
-    assert "fewer of its outlines are usable with 2.00" in note
+    assert "with 2.00, fewer of its outlines are usable" in note

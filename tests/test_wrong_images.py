@@ -86,7 +86,7 @@ CHANGED: dict[tuple[str, int], tuple[Callable[[Picture], Any], str]] = {
     ("c3", 1): (_noise(110.0), "the image shows nothing, all of it within"),
     ("c3", 2): (
         _elsewhere,
-        "found 0 of 1[02] outlines where its reading has the legs, and nothing",
+        "0 of 1[02] predicted outlines were found, and no other explanation",
     ),
 }
 SWAPPED = [(("c1", 3), ("c2", 5)), (("c3", 3), ("c3", 4))]
@@ -163,7 +163,7 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
 ) -> None:
     notes = [note for note in detected.notes if not note.startswith(WITHOUT_GAMMA)]
     assert len(notes) == len(CHANGED) - 1 + 2 * len(SWAPPED) + 1  # both blurred ones are one
-    legs = "view c3: legs leaves out leg2, which its images show clearly; name them there to use"
+    legs = "view c3 does not list leg2 (legs), which its images show clearly; add them to use"
     assert [note.startswith(legs) for note in notes if ": legs " in note] == [True]
     assert detected.unplaced == {}
     named = "".join(detected.notes)
@@ -214,7 +214,7 @@ def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
     found = _observed(made).placement
     assert list(found.unplaced) == ["c1", "c2"]
     assert list(found.notes) == [
-        f"3 images of view c1 ({', '.join(black)}) were left out, all for one reason: the image is "
+        f"3 images of view c1 ({', '.join(black)}) were left out: the image is "
         "black, at most 0 of 255 grey levels; take it again."
     ]
     assert "in its 4 images" in str(found.unplaced["c2"])  # once for all of them
@@ -234,7 +234,7 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     )
     found = detect(made.write())
     assert list(found.unplaced) == ["c1"]
-    assert "images show the legs if left and right are exchanged" in str(found.unplaced["c1"])
+    assert "images show the legs only if left and right are swapped" in str(found.unplaced["c1"])
     assert len([note for note in found.notes if not note.startswith(WITHOUT_GAMMA)]) == 2
     assert re.match(r"view c2: its T_base_camera is wrong: .*it suits view c3", found.notes[0])
     assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
@@ -243,24 +243,24 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("written", "words"),
     [
-        (lambda T: T.inv(), "if it is inverted, the base in the camera:"),
+        (lambda T: T.inv(), "if it is T_camera_base, the inverse:"),
         (lambda T: _pose(1e3 * T.translation, T.rotation), "if its xyz are millimetres:"),
         (lambda T: _pose(T.translation, _w_first(T.rotation)), "if its quaternion has w first:"),
         (
             lambda T: _pose(T.inv().translation, _w_first(T.inv().rotation)),
-            "if it is inverted, the base in the camera, and its quaternion has w first:",
+            "if it is T_camera_base, the inverse, and its quaternion has w first:",
         ),
         (
             lambda T: T * _pose(np.zeros(3), Rotation.from_euler("x", 180, degrees=True)),
-            "if its camera has y up and z backward:",
+            "if its camera axes are y up and z backward:",
         ),
         (
             lambda T: _pose(T.translation, _forward(T.rotation)),
-            "if its camera has x forward and z up:",
+            "if its camera axes are x forward and z up:",
         ),
         (
             lambda T: T * _pose(np.zeros(3), Rotation.from_euler("y", 40, degrees=True)),
-            "needed a rough pose; correct it in dataset.yaml",
+            "; correct it in dataset.yaml",
         ),
     ],
 )
@@ -296,13 +296,13 @@ def _w_first(rotation: Rotation) -> Rotation:
             "",
             1.2,
             3,
-            r"All legs are seen 1[2-9] % thinner than their radii in the model; the radii",
+            r"All legs appear 1[2-9] % thinner than in the model; the radii",
         ),
         pytest.param(  # test_recognition.py shows that single legs are found
             "leg3",
             0.8,
             5,
-            r"leg3 may be 2\d % thicker than in the model: found a radius of about",
+            r"leg3 may be 2\d % thicker than in the model: its radius is about",
             marks=pytest.mark.slow,
         ),
     ],

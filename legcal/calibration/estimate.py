@@ -29,14 +29,14 @@ from legcal.machine.model import Machine
 from legcal.perception.placement import Placement
 
 LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
-# Of a session that looks wrong: neither other starts nor patience would mend it, and what it
-# contradicts is not to blame.
+# For a session with a likely mistake: neither other starts nor more steps would help, and stated
+# values that it contradicts are not to blame.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the images show and what was fitted to it, in canonical order."""
+    """The outlines of all images and the fit to them, in canonical order."""
 
     fitted: OrderedDataset  # the images that were fitted
     outlines: Outlines  # of all images
@@ -50,7 +50,7 @@ class Estimate:
 
     @cached_property
     def outliers(self) -> dict[int, Cause]:
-        """What is said of images that contradict the fit, by their row."""
+        """Causes of images that contradict the fit, by row."""
         return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
 
     def in_file_order(self) -> Estimate:
@@ -113,20 +113,20 @@ def fit_outlines(
 
 
 def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
-    """Raise NotVisible if no image shows a leg that its view says it does."""
+    """Raise NotVisible if no image has a used outline of a leg that its view lists."""
     if fitted.axes is not None:
         return
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
     if unseen:
         raise NotVisible(
-            f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
-            f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
-            "it, or name the legs of each view in dataset.yaml to leave it to the readings."
+            f"{fitted.dataset.folder}: the machine could not be calibrated: no image has a usable "
+            f"outline of {', '.join(unseen)}; add images that show it, or list the visible legs of "
+            "each view in dataset.yaml, so that it relies on readings."
         )
 
 
 def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
-    """Return the legs that views should show, and of which no outline is used."""
+    """Return the names of legs that views list and that have no used outline."""
     along = along_legs(outlines, machine.legs)
     shown = set(along.leg[along.used].tolist())
     views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]

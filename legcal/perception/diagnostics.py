@@ -145,17 +145,17 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outli
 
 
 def is_out_of_sight(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image cannot show: they are outside it, or hidden."""
+    """Return the mask of outlines outside the image or hidden."""
     return outlines.rejected_for(*NOT_IN_SIGHT)
 
 
 def is_visible(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image should show."""
+    """Return the mask of outlines that an image should show."""
     return ~outlines.rejected_for(*NOT_IN_SIGHT, Reason.NOT_PLACED)
 
 
 def is_measurable(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image should show at a length that can be measured."""
+    """Return the mask of outlines that an image should show, long enough to be measured."""
     return is_visible(outlines) & ~outlines.rejected_for(Reason.SHORT)
 
 
@@ -165,7 +165,7 @@ def _without_views(
     defective: Sequence[int],
     defects: Mapping[int, Rejection],
 ) -> Placement:
-    """Return the placement with views unplaced all of whose images show nothing."""
+    """Return the placement without the cameras of views with unusable images only."""
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
@@ -176,9 +176,9 @@ def _without_views(
         unplaced[name] = NotPlaced(
             name,
             Cause(
-                f"its camera could not be placed: found nothing to see in its {{}} image"
-                f"{'s' * (len(own) != 1)} ({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}), "
-                "needed photographs of the legs; take them again.",
+                f"its camera could not be placed: {'none of ' * (len(own) != 1)}its {{}} image"
+                f"{'s' * (len(own) != 1)} is {'un' * (len(own) == 1)}usable "
+                f"({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}); take them again.",
                 (len(own), *images, *causes),
             ),
         )
@@ -192,23 +192,23 @@ def image_verdict(
     usual: Mapping[int, float],
     found: Mapping[int, OutlineCount],
 ) -> tuple[Rejection, Cause]:
-    """Return why an image is left out, false if it is not, and what is said of it and to do."""
+    """Return the rejection of an image, false if it is used, and its cause with a remedy."""
     if explanation.reason:
         return explanation.reason, Cause("{}; {}", (explanation.reason.cause, explanation.remedy))
-    much = Cause("{} of {} outlines where its reading has the legs", tuple(found[row]))
+    much = Cause("{} of {} predicted outlines were found", tuple(found[row]))
     view = int(measurements.view[row])
     if explanation.own >= SHARE_OF_OTHERS * usual[view]:
-        little = "shows little of the legs: found {}, in other images most; look at its light and "
-        return USED, Cause(little + "sharpness", (much,))
+        little = "shows little of the legs: {}, in other images most; check its light and sharpness"
+        return USED, Cause(little, (much,))
     nothing = (
-        "found {}, and nothing else that it shows; check that it is a photograph of this machine, "
-        "taken by this camera at this reading"
+        "{}, and no other explanation fits; check that it is a photograph of this machine, taken "
+        "by this camera at this reading"
     )
     return Rejection(Reason.OTHER_SCENE), Cause(nothing, (much,))
 
 
 def defect_notes(measurements: Measurements, defects: Mapping[int, Rejection]) -> list[str]:
-    """Return one sentence for each thing that is wrong with single images, by row."""
+    """Return one sentence for each defect of single images, by row."""
     again = {row: Cause("{}; take it again", (why.cause,)) for row, why in defects.items()}
     return _left_out_notes(measurements, again)
 
@@ -217,13 +217,13 @@ def _left_out_notes(measurements: Measurements, why: Mapping[int, Cause]) -> lis
     """Return one sentence for each cause for which images were left out, by row."""
     notes = []
     for cause, rows in by_cause(why):
-        verb = ": was left out" if len(rows) == 1 else " were left out, all for one reason"
+        verb = ": was left out" if len(rows) == 1 else " were left out"
         notes.append(f"{images_in_words(measurements, rows)}{verb}: {cause}.")
     return notes
 
 
 def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
-    """Return why no outline is used of images that should show some, by row: what most say."""
+    """Return the commonest rejection of images with no used outline, by row."""
     found = {}
     for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
         own = np.flatnonzero(outlines.row == row)
@@ -236,7 +236,7 @@ def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
 
 
 def _most_common(rejections: Sequence[Rejection]) -> Rejection:
-    """Return the reason of most, with its detail where it is that of all of them."""
+    """Return the commonest reason, with its detail if all have the same."""
     reason = Counter(why.reason for why in rejections).most_common(1)[0][0]
     details = {why.detail for why in rejections if why.reason is reason}
     return Rejection(reason, details.pop() if len(details) == 1 else "")
@@ -245,9 +245,9 @@ def _most_common(rejections: Sequence[Rejection]) -> Rejection:
 def share_shown(
     search: Search, placement: Placement, row: int, *, legs: IntArray | None = None
 ) -> float:
-    """Return the share of the legs, by visible length, that an image shows where they should be.
+    """Return the fraction of the predicted legs, by visible length, that an image shows.
 
-    By default of the legs that its view is stated to show; the view must have been placed.
+    By default of the legs stated for its view, which must have been placed.
     """
     view = int(search.measurements.view[row])
     picture = _picture(search, search.pairs(row, view), row, view, legs)
@@ -262,10 +262,11 @@ def explain(
     *,
     suspects: Collection[int] = (),
 ) -> ImageExplanation:
-    """Return what an image of a placed view shows whose legs are not where its reading has them.
+    """Explain an image of a placed view whose legs are not where its reading predicts them.
 
-    ``usual`` is the share of the legs that good images of each view show, by :func:`share_shown`;
-    ``suspects`` are all suspect images: readings that others show are hardly those of this one.
+    ``usual`` is the fraction of legs that good images of each view show (:func:`share_shown`);
+    ``suspects`` are all suspect images: a reading that another image shows hardly belongs to this
+    one.
     """
     measurements = search.measurements
     view = int(measurements.view[row])
@@ -327,17 +328,17 @@ def explain(
 def _at_other_reading(
     search: Search, row: int, other: int, exchanged: bool
 ) -> tuple[Rejection, str]:
-    """Return what an image shows that suits another image's reading, and what to do.
+    """Return the rejection of an image that matches another image's reading, and the remedy.
 
-    Where that image shows its own reading, the two were not exchanged: it may be near this pose,
-    and one wrong digit in this reading tells them apart.
+    Where that image matches its own reading, the two were not exchanged: its pose may be near, and
+    one wrong digit in this reading makes the difference.
     """
     measurements = search.measurements
     image, remedy = measurements.image[other], "check which image belongs to which row"
     if exchanged:
         shown = f"it shows the reading given for image {image}"
         return Rejection(Reason.OTHER_READING, shown), remedy
-    why = f"its legs are about where the reading of image {image} has them"
+    why = f"its legs match the reading of image {image}"
     difference = np.abs(measurements.q[row] - measurements.q[other])
     *_, second, first = np.argsort(np.nan_to_num(difference))
     if difference[first] > LONE_READING * difference[second]:
@@ -460,7 +461,7 @@ def _leg_notes(
     found: Mapping[int, OutlineCount],
     reasons: Mapping[int, Rejection],
 ) -> list[str]:
-    """Return notes on the legs that views are stated to show."""
+    """Return notes on the legs listed for views."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
@@ -475,9 +476,9 @@ def _leg_notes(
                 continue
             why = _most_common([outlines.reason[i] for i in np.flatnonzero(mine).tolist()])
             notes.append(
-                f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
-                f"outline that can be used ({why}); look at legcal detect, "
-                "or leave it out there."
+                f"view {view.name} lists {names[leg]} (legs), but none of its images has a usable "
+                f"outline of it ({why}); inspect them with legcal detect, or remove it from the "
+                "list."
             )
         good = {row: found[row] for row in rows}
         notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
@@ -485,7 +486,7 @@ def _leg_notes(
 
 
 def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[int]) -> list[str]:
-    """Return a note on legs that a view leaves out although its images show them clearly."""
+    """Return a note on legs that a view does not list although its images show them clearly."""
     clear = [
         name
         for leg, name in enumerate(search.leg_names)
@@ -498,35 +499,39 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
     if not clear:
         return []
     return [
-        f"view {search.measurements.views[v].name}: legs leaves out {', '.join(clear)}, which "
-        "its images show clearly; name them there to use them."
+        f"view {search.measurements.views[v].name} does not list {', '.join(clear)} (legs), which "
+        "its images show clearly; add them to use them."
     ]
 
 
 def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
-    """Say whether a rough pose is farther from a pose than rough ones are."""
+    """Return whether a rough pose is farther from a pose than the tolerance of rough poses."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = pose_distance(hint, T_base_camera)
     return apart > reach * FAR_OFF[0] * distance or angle > reach * FAR_OFF[1]
 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
-    """Yield what people write in place of T_base_camera, and the pose that it means then."""
+    """Yield common misinterpretations of T_base_camera, with the pose each would mean."""
     t, R = hint.translation, hint.rotation
     written = (
         ("", t, R),
         ("its xyz are millimetres", MILLIMETRE * t, R),
-        ("its quaternion has w first", t, Rotation.from_quat(np.roll(R.as_quat(), -1))),
+        (
+            "its quaternion is in the order w, x, y, z",
+            t,
+            Rotation.from_quat(np.roll(R.as_quat(), -1)),
+        ),
     )
     for what, xyz, rotation in written:
         pose = RigidTransform.from_components(xyz, rotation)
         if what:
             yield what, pose
         both = f", and {what}" if what else ""
-        yield f"it is inverted, the base in the camera{both}", pose.inv()
+        yield f"it is T_camera_base, the inverse{both}", pose.inv()
         for axes, R_axes in _CAMERA_AXES.items():
             turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
-            yield f"its camera has {axes}{both}", pose * turned
+            yield f"its camera axes are {axes}{both}", pose * turned
 
 
 def hint_notes(
@@ -539,9 +544,9 @@ def hint_notes(
 ) -> list[str]:
     """Return notes on rough T_base_camera of views that the images contradict.
 
-    ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
-    many times farther than rough poses are they may be. Views that mean the same other thing have
-    one note. Those of some views, by their names, follow from clicks.
+    ``cameras`` are found in the images, None where a view could not be placed; ``reach`` multiplies
+    the tolerance of rough poses. Views with the same misinterpretation have one note. Poses of the
+    views ``by_landmarks`` follow from clicks.
     """
     notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by what they mean
     for name, hint, T in zip(names, hints, cameras, strict=True):
@@ -550,10 +555,9 @@ def hint_notes(
         apart, angle = pose_distance(hint, T)
         if name in by_landmarks:
             notes.append(
-                f"view {name}: the images contradict its clicks: found the camera "
-                f"{1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg from where the images put "
-                "it, needed clicks on the joints that they name; check those of the view in "
-                f"{LANDMARKS_NAME}."
+                f"view {name}: its clicks contradict the images: the camera by clicks is "
+                f"{1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg from the camera found in "
+                f"the images; check the clicks of the view in {LANDMARKS_NAME}."
             )
             continue
         x, y, z = T.translation
@@ -569,23 +573,22 @@ def hint_notes(
                       if not far_off(as_meant, T, reach)), None)  # fmt: skip
         remedy = "correct it in dataset.yaml"
         if other is not None:
-            remedy = f"it suits view {other}: check whether views or their images were exchanged"
+            remedy = f"it fits view {other}: check whether views or their images were swapped"
         elif meant is not None:
             alike.setdefault(meant, []).append((name, 1e3 * apart, float(np.degrees(angle))))
             continue
         notes.append(
-            f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
-            f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
-            f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
+            f"view {name}: its T_base_camera is wrong: it is {1e3 * apart:.0f} mm and "
+            f"{np.degrees(angle):.0f} deg from the camera found in the images (xyz: [{x:.3f}, "
+            f"{y:.3f}, {z:.3f}]); {remedy}."
         )
     for meant, views in alike.items():
         of_views, mm, deg = zip(*views, strict=True)
         one = len(views) == 1
         notes.append(
-            f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: found it "
-            f"{_span(mm)} mm and {_span(deg)} deg from where the images put the camera, needed a "
-            f"rough pose; it suits the images if {meant}: correct {'it' if one else 'them'} in "
-            "dataset.yaml."
+            f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: it is "
+            f"{_span(mm)} mm and {_span(deg)} deg from the camera found in the images; it fits if "
+            f"{meant}: correct {'it' if one else 'them'} in dataset.yaml."
         )
     return notes
 

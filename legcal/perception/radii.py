@@ -232,20 +232,20 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
 def radius_notes(
     found: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
 ) -> list[str]:
-    """Return notes on radii that differ from the model; where it is seen, in words, of each."""
+    """Return notes on radii that differ from the model; *seen_in* names the images of each."""
     if not found.factor:
         return []
     if found.common:
         way = _away(found.common)
         return [
-            f"All legs are seen {way} than their radii in the model; the radii that the images "
-            "show were used; correct those of the model, or the unit and scale of the model and "
-            "the readings if the radii are right."
+            f"All legs appear {way} than in the model; the radii found in the images were used. "
+            "Correct the radii of the model, or, if these are right, the unit and scale of the "
+            "model and the readings."
         ]
     return [
-        f"{legs[leg]} may be {_away(factor)} than in the model: found a radius of about "
-        f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, given {1e3 * radius:.2f} mm, "
-        "and used what these images show; measure the leg, and correct the model if it is so."
+        f"{legs[leg]} may be {_away(factor)} than in the model: its radius is about "
+        f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, not {1e3 * radius:.2f} mm; the "
+        "measured radius was used; measure the leg, and correct the model if confirmed."
         for (leg, radius), factor in sorted(found.factor.items())
     ]
 

@@ -73,10 +73,9 @@ MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of
 RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 TWO_POSES = (
-    "its camera could not be placed: found two poses at which its images show the legs about as "
-    "well ({:.1f} and {:.1f} legs an image; {:.0f} mm and {:.0f} deg apart), needed one; add "
-    "images at readings that differ more between the legs, or clicks on its joints "
-    f"({LANDMARKS_NAME})."
+    "its camera could not be placed: two poses explain its images about equally well ({:.1f} and "
+    "{:.1f} legs per image; {:.0f} mm and {:.0f} deg apart); add images at readings that differ "
+    f"more between the legs, or clicks on its joints ({LANDMARKS_NAME})."
 )
 
 
@@ -449,37 +448,35 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
 
 
 def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> Cause:
-    """Return why a view could not be placed."""
+    """Return the cause for which a view could not be placed."""
     if is_mirrored:
         return Cause(
-            "its camera could not be placed: found that its images show the legs if "
-            "left and right are exchanged, needed photographs as the camera took them; replace "
-            "mirrored images by the originals, or check what may look the same: the order of the "
-            "columns of readings, and the signs of y in the model."
+            "its camera could not be placed: its images show the legs only if left and right are "
+            "swapped; replace mirrored images with the originals, or check what looks the same: "
+            "the order of the columns of readings, and the signs of y in the model."
         )
     where = "near its rough pose or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:
         return Cause(
-            "its camera could not be placed: found no pair of edges in its images "
-            "that could be a leg, needed legs; check that the photographs show the machine, "
-            "sharp and neither black nor overexposed."
+            "its camera could not be placed: no pair of edges in its images could be a leg; check "
+            "that the photographs show the machine, sharp and neither black nor overexposed."
         )
     legs, n = float(placed.support[0].mean()), float(placed.expected[0].mean())
     clicked = "" if hinted else f"; or click its joints ({LANDMARKS_NAME})"
     if not placed.is_enough:
         return Cause(
-            f"its camera could not be placed: found no pose {where} at which its images show the "
-            "legs (at the best one {:.1f} of {:.0f} legs an image), needed {:.1f}; check that the "
-            "images belong to this machine and to their readings, that they are no mirror images, "
-            f"the camera file, and the legs of the view if dataset.yaml names them{clicked}.",
+            f"its camera could not be placed: no pose {where} explains its images: the best one "
+            "matches {:.1f} of {:.0f} legs per image, and {:.1f} are needed; check that the images "
+            "belong to this machine and to their readings, that they are not mirrored, the camera "
+            f"file, and the legs of the view if dataset.yaml lists them{clicked}.",
             (legs, n, float(placed.needed)),
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
         return Cause(
-            f"its camera could not be placed: found too few outlines at the pose {where} at which "
-            "its images show {:.1f} of {:.0f} legs an image, needed more than other edges in the "
-            "images make as well; add images at other readings, in better light, or clicks on its "
-            f"joints ({LANDMARKS_NAME}).",
+            f"its camera could not be placed: too few outlines were measured at the best pose "
+            f"{where}, which matches {{:.1f}} of {{:.0f}} legs per image, to distinguish it from "
+            "other edges in the images; add images at other readings, in better light, or clicks "
+            f"on its joints ({LANDMARKS_NAME}).",
             (legs, n),
         )
     other = placed.pose(1)

@@ -343,12 +343,13 @@ def _visible_places(
 
 
 _REMEDIES = {
-    "elsewhere": "turn {} to the machine, or move further away",
+    "elsewhere": "point {} at the machine, or move further away",
     "near": "move {} further away, or use a camera with a wider view",
     "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
     "hidden": "move {} to where no plate or other leg is in front of the legs",
-    "board": "move {} to where all of the board is in the picture, or use a smaller one",
-    "small": "use a board of larger squares, or a camera with a longer focal length or more pixels",
+    "board": "move {} so that the whole board is in the image, or use a smaller one",
+    "small": "use a board with larger squares, or a camera with a longer focal length or more "
+    "pixels",
 }
 
 
@@ -366,10 +367,10 @@ def _no_visible_places(
     remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
     names = ", ".join(place.name for place in blind if place.name)
     return (
-        f"{scene.task.machine.yaml_path}: no session could be planned: {n_places - len(blind)} of "
-        f"{n_places} camera places see legs{board} for every tripod within "
-        f"{1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg, needed {needed}; "
-        f"{remedy.format(names or 'the places')}."
+        f"{scene.task.machine.yaml_path}: no session could be planned: only "
+        f"{n_places - len(blind)} of {n_places} camera positions see legs{board} with the tripod "
+        f"tolerance of {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg; {needed} "
+        f"are needed; {remedy.format(names or 'the cameras')}."
     )
 
 
@@ -501,8 +502,8 @@ class _Search:
         if sum(count) < task.n_images:
             raise NotVisible(
                 f"{machine.yaml_path}: no session could be planned: only {sum(count)} images from "
-                f"{len(current)} places show legs and the board, needed {task.n_images}; plan "
-                "fewer --images, more --cameras, or a board of another size."
+                f"{len(current)} camera positions show legs and the board, {task.n_images} are "
+                "needed; plan fewer --images, more --cameras, or a board of another size."
             )
         least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
         least = min([least, *count])
@@ -544,17 +545,17 @@ class _Search:
             is_enough=lambda error: error < limit,
         )
         n = max(len(more.images), task.n_images + 1)
-        places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
+        places = f"{task.n_views} camera position{'s' * (task.n_views != 1)}"
         remedy = (
             f"plan {n} --images or more"
             if more.value < limit
             else "plan more --cameras, or --board"
         )
-        needed = f"at least {n}" if more.value < limit else "more places"
+        needed = f"at least {n} images" if more.value < limit else "more positions"
         raise NotIdentifiable(
             f"{task.machine.yaml_path}: no session could be planned: {task.n_images} "
-            f"image{'s' * (task.n_images != 1)} from {places} would not improve on the accuracy of "
-            f"the model, needed {needed}; {remedy}."
+            f"image{'s' * (task.n_images != 1)} from {places} would not improve on the nominal "
+            f"model; {needed} are needed; {remedy}."
         )
 
     def better_places(
@@ -638,8 +639,8 @@ class _Search:
         notes = []
         if blocked:
             notes.append(
-                f"No free path was found to {blocked} of the poses, not even through home: move "
-                "the machine there manually, away from singularities and collisions."
+                f"No collision-free path was found to {blocked} of the poses, not even through "
+                "home: move the machine there manually, away from singularities and collisions."
             )
         if not machine.is_determined:
             notes.append(f"Readings do not determine the pose: {machine.undetermined}.")

@@ -1,4 +1,4 @@
-"""What people do wrong, each as a change of what is taken for true: readings, model or images."""
+"""Common mistakes, each as a changed hypothesis on readings, model or images."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ _TURNS_IN_WORDS = (
     ("images mirrored", "mirrored"),
     ("images upside down", "turned upside down"),
 )
-_MOVE_ONE = "move one leg alone and see which column changes, and which leg it is in a picture"
-_LETTERING = "look at lettering in a picture"
+_MOVE_ONE = "move one leg alone and see which column changes, and which leg moves in a photograph"
+_LETTERING = "look at lettering in a photograph"
 
 
 @dataclass(frozen=True, eq=False)
 class Assumed:
-    """What is taken for true of a session."""
+    """A hypothesis on a session: readings, model, orientation of images, camera positions."""
 
     machine: Machine
     q: Array  # (n_rows, n_legs) readings [m or rad]
     flip: Array  # (n_rows, 2) -1 along axes that images are turned over
-    place: IntArray  # (n_rows,) where the camera of a view stood, numbers from 0
-    focal: float = 1.0  # focal length as a part of the stated one
+    place: IntArray  # (n_rows,) number of the camera position within a view, from 0
+    focal: float = 1.0  # focal length over the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
         """Return joint centres in the base link, as :func:`joints_of`."""
@@ -76,27 +76,27 @@ class Assumed:
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """What somebody may have done wrong, and what is true then."""
+    """A possible mistake, and the hypothesis that corrects it."""
 
     kind: str  # a word or two, for scripts
-    what: str  # clause: "columns leg1_prismatic and leg2_prismatic look exchanged"
-    mended: str  # "with the columns exchanged"
+    what: str  # clause: "columns leg1_prismatic and leg2_prismatic appear to be swapped"
+    mended: str  # "with the columns swapped"
     remedy: str  # what to do
     true: Assumed
-    same_as: tuple[str, ...] = ()  # clauses of what no image can tell from it
-    test: str = ""  # what would decide whether it is this: "move one leg alone and ..."
-    is_small: bool = False  # cameras stand about where images have them as things are
-    of_few: tuple[int, ...] = ()  # rows of single images that it is about
-    amount_of: str = ""  # mistakes of one name differ by how much: the best stands for all
-    # The same by more or less, in steps between those that are tried; None where it has no amount.
+    same_as: tuple[str, ...] = ()  # clauses of mistakes that no image can distinguish from it
+    test: str = ""  # how to decide between them: "move one leg alone and ..."
+    is_small: bool = False  # cameras are about where images put them without correction
+    of_few: tuple[int, ...] = ()  # rows, if only single images are affected
+    amount_of: str = ""  # mistakes of one name differ in amount: only the best is reported
+    # The same mistake by a finer amount, in steps; None where it has no amount.
     finer: Callable[[float], Mistake] | None = None
-    # What is true if the same was done the other way: images suit that worse than things as they
-    # are, if they suit this better. None where it may well be as good.
+    # The opposite mistake: if this one fits better than no correction, its opposite fits worse.
+    # None where the opposite may fit as well.
     opposite: Assumed | None = None
 
 
 def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
-    """Return joint centres of some rows under each of many assumptions, in the base link [m].
+    """Return joint centres of some rows under each of many hypotheses, in the base link [m].
 
     Those at A and at B, (n_rows, n_legs, 3) each. From home the readings are followed by the
     equations of the legs alone, those of one machine all together; what is not reached, and all
@@ -125,15 +125,15 @@ def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Arra
 
 
 def as_given(data: OrderedDataset) -> Assumed:
-    """Return a session as its files have it."""
+    """Return the hypothesis that the files are right."""
     n = data.measurements.n_rows
     return Assumed(data.machine, data.measurements.q, np.ones((n, 2)), np.zeros(n, dtype=np.intp))
 
 
 def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistake:
-    """Return two mistakes at once: the other one was found beside what is true after the first.
+    """Return two mistakes at once: the other was found with the first one corrected.
 
-    ``beside`` are what images cannot tell from the first, one of each kind.
+    ``beside`` are mistakes that images cannot distinguish from the first, one of each kind.
     """
     alike = [same.what for same in beside if same.kind != one.kind]
     return Mistake(
@@ -148,9 +148,9 @@ def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistak
 
 
 def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
-    """Return what may be wrong with a session, the commoner before the rarer.
+    """Return the possible mistakes of a session, the commoner before the rarer.
 
-    That is beside what is ``given``, by default the session as its files have it.
+    They are changes of the hypothesis ``given``, by default that the files are right.
     """
     given = given or as_given(data)
     encoders = _Encoders(given)
@@ -169,7 +169,7 @@ def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake
 
 
 def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings of other legs: exchanged, reversed, from another leg on."""
+    """Yield readings of other legs: columns swapped, reversed, or rotated."""
     order = inverse(data.order.legs)  # legs as the files have them
     motors = [j for j in order.tolist() if j in given.machine.motors]
     names = [given.machine.legs[j].prismatic for j in motors]
@@ -189,40 +189,40 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         what = "motors" if all(leg.actuator for leg in ones) else "legs"
         yield Mistake(
             "columns exchanged",
-            f"columns {names[i]} and {names[k]} look exchanged",
-            "with the columns exchanged",
-            "exchange the headers of these columns",
+            f"columns {names[i]} and {names[k]} appear to be swapped",
+            "with the columns swapped",
+            "swap the headers of these columns",
             with_columns(source),
-            (f"{what} {legs} look exchanged in the model",),
+            (f"{what} {legs} appear to be swapped in the model",),
             _MOVE_ONE,
         )
     if n > 3:  # of three these are two exchanged
         yield Mistake(
             "columns reversed",
-            "the columns of readings look as if they were in reverse order",
+            "the reading columns appear to be in reverse order",
             "with the columns reversed",
             "reverse the headers of the columns",
             with_columns(every[::-1]),
-            ("the legs look as if they were numbered backwards in the model",),
+            ("the legs appear to be numbered in reverse order in the model",),
             _MOVE_ONE,
         )
     for k in range(1, n) if n > 2 else ():
         yield Mistake(
             "columns rotated",
-            f"the columns of readings look as if they began with another leg: what "
-            f"{names[0]} holds is of {names[(n - k) % n]}",
-            f"with the columns moved on by {k}",
+            f"the reading columns appear to be shifted: column {names[0]} contains the readings "
+            f"of {names[(n - k) % n]}",
+            f"with the columns shifted by {k}",
             "correct the headers of the columns",
             with_columns([(j + k) % n for j in every]),
-            ("the legs look as if they were numbered from another one on in the model",),
+            ("the legs appear to be numbered from another starting leg in the model",),
             _MOVE_ONE,
         )
 
 
 def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
-    """Return readings of a view that stand a row late (k = 1) or early (-1) from a row on.
+    """Return readings of a view that are a row late (k = 1) or early (-1) from its row *first* on.
 
-    That is its first-th one in the file. The last ones, whose own are not known, stay as they are.
+    Rows count in the order of the file. The last row, whose readings are unknown, keeps its own.
     """
     rows = rows_of_views(data)[v][first:]
     q = given.q.copy()
@@ -231,9 +231,9 @@ def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: in
     where = row_names(data.dataset.measurements)[row]
     return Mistake(
         "readings shifted",
-        f"the readings of view {name} look as if they stood 1 row too {_LATE[k]} from {where} on, "
-        f"as if {'an image' if k > 0 else 'a row of readings'} were missing there",
-        "with the readings moved by 1 row",
+        f"from {where} on, the readings of view {name} appear to be 1 row too {_LATE[k]}; "
+        f"{'an image' if k > 0 else 'a row of readings'} may be missing there",
+        "with the readings shifted by 1 row",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -264,9 +264,9 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         where = f" of view {view}" if view else ""
         yield Mistake(
             "readings shifted",
-            f"the readings{where} look as if they stood 1 row too {_LATE[k]}: each image has those "
-            "of another",
-            "with the readings moved by 1 row",
+            f"the readings{where} appear to be 1 row too {_LATE[k]}: each image is paired with "
+            "the readings of its neighbour",
+            "with the readings shifted by 1 row",
             "check which image belongs to which row",
             replace(given, q=q),
             amount_of=f"rows{where}",
@@ -282,13 +282,13 @@ def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 
 @dataclass(frozen=True, eq=False)
 class _Encoders:
-    """The encoders of a session, what is read of them, and how mistakes speak of them."""
+    """The encoders of a session, their readings, and their names in messages."""
 
     given: Assumed
 
     @cached_property
     def legs(self) -> list[Leg]:
-        """Of each encoder the leg that it reads, or the first one that it moves."""
+        """The leg that each encoder reads, or the first leg that its motor moves."""
         return [self.given.machine.legs[j] for j in self.given.machine.motors]
 
     @property
@@ -313,28 +313,28 @@ class _Encoders:
 
     @property
     def turning(self) -> list[int]:
-        """Those that read angles."""
+        """Indices of encoders that read angles."""
         return [k for k, leg in enumerate(self.legs) if leg.reads_angle]
 
     @cached_property
     def zero_steps(self) -> Array:
-        """By how much zeros are moved in one step (n_encoders,) [m or rad]."""
+        """Step by which zeros are varied (n_encoders,) [m or rad]."""
         width = np.array([leg.travel[1] - leg.travel[0] for leg in self.legs])
         is_known = (width > 0.0) & np.isfinite(width)
         return np.where(is_known, width, np.ptp(self.q, axis=0)) / _ZEROS
 
     @property
     def moving(self) -> list[int]:
-        """Those that do not stand still: images can confirm their direction and their zero."""
+        """Indices of encoders that move: images can confirm their direction and their zero."""
         return np.flatnonzero(np.ptp(self.q, axis=0) > _STILL * self.zero_steps).tolist()
 
     @property
     def in_words(self) -> str:
-        """What all of them read, in words."""
+        """``legs`` or ``motors``, for messages."""
         return "legs" if self.move_legs_alone else "motors"
 
     def reading(self, q: Array, which: Sequence[int]) -> Assumed:
-        """Return what is true if some of them read something else (n_rows, n_some)."""
+        """Return the hypothesis that some encoders had other readings (n_rows, n_some)."""
         motors, changed = self.given.machine.motors, self.given.q.copy()
         changed[:, [motors[k] for k in which]] = q
         return replace(self.given, q=changed)
@@ -353,7 +353,7 @@ def _of_units(encoders: _Encoders) -> Iterator[Mistake]:
         yield Mistake(
             "unit",
             f"the readings{of} look like {unit}",
-            "taken so",
+            "interpreted that way",
             f"multiply these readings by {scale:g}",
             encoders.reading(scale * encoders.q[:, turning], turning),
         )
@@ -373,7 +373,7 @@ def _of_directions(encoders: _Encoders) -> Iterator[Mistake]:
         if which:
             yield Mistake(
                 "direction of encoders",
-                f"the readings of all {encoders.in_words} look as if they had {what}",
+                f"the readings of all {encoders.in_words} appear to have {what}",
                 "with the readings reversed",
                 "reverse them in the table of readings",
                 encoders.reading(reversed_q, encoders.every),
@@ -381,7 +381,7 @@ def _of_directions(encoders: _Encoders) -> Iterator[Mistake]:
         for k in (k for k in encoders.moving if k in which):
             yield Mistake(
                 "direction of an encoder",
-                f"column {encoders.names[k]} looks as if it had {what}",
+                f"column {encoders.names[k]} appears to have {what}",
                 "with the column reversed",
                 "reverse the column in the table of readings",
                 encoders.reading(reversed_q[:, k : k + 1], [k]),
@@ -389,7 +389,7 @@ def _of_directions(encoders: _Encoders) -> Iterator[Mistake]:
 
 
 def _of_zeros(encoders: _Encoders) -> Iterator[Mistake]:
-    """Yield readings from another zero, of one encoder or of all."""
+    """Yield wrong zeros of one encoder or of all."""
     are_alike = len(encoders.turning) in (0, len(encoders.legs))  # else no zero is common
     for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
         if are_alike:
@@ -399,12 +399,12 @@ def _of_zeros(encoders: _Encoders) -> Iterator[Mistake]:
 
 
 def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
-    """Return another zero of all encoders, by m steps."""
+    """Return a wrong zero of all encoders, by m steps."""
     step, is_angle = float(encoders.zero_steps.mean()), bool(encoders.turning)
     zeros = "the offsets" if encoders.move_legs_alone else "the zeros of motors"
     return Mistake(
         "zero of encoders",
-        f"the readings of all {encoders.in_words} look as if they had another zero: about "
+        f"the readings of all {encoders.in_words} appear to have a wrong zero: about "
         f"{_too_small(m, step, is_angle=is_angle)}",
         _with_that(m),
         f"correct the table of readings, or {zeros} in the model",
@@ -416,12 +416,12 @@ def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
 
 
 def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
-    """Return another zero of the k-th encoder, by m steps."""
+    """Return a wrong zero of the k-th encoder, by m steps."""
     step, name = float(encoders.zero_steps[k]), encoders.names[k]
     zero = f"the zero of {name}" if encoders.legs[k].actuator else "the offset of the leg"
     return Mistake(
         "zero of an encoder",
-        f"column {name} looks as if it had another zero: about "
+        f"column {name} appears to have a wrong zero: about "
         f"{_too_small(m, step, is_angle=k in encoders.turning)}",
         _with_that(m),
         f"correct the column in the table of readings, or {zero} in the model",
@@ -433,17 +433,17 @@ def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
 
 
 def _too_small(m: float, step: float, *, is_angle: bool) -> str:
-    """Return by how much readings are too small if m steps [m or rad] are missing, in words."""
+    """Return the error of readings that lack m steps [m or rad], in words."""
     amount, unit = (np.degrees(step), "deg") if is_angle else (1e3 * step, "mm")
     return f"{abs(m * amount):.0f} {unit} too {'small' if m > 0 else 'large'}"
 
 
 def _with_that(m: float) -> str:
-    return f"with that {'added' if m > 0 else 'taken off'}"
+    return f"after {'adding' if m > 0 else 'subtracting'} it"
 
 
 def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield images that are turned over, all or those of a view."""
+    """Yield images that are mirrored or upside down, all or those of a view."""
     views = data.measurements.views
     every = list(range(data.measurements.n_rows))
     for turn in TURNS:
@@ -457,7 +457,7 @@ def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 def turned_images(
     data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array
 ) -> Mistake:
-    """Return images of some rows of a view that are turned over, and others are not."""
+    """Return some images of a view that are turned over while the others are not."""
     m = data.measurements
     which = f" {_images(data, rows)} of view {m.views[m.view[rows[0]]].name}"
     one = _turned_over(data, given, rows, turn, which)
@@ -467,7 +467,7 @@ def turned_images(
 def moved_cameras(
     data: OrderedDataset, given: Assumed, views: Sequence[Sequence[Sequence[int]]]
 ) -> Mistake:
-    """Return images of some views that were taken from several places, by rows of each place."""
+    """Return images of some views taken from several positions, by the rows of each position."""
     m, place, things = data.measurements, given.place.copy(), _things(data)
     others, said = list[int](), list[str]()
     for places in views:
@@ -479,14 +479,14 @@ def moved_cameras(
                    for k, rows in enumerate(in_file)]  # fmt: skip
         what = "those" if said else f"the {things}"
         said.append(
-            f"{what} of view {m.views[m.view[places[0][0]]].name} look as if they were taken from "
-            f"{len(places)} places: {', '.join(of_each)}"
+            f"{what} of view {m.views[m.view[places[0][0]]].name} appear to be taken from "
+            f"{len(places)} camera positions: {', '.join(of_each)}"
         )
     return Mistake(
         "camera moved",
         ", and ".join(said),
-        "with a view for each place",
-        f"give the {things} of each place a view of their own (for legcal init a folder, or a "
+        "with a view for each position",
+        f"give the {things} of each position their own view (for legcal init a folder, or a "
         "column view)",
         replace(given, place=place),
         of_few=tuple(others),
@@ -494,12 +494,12 @@ def moved_cameras(
 
 
 def _things(data: OrderedDataset) -> str:
-    """Return what is seen of the machine, in words."""
+    """Return ``images`` or ``outlines``, whichever the dataset has."""
     return "images" if len(data.photographs.detect) else "outlines"
 
 
 def _images(data: OrderedDataset, rows: Sequence[int]) -> str:
-    """Return images as a sentence names them: the first of them in the file, and how many more."""
+    """Return the name of the first of some images in the file, and the number of others."""
     in_file = sorted(data.order.rows[list(rows)].tolist())
     return f"{row_names(data.dataset.measurements)[in_file[0]]} and {len(rows) - 1} more"
 
@@ -510,12 +510,12 @@ def _turned_over(
     kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
     flip[list(rows)] *= turn
-    things, remedy = _things(data), "replace these images by the originals"
+    things, remedy = _things(data), "replace these images with the originals"
     if things == "outlines":
-        remedy = "correct the direction of an axis of their table"
+        remedy = "correct the sign of a coordinate in their table"
     return Mistake(
         kind,
-        f"the {things}{which} look {what}",
+        f"the {things}{which} appear to be {what}",
         f"with the {things} turned back",
         remedy,
         replace(given, flip=flip),
@@ -524,7 +524,7 @@ def _turned_over(
 
 
 def _of_model(given: Assumed) -> Iterator[Mistake]:
-    """Yield joints in other places: those of a left-handed table."""
+    """Yield a model made from a left-handed table of joints."""
     machine = given.machine
     mirrored = replace(
         machine,
@@ -533,16 +533,16 @@ def _of_model(given: Assumed) -> Iterator[Mistake]:
     )
     yield Mistake(
         "handedness",
-        "the joints of the model look mirrored: the y axis of their table points the other way",
-        "with the signs of y reversed",
-        "reverse the signs of all y in the model",
+        "the model appears to be mirrored: the y coordinates of its joints have the wrong sign",
+        "with the sign of y reversed",
+        "reverse the sign of all y in the model",
         replace(given, machine=mirrored),
-        test="compare the signs of y in the model with where the legs stand in a picture",
+        test="compare the signs of y in the model with the positions of the legs in a photograph",
     )
 
 
 def _mirrored(leg: Leg) -> Leg:
-    """Return a leg whose joints and axes have y reversed; what turned one way turns the other."""
+    """Return a leg with y of joints and axes reversed, and rotations too."""
     base, platform = (
         None if axis is None else _MIRROR @ axis for axis in (leg.base_axis, leg.platform_axis)
     )
@@ -554,7 +554,7 @@ def _mirrored(leg: Leg) -> Leg:
 
 
 def _of_radii(given: Assumed) -> Iterator[Mistake]:
-    """Yield diameters in place of radii: of all parts, or of those that are equally thick."""
+    """Yield diameters in place of radii: of all parts, or of all equally thick parts."""
     machine = given.machine
     radii = sorted({c.radius for leg in machine.legs for c in leg.cylinders})
     kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
@@ -565,13 +565,12 @@ def _of_radii(given: Assumed) -> Iterator[Mistake]:
 
         return replace(given, machine=machine.with_radii(lambda _, c: radius(c.radius)))
 
-    which = [(None, "the radii", "they are"),
-             *((r, f"the radius {1e3 * r:g} mm", "it is") for r in kinds[:2])]  # fmt: skip
-    for only, name, they_are in which[: 1 if len(kinds) < 2 else None]:
+    which = [(None, "the radii"), *((r, f"the radius {1e3 * r:g} mm") for r in kinds[:2])]
+    for only, name in which[: 1 if len(kinds) < 2 else None]:
         yield Mistake(
             "diameter for radius",
-            f"{name} of the legs in the model look{'s' * (only is not None)} twice as large as "
-            f"{they_are}: a diameter in place of a radius",
+            f"{name} of the legs in the model appear{'s' * (only is not None)} to be twice too "
+            "large: a diameter in place of a radius",
             f"with {name} halved",
             "correct the <visual> cylinders of the model",
             halved(only),
@@ -586,10 +585,10 @@ def _of_cameras(given: Assumed) -> Iterator[Mistake]:
 def _focal_length(given: Assumed, factor: float) -> Mistake:
     return Mistake(
         "focal length",
-        f"the focal length looks as if it were {factor:.2g} times the stated one: images that were "
-        "scaled or cropped after the camera was calibrated, or another zoom",
+        f"the focal length appears to be {factor:.2g} times the stated one: images were scaled or "
+        "cropped after the camera was calibrated, or the zoom is different",
         "with that focal length",
-        "calibrate the camera with images as these are (legcal camera)",
+        "calibrate the camera with unscaled images at the same zoom as these (legcal camera)",
         replace(given, focal=factor * given.focal),
         amount_of="focal length",
         finer=lambda more: _focal_length(given, factor * _FOCAL_STEP**more),

@@ -319,7 +319,7 @@ def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]
         ]
         for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
             legs = tuple(sorted((*predicted.views[v], *added)))
-            text = f"see {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
+            text = f"show {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
             wider = _widened(predicted, v, legs)
             yield text, partial(_score_with_more, analysis, wider, np.arange(len(predicted.t)))
 
@@ -344,10 +344,10 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a calibration board on the base, and one on the platform."""
     if analysis.predicted.n_frames > 1:
-        text = "put a calibration board on the base that every camera sees"
+        text = "put a calibration board on the base, visible to every camera"
         yield text, lambda: _score(analysis.with_board())
     if not analysis.predicted.platform_board.any():
-        text = "put a calibration board on the platform that every camera sees"
+        text = "put a calibration board on the platform, visible to every camera"
         yield text, lambda: _score(analysis.with_board(link="platform"))
 
 

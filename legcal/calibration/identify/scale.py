@@ -171,20 +171,20 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
         sources = tuple(source for source in sources if source.source == "length")
     fixing = [source.assumed for source in sources if source.sigma is not None]
     options = ", or ".join(fixing or [source.assumed for source in sources])
-    reason, fix_gain = "readings of arms carry no length", ""
+    reason, fix_gain = "readings of arms are angles", ""
     if machine.readings_carry_length:  # but for gains
         reason, fix_gain = (
             "the gains of all motors that slide are free",
             "fix one of these gains, or ",
         )
     if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
-        reason += f", and the stated values fix the scale no better than {100 * _VAGUE:g} %"
+        reason += f", and the stated values determine the scale no better than {100 * _VAGUE:g} %"
     stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:
         stated += (
             ", or radii that you know better than the model (--set '*.radius.*=VALUE±SIGMAmm')"
         )
     return (
-        f"{dataset.folder}: the parameters cannot be identified: {reason}, so that the scale of "
-        f"machine, rods and cameras is open; these would fix it: {options}; {fix_gain}{stated}."
+        f"{dataset.folder}: the parameters cannot be identified: {reason}, so the overall scale is "
+        f"undetermined; any of these would determine it: {options}; {fix_gain}{stated}."
     )

@@ -73,15 +73,15 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         _, harmless = split_by_motion(motion, weak_basis, length, HARMLESS)
     if len(basis) and unseen:
         raise NotIdentifiable(
-            f"The fit is not determined: no measurement depends on {', '.join(unseen)}; every leg "
-            "needs readings or outlines; add images that show it."
+            f"The fit is not determined: no measurement depends on {', '.join(unseen)}. Every leg "
+            "needs readings or outlines: add images that show it."
         )
     if len(basis):
         description = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
         raise NotIdentifiable(
-            f"The fit is not determined: the measurements do not fix {len(basis)} of {len(names)} "
-            f"directions of the parameters to a tenth of a leg length: {description}; {_REMEDY}, "
-            "or state known values with a prior."
+            f"The fit is not determined: {len(basis)} of {len(names)} combinations of parameters "
+            f"are uncertain by more than a tenth of a leg length: {description}; {_REMEDY}, or "
+            "state known values with a prior."
         )
     weak: tuple[str, ...] = ()
     if len(
@@ -123,13 +123,12 @@ def refuse_undetermined_inliers(
         description = _in_words(names, eigenvector[:, is_open[0]], problem.legs.names)
         if accepted.all():
             raise NotIdentifiable(
-                "The fit is not determined: at its minimum, the measurements do not fix "
-                f"{description} to a tenth of a leg length; {_REMEDY}, or state known values "
-                "with a prior."
+                f"The fit is not determined: at its minimum, {description} is uncertain by more "
+                f"than a tenth of a leg length; {_REMEDY}, or state known values with a prior."
             )
         raise NotIdentifiable(
-            "The fit is not determined: without the rejected outlines, the measurements do not fix "
-            f"{description}; correct the rejected outlines, or add images."
+            f"The fit is not determined: without the rejected outlines, {description} is not "
+            "determined; correct the rejected outlines, or add images."
         )
 
 

@@ -78,8 +78,8 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
             problems.append(
                 f"The prior of {problem.named[i]} contradicts the measurements: prior {mean:.6g} "
                 f"+- {sigma:.2g} {unit}, measurements about {estimate.value:.4g} {unit}, "
-                f"{estimate.apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are "
-                "accepted; correct the prior or leave it out."
+                f"{estimate.apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct "
+                "or remove the prior."
             )
     if problems:
         raise DidNotConverge(problems)
@@ -114,15 +114,15 @@ def _refuse_other_size(
         choices = replace(problem.choices, free=problem.choices.free | {name})
         try:
             refitted = first_minimum(problem.with_choices(choices), state)
-            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times as large as"
+            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times the size"
         except (DidNotConverge, NotIdentifiable):
-            size = "of another size than"
+            size = "not of the size"
         board = "" if link == "base" else f" on the {link}"
         raise DidNotConverge(
-            f"The calibration board{board} does not fit the readings and the legs: it is {size} "
-            f"the dataset says ({estimate.apart:.0f} standard deviations off; assumed accuracy "
-            f"{1e2 * sigma:.2g} %); measure the board and correct its dimensions in dataset.yaml, "
-            f"or estimate them (--set {name}=free)."
+            f"The dimensions of the calibration board{board} contradict the readings and the legs: "
+            f"the board is {size} stated in the dataset ({estimate.apart:.0f} standard deviations; "
+            f"assumed accuracy {1e2 * sigma:.2g} %); measure the board and correct its dimensions "
+            f"in dataset.yaml, or estimate them (--set {name}=free)."
         )
 
 
@@ -173,8 +173,8 @@ class _Comparison:
         return (
             f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
             f"measurements: stated {stated}, measured about {self.found:.4g} {self.unit}, "
-            f"{apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are accepted; "
-            f"correct it, {'' if self.sigma else 'give it a prior, '}or let it free."
+            f"{apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct it, "
+            f"{'' if self.sigma else 'give it a prior, '}or free it (--set {self.name}=free)."
         )
 
 
@@ -361,10 +361,11 @@ class DoubtedCamera:
     def __str__(self) -> str:
         unit = f" {intrinsic_unit(self.key)}".rstrip()
         return (
-            f"The camera of {self.view} does not agree with its covariance: the measurements move "
-            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to {self.found:.6g}{unit},"
-            f" {self.apart:.0f} standard deviations of such a change; the stated uncertainty does "
-            "not include this error; calibrate the camera again at the same focus and zoom."
+            f"The camera of {self.view} does not agree with its covariance: the fit moves "
+            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to "
+            f"{self.found:.6g}{unit}, {self.apart:.0f} times the expected change; the stated "
+            "uncertainty does not include this error; calibrate the camera again at the same focus "
+            "and zoom."
         )
 
 
@@ -418,7 +419,7 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     note = (
         f"The fit rejected {n_rejected} of {n} outlines"
         f"{', ' + ', '.join(groups) if groups else ''}; the stated uncertainty is valid only if "
-        "these are wrong; check them and the reasons in the table of observations"
+        "these outlines are wrong; check them and their reasons in observations.csv"
     )
     stated = [
         name
@@ -460,9 +461,7 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
         of_leg = is_arm & (outlines.leg == leg)
         n_wrong, total = int(is_wide[of_leg].sum()), int((is_wide | outlines.used)[of_leg].sum())
         if n_wrong >= _MIN_COUNT and n_wrong > _MOST_REJECTED * total:
-            reasons[leg] = (
-                f"{n_wrong} of whose {total} outlines show another width than the model's"
-            )
+            reasons[leg] = f"{n_wrong} of {total} outlines have another width than the model's"
     return reasons
 
 
@@ -472,11 +471,11 @@ def wrong_arms_in_words(wrong: Mapping[int, str], legs: Sequence[Leg]) -> str:
     for j, reason in wrong.items():
         reasons.setdefault(reason, []).append(str(legs[j].prismatic))
     description = "; ".join(
-        f"{list_in_words(names)}, {reason}" for reason, names in reasons.items()
+        f"{list_in_words(names)} ({reason})" for reason, names in reasons.items()
     )
     return (
-        f"the arms of {description}; they are not the straight cylinders of the model; correct "
-        "their radii, or model other shapes as boxes or meshes."
+        f"the arms of {description}. They are not the cylinders of the model: correct their radii, "
+        "or model other shapes as boxes or meshes."
     )
 
 
@@ -495,9 +494,9 @@ def wrong_arms(
         of_arm = o.on_arm & (o.leg == leg)
         total, rejected = int(of_arm.sum()), int(np.sum(of_arm & ~used))
         if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * total:
-            reasons[leg] = f"{rejected} of whose {total} outlines disagree with the fit"
+            reasons[leg] = f"{rejected} of {total} outlines disagree with the fit"
         elif times > ARM_MISFIT and offset_px > _ARM_MISFIT_PX:
-            reasons[leg] = f"whose outlines lie {times:.1f} times as far off as those of rods"
+            reasons[leg] = f"errors of outlines are {times:.1f} times as large as for rods"
     return reasons
 
 
@@ -529,9 +528,9 @@ def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
     if not names:
         return ()
     return (
-        f"The readings of {list_in_words(names)} have the opposite sign in the model: the fitted "
-        "axes or directions are reversed; correct them in the model, or negate the readings (for a "
-        "servo, the sign of us_per_deg).",
+        f"The readings of {list_in_words(names)} have the opposite sign in the model (the fitted "
+        "axes or directions are reversed); correct them in the model, or negate the readings (for "
+        "a servo, the sign of us_per_deg).",
     )
 
 
@@ -557,9 +556,8 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     if not contradictions:
         return []
     return [
-        f"The measurements contradict radii of the model: {'; '.join(contradictions)}; at most "
-        f"{RADIUS_SIGMAS:g} standard deviations are expected; measure these parts and correct the "
-        "model."
+        f"The measurements contradict radii of the model: {'; '.join(contradictions)}; limit "
+        f"{RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
     ]
 
 

@@ -154,7 +154,7 @@ def _fit_without_wrong_arms(
             with_arms = np.unique(outlines.leg[is_arm & outlines.used]).tolist()
             if not with_arms:
                 raise
-            wrong = dict.fromkeys(with_arms, "with whose outlines the joint fit fails")
+            wrong = dict.fromkeys(with_arms, "the joint fit fails when their outlines are used")
         else:
             if not wrong:
                 return dataclasses.replace(solution, notes=(*notes, *solution.notes))
@@ -183,7 +183,7 @@ def _fit_from_best_start(
             continue
         if len(starts) > 1:
             cost = f"{minimum.cost:.6g}"
-            details.append(f"From {origin}, the joint fit reached a cost of {cost}.")
+            details.append(f"Starting from {origin}, the joint fit reached a cost of {cost}.")
         bound_of_ties = (1.0 + _COST_TOLERANCE) * minimum.cost
         rank = sum(other.cost <= bound_of_ties for _, other in candidates)
         candidates.insert(rank, (start, minimum))
@@ -256,9 +256,9 @@ def _refuse_common_mode(solution: Solution, most_px: float) -> None:
     if shifted > most_px:
         kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
         raise DidNotConverge(
-            f"The joint fit ended with a common-mode error of outlines ({kind}) of {shifted:.1f} "
-            f"px, more than the {most_px:g} px that light and blur can explain; check camera "
-            "poses, readings and outlines, or start nearer to the truth."
+            f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
+            f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or start "
+            "from a better nominal model."
         )
 
 

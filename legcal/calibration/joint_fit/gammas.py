@@ -121,7 +121,7 @@ class GammaTrials:
             self.cameras, self.log_gamma.T, self.likelihoods.T, strict=True
         ):
             if views[0] in refused:
-                why = f"fewer of its outlines are usable with {refused[views[0]]:.2f}"
+                why = f"with {refused[views[0]]:.2f}, fewer of its outlines are usable"
             elif np.isfinite(merit).sum() == 1 < len(merit):
                 why = "the fit failed with every other gamma"
             elif (rival := _rival(tried, merit)) is not None:
@@ -129,9 +129,9 @@ class GammaTrials:
             else:
                 continue
             notes.append(
-                f"The gamma of the camera of {few_views(views)} is undecided: {why}; processing in "
-                "the camera is a common cause; write gamma of the views in dataset.yaml if you "
-                "know it, or switch the processing off."
+                f"The gamma of the camera of {few_views(views)} could not be determined: {why}; "
+                "in-camera processing is a common cause; state gamma of the views in dataset.yaml, "
+                "or switch the processing off."
             )
         return tuple(notes)
 

@@ -179,14 +179,14 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
     reading, was = ("readings", "were") if n > 1 else ("reading", "was")
     return (
         f"{n} {reading} of redundant motors contradict{'s' * (n == 1)} all other measurements and "
-        f"{was} left out: {listed}; check {'them' if n > 1 else 'it'}.",
+        f"{was} rejected: {listed}; check {'them' if n > 1 else 'it'}.",
     )
 
 
 def _in_words(wrong: WrongReading) -> str:
     """Motor, image and error of a rejected reading, in words."""
     scale, unit = SHOWN_IN[wrong.unit]
-    alternatives = f" (or as likely one of {', '.join(wrong.alike)})" if wrong.alike else ""
+    alternatives = f" (or {' or '.join(wrong.alike)}, equally likely)" if wrong.alike else ""
     place = f"{wrong.view}, image {wrong.image}"
     return f"{wrong.motor}{alternatives} in {place} by {scale * wrong.off:+.3g} {unit}"
 
@@ -213,7 +213,7 @@ def _doubts(
             worst = max(of_motor, key=lambda reading: abs(reading.off))
             doubts.append(
                 f"{len(of_motor)} of {n} readings of {legs[leg].motor_label} contradict the other "
-                f"measurements, most of all {_in_words(worst)}; this is not an accident; check the "
+                f"measurements, most of all {_in_words(worst)}: too many to be random; check the "
                 "scale, zero and slip of that motor"
             )
     undecided = list[str]()
@@ -226,7 +226,7 @@ def _doubts(
     if undecided:
         doubts.append(
             f"the readings of {few(undecided)} contradict each other, and the measurements do not "
-            "show which motor is wrong; check them, or remove the images"
+            "determine which motor is wrong; check them, or remove the images"
         )
     expected_squares, squares = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if squares > expected_squares + _SIGNIFICANT * np.sqrt(2.0 * expected_squares):
@@ -316,7 +316,7 @@ def _best_scale(problem: FitProblem, linear: Linearization, normal: NormalEquati
     best = int(order[0])
     labels = few([legs[motors[i]].motor_label for i in equal.tolist()])
     if len(equal) > 1:
-        return f"and the scales of {labels} explain it equally well"
+        return f"and scale errors of {labels} explain it equally well"
     return (
         f"and a scale error of {labels} of {100 * score[best] / K[best]:+.2g} % explains most of it"
     )

@@ -252,7 +252,7 @@ def _no_parameters(machine: Machine) -> dict[str, str]:
                 others[name] = (
                     f"a coordinate that is zero by the definition of {frame}"
                     if is_zero
-                    else "a coordinate on which nothing depends"
+                    else "a coordinate that has no effect"
                 )
         angles = ("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist")
         names = [f"{leg.name}.{angle}" for angle in angles]
@@ -269,7 +269,7 @@ def _other_lengths(leg: Leg) -> dict[str, str]:
         return {offset: f"a leg of constant length, whose parameter is {length}"}
     if leg.kind is LegKind.ACTUATED:
         return {length: f"a leg with an encoder, whose parameter is {offset}"}
-    reason = "a leg without an encoder, whose length is whatever the platform makes it"
+    reason = "a leg without an encoder, whose length is passive"
     return {offset: reason, length: reason}
 
 
@@ -306,7 +306,7 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
     if all(choices.holds(n, by_default=is_held_by_default(n)) for n in names):
         raise UsageError(
-            "The mechanism could not be calibrated: all of its parameters are fixed; fix fewer of "
+            "All parameters of the mechanism are fixed: nothing is left to calibrate; fix fewer of "
             "them."
         )
     return choices
@@ -415,16 +415,15 @@ def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
         if ":" not in override.name or lengths[1] <= _MEASURED_RATIO * lengths[0]:
             return ""
         return (
-            f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} "
-            f"between joints that the model has {_with_unit(parameter.nominal, parameter)} apart, "
-            f"needed a distance within {100.0 * (_MEASURED_RATIO - 1.0):.0f} % of that; check the "
-            "number, its unit and between which joints it was measured, or correct the model."
+            f"{override.where} could not be used: {_with_unit(stated.value, parameter)} differs by "
+            f"more than {100.0 * (_MEASURED_RATIO - 1.0):.0f} % from the distance of these joints "
+            f"in the model, {_with_unit(parameter.nominal, parameter)}; check the number, its unit "
+            "and between which joints it was measured, or correct the model."
         )
     return (
-        f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} for "
-        f"{name}, needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far "
-        f"from the nominal {_with_unit(parameter.nominal, parameter)}; check the number and its "
-        "unit."
+        f"{override.where} could not be used: {_with_unit(stated.value, parameter)} for {name} is "
+        f"implausible (nominal {_with_unit(parameter.nominal, parameter)}, accepted "
+        f"{parameter.least:.4g} to {parameter.most:.4g}); check the number and its unit."
     )
 
 
@@ -456,8 +455,8 @@ def _contradiction(
     other = next((w.name for w in pair if w.name in known.synonyms), "")
     also = f", which is {other} too," if other else ""  # views that have one camera
     return (
-        f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, "
-        "needed one of them; remove the other."
+        f"{name}{also} could not be {done}: {_quoted(pair[0])} and {_quoted(pair[1])} are in "
+        "conflict; keep one of them."
     )
 
 

@@ -397,8 +397,8 @@ def _refuse_disagreement(fit: Fit) -> None:
     if 2 * n_accepted < n or rms > most_px:
         raise DidNotConverge(
             f"The joint fit ended with {n - n_accepted} of {n} outlines rejected and an error of "
-            f"{rms:.1f} px (rms) of the others; most must agree, to {most_px:g} px; check camera "
-            "poses, readings and outlines."
+            f"{rms:.1f} px (rms) of the others; more than half must agree within {most_px:g} px. "
+            "Check camera poses, readings and outlines."
         )
 
 
@@ -409,8 +409,8 @@ def _refuse_wrong_axes(fit: Fit) -> None:
     if 2 * wrong > n:
         raise DidNotConverge(
             f"The joint fit ended with errors of {wrong} of {n} axes above {most:g} standard "
-            "deviations; most must agree; check the camera poses, the readings, and the units "
-            "(rad, m) of axes and their sigmas."
+            "deviations; more than half must agree. Check the camera poses, the readings, and the "
+            "units (rad, m) of axes and their sigmas."
         )
 
 
@@ -440,9 +440,9 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
             board_name = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
                 f"The joint fit ended with an error of {rms:.1f} px (rms) of the corners of the "
-                f"calibration board{board_name}; most must agree to {settings.largest_rms_px:g} "
-                "px; check that the board did not move on its link, its dimensions, and the "
-                "camera files."
+                f"calibration board{board_name}; most must agree within "
+                f"{settings.largest_rms_px:g} px. Check that the board did not move on its link, "
+                "its dimensions, and the camera files."
             )
     return judged
 
@@ -517,9 +517,9 @@ def check_convergence(
     before, after = unit * changes.before, unit * changes.after
     i = int(np.argmax(np.abs(after - before)))
     last_change = (
-        f"the last round accepted or rejected {changes.n_changed} outlines anew, with "
-        f"{changes.n_accepted} accepted, and changed the standard deviation of one kind of error "
-        f"from {before[i]:.3f} px to {after[i]:.3f} px"
+        f"in the last round, {changes.n_changed} outlines were newly accepted or rejected "
+        f"({changes.n_accepted} are accepted), and one standard deviation of errors changed from "
+        f"{before[i]:.3f} px to {after[i]:.3f} px"
     )
     largest = max(float(before.max()), float(after.max()))
     most_changed = _MAX_CHANGED * changes.n_accepted
