@@ -37,7 +37,7 @@ from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
@@ -233,7 +233,7 @@ def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
     problem = build_fit(*everything, choices=Choices(fixed=known))
     state = problem.begin(session.truth)
     linear = linearize(problem, state)
-    held = open_directions(problem, state, information(problem, state, linear))
+    held = undetermined_directions(problem, state, information(problem, state, linear))
     assert len(held.directions) == ranks.of - ranks.rank
     assert set(held.names) == open_to_identify
 

@@ -32,7 +32,7 @@ from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
-from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
+from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.poses import candidate_poses as draw_poses
@@ -42,7 +42,7 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
-FEW = replace(usual_setting(load_mechanism("3-rpr").size), draws=3)
+FEW = replace(default_setting(load_mechanism("3-rpr").size), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 

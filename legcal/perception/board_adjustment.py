@@ -59,7 +59,7 @@ class BoardImages:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """How a board departs from a flat one whose squares are square.
+    """Deviations of a board from a flat one with square fields.
 
     With X and Y from -1 to 1 over its corners, a corner lies warp_x (1 - X^2) + warp_y (1 - Y^2) +
     twist X Y above the plane, and lengths along x are 1 + print_ratio times those along y.
@@ -82,7 +82,7 @@ class Sheet:
         return np.array([warp, warp, warp, SIGMA_PRINT_RATIO])
 
     def placed(self, points: Array) -> tuple[Array, Array]:
-        """Return where corners (n, 3) of a flat board lie, and the derivative (n, 3, 4)."""
+        """Return positions of corners (n, 3) of a flat board, and their derivative (n, 3, 4)."""
         from_middle = points[:, :2] - self.middle
         X, Y = (from_middle / self.half).T
         by_number = np.zeros((len(points), 3, len(SHEET)))
@@ -107,7 +107,7 @@ class AdjustedBoard:
     information: Array
 
     def rms_px(self, which: BoolArray | None = None) -> float:
-        """How far corners (of all (n,) or some) are from where they should be seen (rms) [px]."""
+        """Reprojection error (rms) of corners, of all (n,) or some [px]."""
         residual = self.residual if which is None else self.residual[which]
         return float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 

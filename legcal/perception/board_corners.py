@@ -43,7 +43,7 @@ _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """What an image shows of a board.
+    """The corners of a board in an image.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def search_board(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> SeenBoard:
-    """Return what an image shows of a board; of a chessboard of any extent."""
+    """Detect a board in an image; a chessboard of any extent."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
     tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if board.kind == "chessboard":
@@ -203,7 +203,7 @@ def _usual_blur(found: Saddles) -> float:
 
 
 def _without_loose_lines(ij: IntArray) -> BoolArray:
-    """Return which corners of a lattice stay when outer lines of few of them are left out."""
+    """Return the mask of corners of a lattice without sparse outer lines."""
     kept = np.ones(len(ij), dtype=np.bool_)
     while kept.any():
         for axis, end in ((0, -1), (0, 1), (1, -1), (1, 1)):
@@ -219,7 +219,7 @@ def _without_loose_lines(ij: IntArray) -> BoolArray:
 
 
 def _print(board: Board) -> Print:
-    """Return how the corners of a board with markers or tags lie on it [m]."""
+    """Return the positions of the corners of a board with markers or tags [m]."""
     nx, ny = board.grid
     points = board.points.reshape(ny, nx, 3)
     x, y = points[0, :, 0], points[:, 0, 1]
@@ -272,7 +272,7 @@ def _tags_and_corners(
 
 
 def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
-    """Return how markers are searched in turn: scale, whether sharpened, windows."""
+    """Return the settings by which markers are searched in turn: scale, sharpening, windows."""
     wanted = (
         (1.0, _MARKERS_SEARCHED, False, _WINDOW),
         (1.0, _MARKERS_SEARCHED, True, _BLURRED_WINDOW),
@@ -367,7 +367,7 @@ def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _quarter_turns() -> int:
-    """Return how far OpenCV's tags are turned against Kalibr's, in quarter turns clockwise.
+    """Return the rotation of OpenCV's tags against Kalibr's, in quarter turns clockwise.
 
     OpenCV lists the corners of a tag clockwise from the top left of its own picture of it.
     """
@@ -494,7 +494,7 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
 
 
 def _smaller(board: Board, found: str, n_images: str, taken: str = "") -> str:
-    """Return what is said where a smaller board is seen than was stated."""
+    """Return a note for a detected board that is smaller than stated."""
     return (
         f"{found[0].upper()}{found[1:]} or that part of one is seen in {n_images}, and the whole "
         f"of {board_in_words(board)} in none{taken}; correct --board, or uncover the board."
@@ -542,7 +542,7 @@ def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | Non
 
 
 def _n_tags(board: Board) -> int:
-    """Return how many tags or markers a board has."""
+    """Return the number of tags or markers of a board."""
     count = board.columns * board.rows
     return count if board.kind == "aprilgrid" else count // 2
 
@@ -558,7 +558,7 @@ def _middles(board: Board, columns: int, parity: int, tags: IntArray) -> Array:
 
 
 def _mislaid(board: Board, columns: int, parity: int, seen: SeenBoard) -> float:
-    """Return how far tags are off if they lie in so many columns (rms), by the step to the next."""
+    """Return the misfit (rms) of tags in a number of columns, over the distance of tags."""
     at = _middles(board, columns, parity, seen.tags)
     with quiet_opencv():
         H, _ = cv2.findHomography(at, seen.tags_px)
@@ -588,7 +588,7 @@ def _turned_as(board: Board, extent: tuple[int, int]) -> tuple[int, int]:
 
 
 def _squares(board: Board, extent: tuple[int, int]) -> str:
-    """Return which chessboard has so many corners, turned as the board is."""
+    """Return the chessboard with these numbers of corners, turned as the board is."""
     x, y = _turned_as(board, extent)
     return f"a chessboard of {x + 1} x {y + 1} squares"
 
@@ -597,7 +597,7 @@ def describe_image(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> str | None:
-    """Return what an image shows instead of a board, in words that go after "found"."""
+    """Describe what an image shows instead of the board."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
     if board.kind != "chessboard" and (markers := _other_markers(board, grey)):
         return markers
@@ -626,7 +626,7 @@ def tags_are_mirrored(
 
 
 def _other_markers(board: Board, grey: Grey) -> str | None:
-    """Return which markers or tags are seen."""
+    """Return the numbers of the detected markers or tags."""
     thing = _things(board)
     own = _n_tags(board)
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)

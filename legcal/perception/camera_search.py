@@ -62,7 +62,7 @@ UPSIDE_DOWN = np.array([-1.0, -1.0])
 
 
 class EdgeStep(NamedTuple):
-    """How poses are moved to edges."""
+    """Settings by which poses are moved to edges."""
 
     blur: float  # how far edges count [cells of half the size, or of the maps]
     turn: float  # by which poses are turned, one standard deviation [deg]
@@ -102,7 +102,7 @@ class PoseCandidates:
 
     @property
     def needed(self) -> float:
-        """How many legs must match in a picture on average for a pose to be accepted."""
+        """Mean number of legs per image that must match for a pose to be accepted."""
         n = self.support.shape[1]
         alone = not self.hinted and self._leads(LONE_LEAD)
         share = LONE_SUPPORT if alone else SUPPORT
@@ -154,7 +154,7 @@ class PoseCandidates:
         return float(self.support[0].sum()) / expected if expected else 0.0
 
     def _leads(self, enough: tuple[float, float]) -> bool:
-        """Say whether the first pose leads by so many legs and such a part of its score."""
+        """Return whether the first pose leads by a number of legs and a part of its score."""
         legs, part = enough
         return self.lead >= max(legs, part * float(self.score[0]))
 
@@ -376,7 +376,7 @@ def _different(
 
 
 def _one_leg(pairs: Array) -> BoolArray:
-    """Return which pairs (n, n) may be of one leg: they continue each other or overlap.
+    """Return the mask of pairs (n, n) that may be of one leg: they continue or overlap.
 
     Pairs (n, 9) are as in :class:`legcal.perception.pair_matching.Pictures`.
     """
@@ -434,7 +434,7 @@ def refined(
 
 
 def scores(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Array:
-    """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
+    """Return the number of legs that agree with each pose in all images together, (n_poses,)."""
     found = match_pairs(pictures, poses, tolerance).exclusive_score
     return np.asarray(_by_legs(pictures, found).sum(axis=0))
 
@@ -455,7 +455,7 @@ def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
 
 
 def _near(poses: CameraPoses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
-    """Return which of some poses are within an angle and a part of the distance of pose i."""
+    """Return the mask of poses within an angle and a part of the distance of pose i."""
     trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
     # Where the camera stands in the base link.
@@ -490,12 +490,12 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 
 def may_be_mirrored(own: PoseCandidates) -> bool:
-    """Say whether a placed view needs to be compared with its mirror image."""
+    """Return whether a placed view needs to be compared with its mirror image."""
     return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
 
 
 def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
-    """Say whether mirrored pictures explain a view better than its own ones do.
+    """Return whether mirrored images explain a view better than the original ones.
 
     Those of a machine with a plane of symmetry, as all planar ones, explain it about as well.
     """

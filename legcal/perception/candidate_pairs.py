@@ -83,14 +83,14 @@ def reduction(camera: Camera, part: float) -> int:
 
 
 class Still(NamedTuple):
-    """What stands still in reduced pictures of one view."""
+    """The static background in reduced images of one view."""
 
     picture: Grey
     noise: float  # by which most pixels of pictures differ from it [grey levels]
 
 
 def still_picture(pictures: Sequence[Grey]) -> Still | None:
-    """Return what stands still in reduced pictures of one view; None where they are few.
+    """Return the static background in reduced images of one view; None if they are few.
 
     Legs are somewhere else in most pictures.
     """
@@ -102,7 +102,7 @@ def still_picture(pictures: Sequence[Grey]) -> Still | None:
 
 
 def _differs(picture: Grey, still: Still) -> BoolArray:
-    """Return which pixels of a picture are not those of what stands still."""
+    """Return the mask of pixels of an image that differ from the background."""
     least = max(NOISE_FACTOR * still.noise, DIFFERS * float(still.picture.max()))
     return np.asarray(np.abs(picture - still.picture) > least)
 
@@ -114,7 +114,7 @@ def moving_pixels(picture: Grey, still: Still) -> Image:
 
 
 def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
-    """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
+    """Return the mask of pieces (n, 2, 2) mostly where an image differs from the background."""
     differs = moving_pixels(picture, still)
     share = np.linspace(0.0, 1.0, N_ALONG)[:, None]
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
@@ -184,7 +184,7 @@ def _middle(values: Image) -> float:
 
 
 def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray:
-    """Return which chain each edge pixel (n,) belongs to: neighbours in a sector of directions.
+    """Return the chain of each edge pixel (n,): neighbours in a sector of directions.
 
     Sectors are laid twice, the second time between the first ones: a pixel takes the longer chain.
     """
@@ -208,7 +208,7 @@ def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray
 
 
 def _components(i: IntArray, j: IntArray, n: int) -> IntArray:
-    """Return which connected component each of n nodes is in, by links from i to greater j."""
+    """Return the connected component of each of n nodes, by links from i to greater j."""
     label: IntArray = np.arange(n)
     while len(i):  # each round at least halves what still has links to others
         above: IntArray = np.arange(n)
@@ -291,7 +291,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
 
 
 def _first_of(values: Array, value: Array, first: IntArray, n: IntArray) -> IntArray:
-    """Return where each group of n values from a first one on has its value for the first time."""
+    """Return the index of the first occurrence of each value within its group."""
     at = np.flatnonzero(values == np.repeat(value, n))
     return at[np.searchsorted(at, first)]
 
@@ -485,7 +485,7 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int) -> IntArray:
 
 
 def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
-    """Return which pairs (n,), best first, do not lie within better ones of the same width."""
+    """Return the mask of pairs (n,), best first, not within better ones of the same width."""
     along = stop - start
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]

@@ -112,7 +112,7 @@ def _candidates(grey: Grey) -> tuple[Array, Array, Array]:
 
 
 def _summit(strength: Grey, row: IntArray, column: IntArray) -> Array:
-    """Return where between pixels peaks are, (n, 2) less the pixels, by parabolas."""
+    """Return the subpixel offsets of peaks, (n, 2), by parabolas."""
     height, width = strength.shape
     found = []
     for dr, dc, size, at in ((0, 1, width, column), (1, 0, height, row)):
@@ -247,7 +247,7 @@ _MAX_ROUNDS = 40  # of corners beside those that are known
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """How corners lie on a board, by columns and rows.
+    """Lattice of corners of a board, by columns and rows.
 
     Attributes
     ----------
@@ -272,7 +272,7 @@ class Print:
         return np.column_stack([self.x[ij[:, 0]], self.y[ij[:, 1]]])
 
     def has(self, ij: IntArray) -> BoolArray:
-        """Say which columns and rows (k, 2) there are."""
+        """Return the mask of existing columns and rows (k, 2)."""
         if self.x is None or self.y is None:
             return np.ones(len(ij), dtype=np.bool_)
         return np.asarray(np.all((ij >= 0) & (ij < [len(self.x), len(self.y)]), axis=1))
@@ -281,7 +281,7 @@ class Print:
 def expected(
     xy: Array, px: Array, at: Array, pitch: float, *, without_own: bool = False
 ) -> tuple[Array, Array]:
-    """Return where places *at* (k, 2) of a board are in the image, by others nearby.
+    """Predict the image positions of columns and rows *at* (k, 2) by their neighbours.
 
     Returns px (k, 2) and the steps in the image along x and y, (k, 2, 2) [px / unit].
     ``without_own`` leaves out for each place the row of the same number.

@@ -1,4 +1,4 @@
-"""What is wrong with images, views and rough poses, each named once.
+"""Diagnostics of images, views and rough poses, each named once.
 
 Images in which few legs were found where the others of their view show theirs are examined again:
 with the readings of all other images, with the cameras of the other views, and mirrored. An
@@ -69,7 +69,7 @@ BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recog
 
 
 class ImageExplanation(NamedTuple):
-    """What an image shows."""
+    """The explanation of an image whose legs are not where its reading predicts them."""
 
     own: float  # share of the legs, by visible length, that are where its reading has them
     reason: Rejection = USED  # what it shows instead; false where nothing explains it clearly
@@ -77,7 +77,7 @@ class ImageExplanation(NamedTuple):
 
 
 class OutlineCount(NamedTuple):
-    """How many outlines of an image were found, of those that it should show."""
+    """Numbers of measured and of predicted outlines of an image."""
 
     used: int
     visible: int
@@ -400,7 +400,7 @@ def _share(
 
 
 def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
-    """Return how many outlines were found in images that should show any, by row."""
+    """Return the numbers of outlines of images that should show any, by row."""
     visible = is_visible(outlines)
     counts = {}
     for row in rows:
@@ -432,7 +432,7 @@ def _usual(
     suspects: Sequence[int],
     run: Run,
 ) -> dict[int, float]:
-    """Return how much of the legs good images show, for views with suspect images.
+    """Return the fraction of legs that good images show, for views with suspect images.
 
     There is always a good one: an image is a suspect where others show far more.
     """

@@ -96,7 +96,7 @@ class _Image:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What is known of the machine; it travels to worker processes."""
+    """Constants of the machine; they travel to worker processes."""
 
     machine: Machine
     wanted: BoolArray  # (n_views, n_legs)
@@ -124,7 +124,7 @@ class _Scene:
     def pictures(
         self, targets: Sequence[LegSegments], of_pose: Sequence[int], cameras: Array
     ) -> tuple[Pictures, IntArray]:
-        """Return what images show and should show with the legs at poses, and the index of each.
+        """Return edge pairs and predicted legs of images at poses, and the index of each.
 
         *of_pose* are the poses of the measurements whose images they are, *cameras* (n, n_views, 3,
         4) T_camera_base with each of them.
@@ -166,7 +166,7 @@ class _Guesses:
 
 
 def _targets(machine: Machine, poses: Array) -> list[LegSegments]:
-    """Return what is to be seen of all legs at poses (n, 3, 4)."""
+    """Return the predicted cylinders of all legs at poses (n, 3, 4)."""
     A, every = machine.A_base, np.arange(machine.n_legs)
     B = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     cylinders = [leg.cylinders for leg in machine.legs]
@@ -323,7 +323,7 @@ def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array
 
 
 def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
-    """Return which are the first n poses (m, 3, 4) that are not near an earlier one."""
+    """Return the indices of the first n poses (m, 3, 4) that are not near an earlier one."""
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
     near = np.sqrt(np.mean(off**2, axis=2)) < APART * machine.size
@@ -351,7 +351,7 @@ def _scores(
     targets: Sequence[LegSegments],
     tolerance: float,
 ) -> Array:
-    """Return how many legs agree with each guess, less what the model and rough poses say."""
+    """Return the number of legs that agree with each guess, less the cost of its priors."""
     poses = guesses.poses
     every, index = scene.pictures(targets, [k] * len(poses), guesses.cameras)
     found = match_pairs(every, _as_they_are(scene), tolerance)
@@ -443,13 +443,13 @@ def _camera_change(start: Array, cameras: Array) -> Array:
 
 
 def _camera_unit(rough: Array) -> Array:
-    """Return how far cameras may be from rough ones (..., 3, 4), (..., 6) [rad, m]."""
+    """Return the tolerance (..., 6) of cameras about rough ones (..., 3, 4) [rad, m]."""
     far = CAMERA_SIGMA[1] * np.linalg.norm(rough[..., 3], axis=-1)
     return np.stack([np.full_like(far, CAMERA_SIGMA[0])] * 3 + [far] * 3, axis=-1)
 
 
 def _pose_unit(scene: _Scene) -> Array:
-    """Return how far a pose may be from where it is if nothing says so, (6,) [rad, m]."""
+    """Return the standard deviations of a weak prior on a pose, (6,) [rad, m]."""
     size = scene.machine.size
     return np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * size] * 3)
 
@@ -499,7 +499,7 @@ def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]
 
 
 def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
-    """Return how far sliders are beyond their travel (n, n_legs) [m], and derivatives by pose."""
+    """Return the excess of sliders over their travel (n, n_legs) [m], with derivatives by pose."""
     arm = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2)
     vector = arm + poses[:, None, :, 3] - machine.A_base
     length = np.linalg.norm(vector, axis=2)
@@ -517,7 +517,7 @@ def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What the fit of all images moves."""
+    """The unknowns of the fit of all images."""
 
     cameras: Array  # (n_used, 3, 4) T_camera_base of the views that have images
     poses: Array  # (n_poses, 3, 4) T_base_platform of the poses that have images

@@ -130,7 +130,7 @@ def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
 
 
 def _strongest(slope: Grey) -> BoolArray:
-    """Return which edges of a direction count."""
+    """Return the mask of edges of a direction that count."""
     k = min(len(slope) - MIN_EDGES, math.ceil(0.01 * STRONG * (len(slope) - 1)))
     return np.asarray(slope >= np.partition(slope, k)[k])
 
@@ -156,7 +156,7 @@ def _blur_of(ratios: Grey) -> float:
 def image_defects(
     exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, Hashable]
 ) -> dict[int, Rejection]:
-    """Return why images cannot be used: by themselves, or beside others, by row.
+    """Return the rejections of unusable images, alone or compared with others, by row.
 
     ``view`` and ``camera`` are those of each row: images of a view show about the same through the
     same lens. Where a view has few, as of a camera in the hand, all of its camera are compared.

@@ -76,7 +76,7 @@ class Mark(NamedTuple):
 
 
 class PartMarks(NamedTuple):
-    """What is drawn of a part of a leg."""
+    """The drawing of a part of a leg."""
 
     name: str  # the leg, and the part where the leg has several; "" for what has no label
     reason: str  # why an outline of it is not used, shortened; "" if both are
@@ -89,7 +89,7 @@ def marks_of_image(
     predicted: Sequence[PredictedLeg],
     leg_names: Sequence[str],
 ) -> list[PartMarks]:
-    """Return what is drawn over an image, one entry for each part of a leg in it.
+    """Return the drawings over an image, one for each part of a leg in it.
 
     From its outlines and the predicted legs.
     """
@@ -136,7 +136,7 @@ def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
 
 
 def _reason(pair: Outlines) -> str:
-    """Return why an outline of a part is not used."""
+    """Return the reason of a rejected outline."""
     rejections = {
         int(edge): why
         for edge, why, used in zip(pair.edge, pair.reason, pair.used, strict=True)
@@ -392,6 +392,6 @@ def _leader(anchor: Array, corner: Array, extent: Array) -> Array:
 
 
 def _is_in(points: Array, low: Array, high: Array) -> BoolArray:
-    """Say which points (n, 2) are in a box."""
+    """Return the mask of points (n, 2) in a box."""
     inside: BoolArray = np.all((points > low) & (points < high), axis=1)
     return inside

@@ -124,7 +124,7 @@ class CameraPoses:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is known of a picture: its edge pairs, and the legs that it may show."""
+    """An image: its edge pairs, and the legs that it may show."""
 
     pairs: CandidatePairs
     targets: LegSegments  # segments of legs at its reading
@@ -227,7 +227,7 @@ def _filled(parts: Sequence[NDArray[Any]], n: int, value: NDArray[Any]) -> NDArr
 
 
 class PairMatches(NamedTuple):
-    """How well poses explain pictures, (n_pictures, n_poses, n_segments) each."""
+    """Scores of poses in images, (n_pictures, n_poses, n_segments) each."""
 
     score: Array  # of each segment, 0 to 1: how well, times how much of its visible length
     pair: IntArray  # the edge pair of its picture with that score
@@ -505,7 +505,7 @@ def segment_equations(
 
 
 def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Array:
-    """Return how far segments are from the pairs that agree with them, (K, n, T) [m].
+    """Return the distances of segments from the pairs that agree with them, (K, n, T) [m].
 
     Sideways, at the ends of the pairs and at the depth of the segments.
     """

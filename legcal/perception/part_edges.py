@@ -54,7 +54,7 @@ class EdgePair:
     alone: BoolArray  # (2,) whether each edge is convincing without the other
 
     def suits(self, width: Array) -> bool:
-        """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
+        """Return whether both edges are at the distance of the part's outlines (2,) [px]."""
         off = np.abs(self.v[1] - self.v[0] - width)
         tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
         return bool(np.all(self.found) and np.all(off <= tolerance))
@@ -134,7 +134,7 @@ def _pairs(
 def _best_pairs(
     parts: Sequence[LegPart], predicted: Array, shift: Array, merit: Array, score: Array
 ) -> tuple[IntArray, IntArray, BoolArray]:
-    """Return which lines near both edges of each part are a pair, and whether it is convincing."""
+    """Return the best pair of lines near both edges of each part, and whether it is convincing."""
     one, two = shift[:, 0, :, None], shift[:, 1, None]
     width = (predicted[:, 1] - predicted[:, 0])[:, None, None]
     window = np.array([part.window for part in parts])[:, None, None, None]
@@ -227,7 +227,7 @@ def _node_points(parts: Sequence[LegPart], n_blocks: IntArray, reach: float) -> 
 
 
 def _sharpness(profiles: Samples, seen: BoolArray, n_blocks: IntArray) -> Samples:
-    """Return how much each column of profiles (n, n_columns) looks like an edge, 0 to 1.
+    """Return the edge score of each column of profiles (n, n_columns), 0 to 1.
 
     The maxima of the smoothed gradient along each profile against the median of its patch, widened
     by one column to each side, where they count less. ``n_blocks`` are those of each patch.
@@ -328,7 +328,7 @@ def _added(votes: Samples, n_blocks: IntArray, halves: IntArray, half: int) -> S
 
 @lru_cache(maxsize=512)
 def _columns(n_blocks: int, half: int) -> IntArray:
-    """Return where lines begin to count in each block, by the difference of their ends.
+    """Return the first offset of lines that counts in each block, by the difference of their ends.
 
     (n_blocks, 2 half + 1) columns of votes with half // 2 + 1 more on each side.
     """

@@ -68,7 +68,7 @@ MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 
 def detection_settings() -> dict[str, object]:
-    """Return what detected outlines depend on besides the dataset."""
+    """Return the settings that detected outlines depend on besides the dataset."""
     return {"near_fit_px": WINDOW_PX, "detector": DETECTOR_VERSION}
 
 
@@ -90,7 +90,7 @@ class Photographs:
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
-        """What can be seen of each leg."""
+        """The visible cylinders of each leg."""
         return tuple(leg.cylinders for leg in self.machine.legs)
 
     @property
@@ -110,7 +110,7 @@ class Photographs:
         pairs: Mapping[int, CandidatePairs] | None = None,
         blur: Mapping[int, float] | None = None,
     ) -> Search:
-        """Return what is searched for by a model.
+        """Return the search for the legs of a model.
 
         Candidate pairs of some images may be known, and roughly the blur [px], by row.
         """
@@ -140,7 +140,7 @@ class Photographs:
         return replace(self, detect=rows, keep=outlines.choose(kept))
 
     def with_intrinsics(self, cameras: Sequence[Camera]) -> Photographs:
-        """Return the same images, seen through the lenses of other cameras, one a view."""
+        """Return the images with the intrinsics of other cameras, one a view."""
         views = tuple(
             replace(view, camera=replace(view.camera, K=lens.K, distortion=lens.distortion))
             for view, lens in zip(self.measurements.views, cameras, strict=True)
@@ -148,7 +148,7 @@ class Photographs:
         return replace(self, measurements=replace(self.measurements, views=views))
 
     def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
-        """Return the same images, read with other gammas of some views, by their names."""
+        """Return the images with other gammas of some views, by name."""
         views = tuple(
             replace(view, camera=replace(view.camera, gamma=gammas[view.name]))
             if view.name in gammas
@@ -181,7 +181,7 @@ class MeasuredImages:
         ]
 
     def kept(self, rows: IntArray) -> IntArray:
-        """Return those of some images that were not left out, and whose views were placed."""
+        """Return the rows of images that were not left out, in placed views."""
         view, cameras = self.photographs.measurements.view, self.placement.T_base_camera
         is_kept = [r not in self.left_out and cameras[view[r]] is not None for r in rows.tolist()]
         return rows[np.array(is_kept, dtype=np.bool_)]
@@ -195,7 +195,7 @@ def given_outlines(photographs: Photographs) -> Outlines:
 def nominal_placement(
     machine: Machine, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
 ) -> Placement:
-    """Return where a model has the legs at poses (n_poses,), with the rough cameras of views."""
+    """Return the placement by a model at poses (n_poses,), with the rough cameras of views."""
     B_base = np.array([T.apply(machine.B_platform) for T in T_base_platform])
     poses = np.array([T.as_matrix() for T in T_base_platform])
     A_base = B_base - vectors_at(machine, poses)
@@ -288,7 +288,7 @@ def _with_other_radii(
     *,
     method: Method,
 ) -> _Measured:
-    """Return what is measured with other radii of parts that were not found, if it is more.
+    """Return the outlines measured with other radii of parts not found, if these are more.
 
     *views* are where its images were recognised.
     """
@@ -336,7 +336,7 @@ def _with_free_poses(
     rows: IntArray,
     report: Report,
 ) -> tuple[Placement, FreePosesOf]:
-    """Return where a model has the legs, with poses found in images where readings give none."""
+    """Return the placement by a model, with poses found in images where readings give none."""
     machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
@@ -357,7 +357,7 @@ def _with_free_poses(
 def _at_poses(
     photographs: Photographs, nominal: Placement, T_base_platform: Mapping[int, RigidTransform]
 ) -> Placement:
-    """Return where a model has the legs with the platform at other poses, by their number."""
+    """Return the placement by a model with the platform at other poses, by their number."""
     B_base = nominal.B_base.copy()
     for pose, T in T_base_platform.items():
         B_base[photographs.measurements.pose == pose] = T.apply(photographs.machine.B_platform)
@@ -367,7 +367,7 @@ def _at_poses(
 def _in_doubt(
     measurements: Measurements, rows: IntArray, n_outlines: Mapping[int, int]
 ) -> dict[int, Rejection]:
-    """Return why images do not tell where the platform is, by row, by the outlines of poses."""
+    """Return the rejections of images that leave the platform pose ambiguous, by row."""
     checked = np.array([n_outlines[k] >= MIN_OUTLINES for k in measurements.pose[rows].tolist()])
     reasons = dict.fromkeys(rows[~checked].tolist(), Rejection(Reason.FEW_LEGS))
     left, view = rows[checked], measurements.view
@@ -475,7 +475,7 @@ def _placed(
     report: Report,
     joined: Joined,
 ) -> PlacedViews:
-    """Return where views have the legs that some images show."""
+    """Return the placement of views by the legs in some images."""
     progress = _counted(report, "Recognising legs", len(rows))
     return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
 
@@ -505,7 +505,7 @@ def _measured(
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
 ) -> tuple[dict[int, Rejection], dict[int, CandidatePairs], dict[int, float]]:
-    """Return why images show nothing, pairs of those recognised first, and blurs [px], by row."""
+    """Return rejections of unusable images, edge pairs of the first ones, blurs [px], by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
@@ -530,7 +530,7 @@ def _inspect_images(
 def _still_pictures(
     measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
 ) -> dict[int, Still]:
-    """Return what stands still in the reduced pictures of each view that has enough of them."""
+    """Return the static background of each view with enough reduced images."""
     of_view: dict[int, list[Grey]] = {}
     for row, picture in small.items():
         if row not in defects:
@@ -547,7 +547,7 @@ def _pairs_of_reduced(search: Search, seen_by: tuple[Grey, int]) -> CandidatePai
 def defects_of(
     measurements: Measurements, exposures: Mapping[int, Exposure]
 ) -> dict[int, Rejection]:
-    """Return why images show nothing, by themselves or beside others of their view, by row."""
+    """Return rejections of unusable images, alone or compared with their view, by row."""
     views = measurements.views
     camera = shared_cameras([view.name for view in views], [view.camera for view in views])
     view = {row: int(measurements.view[row]) for row in exposures}
@@ -555,7 +555,7 @@ def defects_of(
 
 
 def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Grey | None]:
-    """Return how an image was exposed, and reduced if it is one of rows."""
+    """Return the exposure of an image, and the reduced image if it is one of rows."""
     image = search.load(row)
     factor = search.reduction(int(search.measurements.view[row]))
     return measure_exposure(image), reduce(image, factor) if row in rows else None
@@ -583,7 +583,7 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
 
 
 def _is_among(part: LegRadius, others: Sequence[LegRadius]) -> bool:
-    """Say whether a part is one of others, whose radii may differ by rounding."""
+    """Return whether a part is one of others, whose radii may differ by rounding."""
     return any(part[0] == leg and look_alike(part[1], radius) for leg, radius in others)
 
 

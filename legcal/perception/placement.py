@@ -1,4 +1,4 @@
-"""What is searched for in images, and where their cameras and legs are estimated to be.
+"""The search for legs in images, and the estimated cameras and joint centres.
 
 A :class:`Search` is the nominal model at every reading. A :class:`Placement` is what flows through
 the room: first rough cameras and the nominal model, then what was recognised, then what views
@@ -53,7 +53,7 @@ NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What is searched for; it travels to worker processes."""
+    """The search for legs; it travels to worker processes."""
 
     load: Load  # the image of a row
     measurements: Measurements
@@ -74,7 +74,7 @@ class Search:
         return len(self.cylinders)
 
     def picture(self, row: int) -> Picture:
-        """Return what the image of a row shows, and what it should."""
+        """Return the edge pairs and predicted legs of the image of a row."""
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
         extent = sensor_extent(camera)
@@ -92,7 +92,7 @@ class Search:
         return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
 
     def edge_maps(self, rows: Sequence[int]) -> EdgeMaps:
-        """Return where the images of rows show edges of each direction, if these move."""
+        """Return the edge maps of the images of rows, without the static background."""
         views = [int(self.measurements.view[row]) for row in rows]
         factors = [self.reduction(view) for view in views]
         cameras = [self.measurements.views[view].camera for view in views]
@@ -120,12 +120,12 @@ class Search:
 
     @cached_property
     def shapes(self) -> list[tuple[Cylinder, ...]]:
-        """What each leg is recognised by: its cylinders, and housings as such."""
+        """The cylinders by which each leg is recognised, with housings as such."""
         housings = housings_of_legs(self.occluders, self.n_legs)
         return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
-        """Return what an image shows with what it should show by other cylinders."""
+        """Return the image with the legs predicted by other cylinders."""
         return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
@@ -252,7 +252,7 @@ class Placement:
 
     @cached_property
     def shift(self) -> Array:
-        """How far A and B are in each view from the nominal model, (n_views, n_legs, 2, 3) [m]."""
+        """Shift of A and B from the nominal model in each view, (n_views, n_legs, 2, 3) [m]."""
         if self.moved is None:
             return np.zeros((len(self.T_base_camera), self.A_base.shape[1], 2, 3))
         return self.moved
@@ -284,13 +284,13 @@ class Placement:
             raise NotVisible(unplaced_notes(self.unplaced))
 
     def all_notes(self, measurements: Measurements) -> tuple[str, ...]:
-        """Return what a reader should know, also of views without a camera, and of images."""
+        """Return all notes, also on views without a camera, and on images."""
         on_images = image_notes(measurements, self.barely)
         return (*unplaced_notes(self.unplaced), *self.notes, *on_images)
 
 
 def unplaced_notes(unplaced: Mapping[str, NotPlaced]) -> list[str]:
-    """Return why views have no camera, by name, one sentence a cause."""
+    """Return one sentence for each cause for which views have no camera."""
     return [
         f"{few_views(views)}{', each' * (len(views) > 1)}: {why}"
         for why, views in by_cause({one.view: one.why for one in unplaced.values()})

@@ -81,7 +81,7 @@ class RadiusFactors:
         return RadiusFactors(more, self.common) if more else NO_RADIUS_FACTORS
 
     def of_the_same(self, step: "RadiusFactors") -> "RadiusFactors":
-        """Return what a step says of the parts whose radii this one has corrected."""
+        """Return the factors of a further step for the parts that this one has corrected."""
         if self.common:
             return step if step.common else NO_RADIUS_FACTORS
         mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
@@ -219,7 +219,7 @@ def _logarithms(
 
 
 def _width(ends: Array, radius: float, middle: Array) -> float:
-    """Return how wide a cylinder along ends (2, 3) is seen where the axis is next to a point."""
+    """Return the apparent width of a cylinder along ends (2, 3), next to a point."""
     xy = ends[:, :2] / ends[:, 2:]
     run = xy[1] - xy[0]
     share = float((middle - xy[0]) @ run / (run @ run))

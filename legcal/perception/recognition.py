@@ -141,7 +141,7 @@ class PlacedViews:
     def with_other_radii(
         self, suspects: Collection[LegRadius], run: Run = in_turn
     ) -> Placement | None:
-        """Return the same with other radii of some parts, by leg and radius [m]; None without any.
+        """Return the recognition with other radii of parts, by leg and radius [m]; None without.
 
         Their outlines were not found with those of the model.
         """
@@ -159,7 +159,7 @@ class PlacedViews:
         return group.pictures(self.pictures, group.rows if rows is None else rows)
 
     def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> PlacedViews:
-        """Return what images show and should show by other cylinders of the legs."""
+        """Return images with the legs predicted by other cylinders."""
         search = replace(self.search, cylinders=cylinders)
         pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
         return replace(self, search=search, pictures=pictures)
@@ -195,7 +195,7 @@ class PlacedViews:
 
     @property
     def support(self) -> float:
-        """How many legs agree in a picture, over all groups that were placed."""
+        """Number of legs that agree in an image, over all placed groups."""
         return sum(float(one.support[0].mean()) for one in self.placed if one.is_convincing)
 
     def decided_by_outlines(self, g: int) -> PoseCandidates:
@@ -228,7 +228,7 @@ class PlacedViews:
 def _pictures(
     search: Search, rows: Sequence[int], progress: Callable[[int], None] | None, run: Run
 ) -> dict[int, Picture]:
-    """Return what the images of rows show, and what they should."""
+    """Return edge pairs and predicted legs of the images of rows."""
     found = {}
     for row, picture in zip(rows, run(search.picture, rows), strict=True):
         found[row] = picture
@@ -343,7 +343,7 @@ class _Trial:
 
     @property
     def evidence(self) -> float:
-        """How much they support it."""
+        """Their support."""
         return 0.0 if self.fit is None else self.fit.evidence
 
 
@@ -367,7 +367,7 @@ def _best(trials: Sequence[_Trial]) -> int:
 
 
 def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Group) -> bool:
-    """Say whether outlines support one pose, and not nearly as much for another one."""
+    """Return whether outlines support one pose clearly more than any other."""
     best = _best(trials)
     others = [
         trial.evidence
@@ -387,7 +387,7 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
 
 
 def _same(one: Outlines, other: Outlines) -> bool:
-    """Say whether two poses have most legs at the same places."""
+    """Return whether two poses have most legs in the same positions."""
     where = [
         {
             (row, leg, part, edge): middle
@@ -404,7 +404,7 @@ def _same(one: Outlines, other: Outlines) -> bool:
 
 
 def _gap(one: Array, other: Array) -> float:
-    """Return how far the middle of a line (2, 2) is from another line [px]."""
+    """Return the distance of the middle of a line (2, 2) from another line [px]."""
     along = other[1] - other[0]
     step = one.mean(axis=0) - other[0]
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))

@@ -91,7 +91,7 @@ def fit_saddles(
     band: float,  # how far from the edges nothing else is printed [unit]
     blur: float = 0.0,  # of crossings of this image, if it is known [px]
 ) -> Saddles:
-    """Return where two edges cross near some pixels."""
+    """Return the crossings of two edges near some pixels."""
     if not len(start):
         none = np.zeros(0)
         return Saddles(np.zeros((0, 2)), none, none, none, none, np.zeros(0, dtype=np.bool_))
@@ -368,7 +368,7 @@ def _judged(
 
 
 def _pull(A: _Levels, N: Array) -> Array:
-    """Return how levels move the place, (n, 2, m), by all derivatives of the model (n, k, m)."""
+    """Return derivatives of the position by grey levels, (n, 2, m), from the model's (n, k, m)."""
     n, k, _ = A.shape
     size = np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)
     N = N.copy()

@@ -121,7 +121,7 @@ class ViewFit:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What the fit of a group moves."""
+    """The unknowns of the fit of a group."""
 
     pose: Frames  # (1,) of the machine in the frame of the group, its origin at the middle
     shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
@@ -308,7 +308,7 @@ def _squared_distances(
 def _evidence(
     lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float, size: float
 ) -> float:
-    """Return how much outlines support a state, each leg of an image by itself."""
+    """Return the evidence of outlines for a state, by leg and image."""
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
@@ -317,12 +317,12 @@ def _evidence(
 
 
 def min_evidence(group: Group) -> float:
-    """Return how much evidence outlines must give: more images agree more by chance."""
+    """Return the required evidence of outlines: more images agree more by chance."""
     return EVIDENCE * (1.0 + EVIDENCE_OF_IMAGE * len(group.rows))
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
-    """Return how well a fit knows where legs are seen, (n_rows, n_legs) [px].
+    """Return the standard deviations of predicted legs in images, (n_rows, n_legs) [px].
 
     One standard deviation across each leg, at the joint where it is known worse; infinite for
     legs that reach behind the camera, and in images of other views.
@@ -435,7 +435,7 @@ def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None
 def _offsets_of(
     X: Array, radius: Array, edge: IntArray, ends: Array, metric: Array
 ) -> tuple[Array, Array]:
-    """Return how far points are from outlines (n, 2) [px], and derivatives (n, 2, 2, 3) by A and B.
+    """Return the distances of points from outlines (n, 2) [px], with derivatives by A and B.
 
     Of the outlines (0 where epsilon is +1, 1 where it is -1) of cylinders with A and B (n, 2, 3) in
     the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
@@ -459,7 +459,7 @@ def _offsets_of(
 
 
 def _metric_of(camera: Camera, ends: Array) -> Array:
-    """Return what makes normals of lines (..., 2) those in the picture at points (..., 2)."""
+    """Return the matrices that map normals of lines (..., 2) into the image at points (..., 2)."""
     return np.asarray(np.swapaxes(np.linalg.inv(camera.pixels_per_unit(ends)), -1, -2))
 
 
@@ -614,7 +614,7 @@ def group_name(names: Sequence[str]) -> str:
 
 
 def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:
-    """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
+    """Return the tolerance of missing legs about a fit (n_rows, n_legs) [px]; NaN for others."""
     missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
     visible = ~outlines.rejected_for(Reason.OUTSIDE, Reason.NOT_PLACED)
     missing[outlines.row[visible], outlines.leg[visible]] = True
@@ -629,6 +629,6 @@ def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outl
 
 
 def _among(outlines: Outlines, legs: set[tuple[int, int]]) -> BoolArray:
-    """Return which outlines are of some legs in images, (row, leg)."""
+    """Return the mask of outlines of some legs in images, (row, leg)."""
     own = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
     return np.array([one in legs for one in own], dtype=np.bool_)

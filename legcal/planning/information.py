@@ -102,7 +102,7 @@ class Contributions:
 
     names: tuple[str, ...]  # of m unknowns, the p coordinates of the machine first
     rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
-    prior: Array  # (m, m): what is known without images
+    prior: Array  # (m, m): prior information
     basis: Array  # (n_parameters, p): directions of the kinematic parameters
     at_site: Array  # (n_images, r) variances of what photographs of a site share, in those rows
     site: IntArray  # (n_images,)
@@ -165,7 +165,7 @@ class Predictor:
         *,
         is_fit: bool = False,
     ) -> Contributions:
-        """Return what images add to the information.
+        """Return the contribution of images to the information.
 
         With *is_fit* that of a fit that weighs outlines as if they had no errors at places, and how
         these move it.
@@ -257,7 +257,7 @@ class Predictor:
         return Contributions(named, rows, whole, basis, at_site, site, moved[..., :0])
 
     def _shifts(self, problem: FitProblem, *, are_shared: bool) -> Array:
-        """Return how errors at places move both ends of outlines (n, 2, c) [px].
+        """Return the shifts of both ends of outlines by repeated errors (n, 2, c) [px].
 
         By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
         """
@@ -277,7 +277,7 @@ def _without(U: Array, X: Array) -> Array:
 
 def _apart(
     kept: Array,  # (n, r, m)
-    U: Array,  # (n, r, d): what the pose of an image takes up
+    U: Array,  # (n, r, d): derivatives by the pose of an image
     moved: Array,  # (n, r, 2): by bias and tilt of the outline of each row
     is_outline: BoolArray,  # (r,)
 ) -> tuple[Array, Array]:
@@ -320,7 +320,7 @@ def _by_element(rows: Array, element: IntArray, n: int) -> Array:
 
 
 def _are_lengths(problem: FitProblem) -> BoolArray:
-    """Return which kept unknowns count in metres, (n_kept,)."""
+    """Return the mask of kept unknowns in metres, (n_kept,)."""
     found = np.zeros(problem.n_kept, dtype=np.bool_)
     for block in problem.variables:
         where = problem.where(block.name)

@@ -67,7 +67,7 @@ class Setting:
         focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
         return focal * float(np.tan(self.turn) + (self.shift + self.length) / nearest)
 
-    def camera_elsewhere(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
+    def perturbed_camera(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
         """Draw a camera pose within tolerance."""
         shift, turn = rng.normal(size=(2, 3))
         shift *= self.shift * rng.random() / np.linalg.norm(shift)
@@ -77,7 +77,7 @@ class Setting:
         )
 
 
-def usual_setting(size: float) -> Setting:
+def default_setting(size: float) -> Setting:
     """Return the default tolerances for a mean leg length *size* [m]."""
     return Setting(USUAL_SHIFT * size, USUAL_LENGTH * size, draws=USUAL_DRAWS)
 

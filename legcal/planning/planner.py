@@ -28,7 +28,7 @@ from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchang
 from legcal.planning.goals import Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
 from legcal.planning.laid_board import LaidBoard, lying
-from legcal.planning.order import in_short_order, ways
+from legcal.planning.order import shortest_order, ways
 from legcal.planning.places import (
     Place,
     Setting,
@@ -38,7 +38,7 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Bodies, Seen, what_is_seen
+from legcal.planning.sight import Bodies, Seen, visible_parts
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
 from legcal.vision.visibility import in_picture, least_length
@@ -55,7 +55,7 @@ POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
 # Mean leg lengths: a session with a larger error, also above the model's, is refused
-_LEAST_ERROR = 0.0025
+_MIN_ERROR_LIMIT = 0.0025
 _EXTRAPOLATED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # multiples of the planned images
 _MOST_NEEDED = 100  # images, in the search for a sufficient number
 
@@ -118,7 +118,7 @@ class Scene:
         bodies = Bodies.at(self.task.machine, self.legs, poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
-        return what_is_seen(self.task.predictor.camera, T, bodies, margin)
+        return visible_parts(self.task.predictor.camera, T, bodies, margin)
 
     def board_is_shown(
         self,
@@ -249,8 +249,8 @@ def plan_session(
         if stop():
             break
         step = 0.5**turn
-        placed = search.better_places(current, step, middle)
-        polished, reached = search.better_poses(placed, step, least)
+        placed = search.improve_positions(current, step, middle)
+        polished, reached = search.improve_poses(placed, step, least)
         polished_covariance = search.expected_covariance(polished)
         if search.value_of(polished_covariance) < search.value_of(expected):
             current, value, expected = polished, reached, polished_covariance
@@ -522,7 +522,7 @@ class _Search:
     def _refuse_undetermined(self, session: Session) -> None:
         """Refuse a session that does not improve the model; state a sufficient number of images."""
         task, work, basis = self.task, self.work, self.basis
-        limit = max(task.setting.length, _LEAST_ERROR * task.machine.size)
+        limit = max(task.setting.length, _MIN_ERROR_LIMIT * task.machine.size)
 
         def error_of(S: Array) -> Array:
             """Error of the platform, or the criterion if readings do not determine its pose."""
@@ -558,7 +558,7 @@ class _Search:
             f"model; {needed} are needed; {remedy}."
         )
 
-    def better_places(
+    def improve_positions(
         self, current: Sequence[Candidates], step: float, target: Array
     ) -> list[Candidates]:
         """Local search over camera places, poses unchanged."""
@@ -578,7 +578,7 @@ class _Search:
                     current[v], contributions[v], value = trial, added, trial_value
         return current
 
-    def better_poses(
+    def improve_poses(
         self, current: Sequence[Candidates], step: float, least: int
     ) -> tuple[list[Candidates], float]:
         """Exchange poses with poses nearby; also return the criterion."""
@@ -625,7 +625,7 @@ class _Search:
         ordered, begin = list[Configurations](), machine.home_configuration
         for candidates in current:
             ordered.append(
-                some_of(candidates.poses, in_short_order(machine, candidates.poses, begin))
+                some_of(candidates.poses, shortest_order(machine, candidates.poses, begin))
             )
             begin = ordered[-1].configurations[-1]
         via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
@@ -707,7 +707,7 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
         if machine.is_determined:
             poses = poses_at_readings(machine, scene.legs, candidates.poses.readings, nearby)
         T = candidates.place.T_base_camera
-        T = T if is_set else task.setting.camera_elsewhere(T, rng)
+        T = T if is_set else task.setting.perturbed_camera(T, rng)
         added = scene.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
         if added is not None:
             parts.append(added)

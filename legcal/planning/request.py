@@ -26,7 +26,7 @@ from legcal.planning.places import (
     MAX_LENGTH,
     Place,
     Setting,
-    usual_setting,
+    default_setting,
 )
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
@@ -129,7 +129,7 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    setting = usual_setting(machine.size) if setting is None else setting
+    setting = default_setting(machine.size) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)

@@ -21,7 +21,7 @@ from legcal.calibration.identify.predicted_observations import (
 from legcal.calibration.identify.ranks import Analysis, undetermined, weak_directions
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
-    Replanning,
+    Replanner,
     find_remedies,
     judge_board,
     recommend,
@@ -168,7 +168,7 @@ def identifiability(
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
     predicted = planned_observations(mechanism, legs, images, **boards)
-    replanning = Replanning(
+    replanning = Replanner(
         lambda more: planned_observations(mechanism, legs, more, **boards),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), **boards),
     )
@@ -272,7 +272,7 @@ def _report_on(
     machine: Machine,
     analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
-    replanning: Replanning | None,
+    replanning: Replanner | None,
 ) -> Identifiability:
     """Report on a session."""
     predicted = analysis.predicted

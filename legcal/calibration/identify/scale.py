@@ -1,4 +1,4 @@
-"""Sources of scale for a machine whose readings carry no length.
+"""Sources of scale for a machine without readings of lengths.
 
 Encoders of arms measure angles: such a machine at twice the size, with rods twice as thick and
 cameras twice as far, gives the same images and readings. A measured length, a board, or radii fix
@@ -101,9 +101,9 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
     lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
     mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
-    open_directions = undetermined(predicted, information)
-    leaves_more = len(open_directions) > _n_open(analysis, 0.0)
-    if leaves_more or np.linalg.norm(open_directions @ mean) > _OPEN * np.linalg.norm(mean):
+    undetermined_directions = undetermined(predicted, information)
+    leaves_more = len(undetermined_directions) > _n_open(analysis, 0.0)
+    if leaves_more or np.linalg.norm(undetermined_directions @ mean) > _OPEN * np.linalg.norm(mean):
         return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
     seen = singular > 0.0

@@ -40,7 +40,9 @@ class HeldDirections:
     ] = ()  # parameters that depend on the nominal model along these directions
 
 
-def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> HeldDirections:
+def undetermined_directions(
+    problem: FitProblem, state: State, normal: NormalEquations
+) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
     *problem* has no held directions yet; *normal* is its information at the state. Intrinsics with
@@ -160,7 +162,7 @@ def held_at_nominal(
     )
 
 
-def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Array:
+def covariance_of_held(problem: FitProblem, state: State, held: HeldDirections) -> Array:
     """Return the covariance (n_kinematic, n_kinematic) of steps along the held directions H.
 
     Errors of the nominal model with covariance D^2, conditioned on the estimated complement of H,

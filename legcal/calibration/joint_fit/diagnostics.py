@@ -15,7 +15,7 @@ from scipy.special import chdtri, ndtr
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
     held_at_nominal,
-    open_directions,
+    undetermined_directions,
 )
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
@@ -85,7 +85,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
         raise DidNotConverge(problems)
 
 
-def refuse_other_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
     """Refuse a calibration board whose dimensions in the dataset contradict the measurements.
 
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
@@ -280,7 +280,7 @@ def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
     """Fit with the stated parameters free; return the fit and its held directions."""
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
-    held = open_directions(problem, first.state, normal)
+    held = undetermined_directions(problem, first.state, normal)
     if len(held.basis):
         problem, state = held_at_nominal(problem, first.state, held)
         continued = first_minimum(problem, state)
@@ -449,7 +449,7 @@ def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     )
 
 
-def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str]:
+def arms_with_wrong_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str]:
     """Return the legs whose arms have another width than the model's in most images, with reasons.
 
     *is_arm* marks the outlines of arms in the table. Both edges of an arm of another shape or
@@ -561,7 +561,7 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     ]
 
 
-def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
+def blaming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
     """Prepend the stated values, if any, to a failure as its likely cause."""
     stated = stated_parameters(problem)
     if not stated:

@@ -113,7 +113,7 @@ class NoiseModel:
         return np.asarray(np.sum(whitened**2, axis=-1))
 
 
-def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
+def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
     """Estimate the noise from the median outline, robust against less than half outliers.
 
     The difference of the offsets at both ends is independent of the bias, and their sum of the

@@ -146,7 +146,7 @@ def known_parameters(
     boards: Sequence[FixedBoard] = (),
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
-    by_name, others = _kinematic(machine), _no_parameters(machine)
+    by_name, others = _kinematic(machine), _rejected_names(machine)
     seen: dict[str, KnownParameter] = dict(_radii(machine))
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
@@ -237,7 +237,7 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
     return parameters, synonyms
 
 
-def _no_parameters(machine: Machine) -> dict[str, str]:
+def _rejected_names(machine: Machine) -> dict[str, str]:
     """Names that look like parameters of a machine but are not, with the reason."""
     free = free_coordinates(len(machine.legs), machine.frame_legs)
     known = parametrization_of(machine, twists=True).names
@@ -273,7 +273,7 @@ def _other_lengths(leg: Leg) -> dict[str, str]:
     return {offset: reason, length: reason}
 
 
-_DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
+_PAST_TENSE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
 
 
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
@@ -445,7 +445,7 @@ def _contradiction(
     others = [override for override, decision in several if decision.action != "fixed"]
     stated = {(d.value, d.sigma): override for override, d in several if d.value is not None}
     if fixed and others:
-        done, pair = f"both fixed and {_DONE[others[0].action]}", (fixed[0], others[0])
+        done, pair = f"both fixed and {_PAST_TENSE[others[0].action]}", (fixed[0], others[0])
     elif len(stated) > 1:
         first, second, *_ = stated.values()
         done = "fixed at two values" if fixed else "given two different priors"

@@ -19,10 +19,10 @@ import numpy as np
 
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
-    like_readings,
-    with_agreeing_readings,
-    with_judged_readings,
-    with_rough_readings,
+    reject_outlier_readings,
+    restore_inlier_readings,
+    with_inflated_reading_noise,
+    with_rejected_readings_of,
 )
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
@@ -35,8 +35,8 @@ from legcal.calibration.joint_fit.outline_errors import (
     estimated_biases,
     expected_biases,
     least_at_places,
-    noise_of_the_median,
     possible_biases,
+    robust_noise,
     shifts_at_places,
     sigmas_at_places,
     with_gamma,
@@ -49,14 +49,14 @@ from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
-from legcal.estimation.uncertainty import explained_share, response, score_test, scores_of_block
+from legcal.estimation.uncertainty import leverage, response, score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.cylinder import EPSILON
 
 _BOARD_ROUNDS = 3
 _READING_ROUNDS = 8  # each rejects at most one reading per pose
 _REJECTION_TOLERANCE = 0.005  # relative decrease of the cost, in rounds that reject outliers
-_PASSING = 1e-6  # tolerance of intermediate minima, in squared sigmas
+_INTERMEDIATE_TOLERANCE = 1e-6  # tolerance of intermediate minima, in squared sigmas
 _ACCEPTED = 0.5  # weight at the rejection distance
 _MIN_REDUNDANCY = 0.05  # mean redundancy of corners
 _MIN_SCALE = 0.1
@@ -66,7 +66,7 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
 @dataclass(frozen=True, eq=False)
-class AtPlaces:
+class RepeatedErrors:
     """Errors of edges that return to places; not estimated as biases."""
 
     sigma: Array  # (2,) of ``PLACES``, root mean squares over all places [px]
@@ -82,7 +82,7 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    at_places: AtPlaces | None = None  # errors shared there, None where there are none
+    at_places: RepeatedErrors | None = None  # errors shared there, None where there are none
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
 
     @property
@@ -137,7 +137,7 @@ def first_minimum(
     """
     original, all_outlines = problem, np.ones(len(problem.outlines), dtype=np.bool_)
     is_rough = problem.legs.is_redundant
-    claimed = with_rough_readings(problem.weighted(NoiseModel()))
+    claimed = with_inflated_reading_noise(problem.weighted(NoiseModel()))
     chosen = of_determined_poses(claimed, begin, all_outlines)
     problem, loss = claimed.weighted(NoiseModel(), chosen), claimed.loss
     legs, n = problem.legs, problem.n_kinematic
@@ -154,7 +154,7 @@ def first_minimum(
         begin,
         loss,
         max_iterations=problem.settings.max_iterations,
-        tolerance=_PASSING,
+        tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=_REJECTION_TOLERANCE,
         computed_rows=computed_rows if chosen.all() and not is_rough else None,
         must_converge=must_converge,
@@ -165,7 +165,7 @@ def first_minimum(
     linear = linearize(problem, minimum.state, minimum.linear.rows if same else None)
     cost = robust_cost(problem, linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
-        rough = with_rough_readings(problem)
+        rough = with_inflated_reading_noise(problem)
         cost = robust_cost(rough, linearize(rough, minimum.state), loss)
     return Minimum(minimum.state, linear, cost, minimum.iterations)
 
@@ -200,7 +200,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     _refuse_wrong_axes(fit)
     return replace(
         fit,
-        at_places=_at_places(fit),
+        at_places=_repeated_errors(fit),
         notes=check_convergence(changes, problem.outlines.covariance, problem.settings),
     )
 
@@ -210,12 +210,14 @@ def _without_outliers(fit: Fit) -> Fit:
     given, settings, claimed = fit.problem, fit.problem.settings, fit.problem.outlines.covariance
     # Wrong readings go first, before they bias the fit: the first minimum has inflated noise.
     if given.legs.is_redundant:
-        rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
+        rough, tolerance = with_inflated_reading_noise(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
-        fit = replace(fit, problem=like_readings(given, rough), minimum=minimum).passed(tolerance)
+        fit = replace(fit, problem=with_rejected_readings_of(given, rough), minimum=minimum).passed(
+            tolerance
+        )
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
-        fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))
+        fit = fit.weighted(robust_noise(offsets[before], claimed[before]))
         if np.sum(before != fit.accepted) <= settings.error_tolerance * fit.accepted.sum():
             break  # left to the rounds of noise estimation
         fit = fit.passed(_REJECTION_TOLERANCE)
@@ -279,19 +281,19 @@ def _without_wrong_readings(
 
     Readings of the *complete* problem that agree after the others are rejected are restored, once.
     """
-    may_come_back = True
+    may_restore = True
     for _ in range(_READING_ROUNDS):
-        problem, is_changed = with_judged_readings(problem, minimum.state)
-        if not is_changed and may_come_back:
-            problem, is_changed = with_agreeing_readings(problem, complete, minimum.state)
-            may_come_back = False
+        problem, is_changed = reject_outlier_readings(problem, minimum.state)
+        if not is_changed and may_restore:
+            problem, is_changed = restore_inlier_readings(problem, complete, minimum.state)
+            may_restore = False
         if not is_changed:
             break
         minimum = _approach_minimum(problem, minimum, relative_tolerance)
     return problem, minimum
 
 
-def _at_places(fit: Fit) -> AtPlaces | None:
+def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
     """Return errors at places and their effect on the covariance; None where there are none.
 
     They are estimated where residuals show biases at all; those of polished parts are there anyway.
@@ -314,7 +316,7 @@ def _at_places(fit: Fit) -> AtPlaces | None:
     normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * of_places
     sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
-    return AtPlaces(sigma, moved @ moved.T)
+    return RepeatedErrors(sigma, moved @ moved.T)
 
 
 def _approach_minimum(
@@ -324,7 +326,7 @@ def _approach_minimum(
     return _minimise_near(
         problem,
         near,
-        tolerance=_PASSING,
+        tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=relative_tolerance,
         rate=near.rate,
     )
@@ -365,7 +367,7 @@ def _noise(fit: Fit) -> NoiseModel:
     claimed, used = problem.outlines.covariance, weight > 0.0
     normal = information(problem, fit.state, linear, problem.loss)
     L = np.linalg.cholesky(fit.noise.covariance(claimed))[used]
-    share = explained_share(problem, linear, normal, "outlines")[used]
+    share = leverage(problem, linear, normal, "outlines")[used]
     explained = L @ share @ np.swapaxes(L, -1, -2)  # weighted, as the squares are
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
     return estimate_noise(offsets, explained, claimed[used], weight[used])
@@ -422,7 +424,7 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
     for board in problem.boards:
         if not len(board):
             continue
-        rows, share = linear[board.name], explained_share(problem, linear, normal, board.name)
+        rows, share = linear[board.name], leverage(problem, linear, normal, board.name)
         redundancies = 1.0 - 0.5 * np.einsum("nqq->n", share)
         norms = rows.squared_norms
         redundancy = max(float(np.mean(redundancies)), _MIN_REDUNDANCY)

@@ -57,7 +57,7 @@ def _images_have_length(problem: FitProblem) -> bool:
 
 
 @contextmanager
-def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
+def explaining_missing_scale(problem: FitProblem) -> Iterator[None]:
     """Prepend to a failure that radii alone determine the scale, if they do."""
     try:
         yield

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
+from legcal.calibration.joint_fit.determinacy import HeldDirections, covariance_of_held, named_units
 from legcal.calibration.joint_fit.diagnostics import (
     DoubtedCamera,
     contradicted_radii,
@@ -416,7 +416,7 @@ def _kinematic(
     return KinematicUncertainty(
         problem.legs.parametrization,
         of_every(kept),
-        of_every(held_spread(problem, state, held)),
+        of_every(covariance_of_held(problem, state, held)),
         of_every(named),
         held_basis,
         held.directions,
