@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
-from legcal.calibration.joint_fit.diagnostics import arms_with_wrong_widths, wrong_arms_in_words
+from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
 from legcal.data.corners import Corners
@@ -212,7 +212,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, seen, arms)])
         image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
-        if wrong := arms_with_wrong_widths(outlines, are_of_arms(outlines, data.machine.legs)):
+        if wrong := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
             said = wrong_arms_in_words(wrong, data.machine.legs)
             notes.append(f"Arms do not look as the model draws them: {said}")
         # Legs of a view that could not be placed are drawn where its rough pose has them.

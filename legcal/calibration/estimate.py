@@ -28,15 +28,17 @@ from legcal.errors import NotVisible
 from legcal.machine.model import Machine
 from legcal.perception.placement import Placement
 
+# Of all outlines that are measured in photographs: light at the limb that no model of shading
+# predicts looks like other radii, so that residuals never show it [px].
 LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
-# For a session with a likely mistake: neither other starts nor more steps would help, and stated
-# values that it contradicts are not to blame.
+# Of a session that looks wrong: neither other starts nor patience would mend it, and what it
+# contradicts is not to blame.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The outlines of all images and the fit to them, in canonical order."""
+    """What the images show and what was fitted to it, in canonical order."""
 
     fitted: OrderedDataset  # the images that were fitted
     outlines: Outlines  # of all images
@@ -50,7 +52,7 @@ class Estimate:
 
     @cached_property
     def outliers(self) -> dict[int, Cause]:
-        """Causes of images that contradict the fit, by row."""
+        """What is said of images that contradict the fit, by their row."""
         return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
 
     def in_file_order(self) -> Estimate:
@@ -113,7 +115,7 @@ def fit_outlines(
 
 
 def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
-    """Raise NotVisible if no image has a used outline of a leg that its view lists."""
+    """Raise NotVisible if no image shows a leg that its view says it does."""
     if fitted.axes is not None:
         return
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
@@ -126,7 +128,7 @@ def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
 
 
 def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
-    """Return the names of legs that views list and that have no used outline."""
+    """Return the legs that views should show, and of which no outline is used."""
     along = along_legs(outlines, machine.legs)
     shown = set(along.leg[along.used].tolist())
     views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]

@@ -73,7 +73,7 @@ from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
-MAX_LEFT_OUT = 0.25  # share of unused images or outlines, above which common mistakes are tried
+MAX_LEFT_OUT = 0.25  # of the images, or of the outlines, beyond which common mistakes are tried
 
 
 def calibrate(
@@ -308,7 +308,7 @@ def _estimate(
 
 
 def _unused_share(estimate: Estimate) -> float:
-    """Return the share of measurable outlines that the fit does not use."""
+    """Return the share of the measurable outlines that the fit does not use."""
     shown = estimate.solution.outlines.choose(is_measurable(estimate.solution.outlines))
     return 1.0 - float(shown.used.mean()) if len(shown) else 1.0
 

@@ -42,7 +42,7 @@ from legcal.signals import INTERRUPTED, raise_if_stopped
 from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
-NO_COMMAND = "No command given; choose one of those above."
+NO_COMMAND = "Nothing was done: found no command, needed one of those above."
 
 app = typer.Typer(
     name="legcal",

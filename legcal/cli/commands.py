@@ -86,27 +86,27 @@ def detect(
             "--output",
             "-o",
             metavar="OUT",
-            help="The folder to write: observations.csv, index.html and every image with its "
-            "detected outlines.",
+            help="The folder to write: observations.csv, index.html and every image with what was "
+            "found in it.",
         ),
     ],
     edit: Annotated[
         bool,
         typer.Option(
             "--edit",
-            help="Then serve the page to the browser: it shows the legs projected with the camera "
-            "estimated from clicked joints, and saves the clicks into the dataset.",
+            help="Then serve the page to the browser of this machine: the legs are drawn at the "
+            "cameras that follow from clicks on joints, and these are saved into the dataset.",
         ),
     ] = False,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="The port of --edit; 0 for any free one.")
+        int, typer.Option(min=0, max=65535, help="The port of --edit; 0 for any that is free.")
     ] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run doctor, and draw the detected outlines over the images for correction.
+    """Do what doctor does, and show the outlines of the legs over the images, to be corrected.
 
     Exit 1 if a camera could not be placed or no outline can be used.
     """
@@ -138,7 +138,7 @@ def _serve_clicks(found: Examination, detection: Detection, folder: Path, port: 
     from legcal.viewer.click_server import ClickServer
 
     server = ClickServer(found, detection, folder, port)
-    typer.echo(f"Click joints at {server.address}; press Ctrl-C to stop.", err=True)
+    typer.echo(f"{server.address} takes clicks on joints; Ctrl-C ends it.", err=True)
     open_browser(str(server.address))
     with suppress(KeyboardInterrupt):  # the way to end it
         server.run()
@@ -151,9 +151,9 @@ def doctor(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a dataset for anything that would prevent calibration, including common mistakes.
+    """Look for all that can stand in the way of calibrating a dataset, common mistakes included.
 
-    Exit 0 if it is ready, 1 if there are problems, 2 if files cannot be used.
+    Exit 0 if nothing stands against it, 1 if something does, 2 if files cannot be used.
     """
     from legcal.calibration import doctor as job
     from legcal.report.doctor import examination_table
@@ -192,7 +192,7 @@ def identify(
         str,
         typer.Argument(
             metavar="MODEL|DATASET",
-            help="A model, or a dataset folder, whose views are judged.",
+            help="A mechanism as for inspect, or a dataset folder, whose own views are judged.",
         ),
     ],
     view: Annotated[
@@ -211,7 +211,7 @@ def identify(
         bool,
         typer.Option(
             "--board",
-            help="A calibration board on the base, visible in every image, relates the cameras to "
+            help="A calibration board on the base is seen in every image: cameras are tied to "
             "each other.",
         ),
     ] = False,
@@ -219,7 +219,7 @@ def identify(
         bool,
         typer.Option(
             "--platform-board",
-            help="A calibration board on the platform is visible in every image.",
+            help="A calibration board on the platform is seen in every image.",
         ),
     ] = False,
     hand_held: Annotated[
@@ -232,7 +232,7 @@ def identify(
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Report which parameters are identifiable, and how to make the others so."""
+    """Say which parameters a calibration can identify, and what would identify the others."""
     from legcal.calibration.identify.identifiability import answer
     from legcal.report.identify import identify_table
     from legcal.report.page.verdicts import identify_verdict
@@ -306,16 +306,16 @@ def locate(
     position_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of each coordinate of a position, e.g. 0.02mm; default: from the residuals."
+            help="Sigma of each coordinate of a position, 0.02mm; by default from the residuals."
         ),
     ] = None,
     angle_sigma: Annotated[
         str | None,
-        typer.Option(help="Sigma of an orientation, e.g. 0.01deg; default: from the residuals."),
+        typer.Option(help="Sigma of an orientation, 0.01deg; by default from the residuals."),
     ] = None,
     encoder_sigma: Annotated[
         str | None,
-        typer.Option(help="Sigma of a reading, e.g. 2um, or 0.01deg for rotary motors; default 0."),
+        typer.Option(help="Sigma of a reading, 2um, of motors that turn 0.01deg; 0 by default."),
     ] = None,
     tool_position: Annotated[
         str | None,

@@ -31,53 +31,49 @@ def plan(
     ],
     images: Annotated[
         int | None,
-        typer.Option(help="Total number of photographs; default 45 (in identify: per view)."),
+        typer.Option(help="Photographs to take in all (in identify: per view); 45."),
     ] = None,
     images_per_view: Annotated[
-        int | None, typer.Option(help="Photographs per view, instead of --images.")
+        int | None, typer.Option(help="Photographs of each view, in place of --images.")
     ] = None,
-    cameras: Annotated[
-        int | None, typer.Option(help="Number of camera positions; default 3.")
-    ] = None,
+    cameras: Annotated[int | None, typer.Option(help="Camera places; 3.")] = None,
     target: Annotated[
         str | None,
         typer.Option(
             metavar="LENGTH",
-            help="Use the fewest images expected to reach this error of the platform, e.g. 0.05mm; "
-            "instead of --images.",
+            help="Instead of --images: the fewest with which this error of the platform is "
+            "expected, 0.05mm.",
         ),
     ] = None,
     noise: Annotated[
         Path | None,
         typer.Option(
             metavar="RESULT",
-            help="Take the outline noise from this result.",
+            help="Errors of outlines as an earlier result has them.",
         ),
     ] = None,
     bounds: Annotated[
         str | None,
         typer.Option(
             metavar="X0:X1,Y0:Y1,Z0:Z1",
-            help="Allowed camera positions in the base link, e.g. -2m:2m,-2m:2m,0m:1.5m.",
+            help="Where cameras may stand in the base link: -2m:2m,-2m:2m,0m:1.5m.",
         ),
     ] = None,
     given: Annotated[
         Path | None,
-        typer.Option(metavar="DATASET", help="Existing dataset to extend."),
+        typer.Option(metavar="DATASET", help="What was shot already: plan what to add."),
     ] = None,
     board: Annotated[
         str | None,
         typer.Option(
             metavar="SPEC",
             help="A calibration board on the base in every image, as for legcal camera; the plan "
-            "gives its position.",
+            "says where it lies.",
         ),
     ] = None,
     hand_held: Annotated[
         bool,
-        typer.Option(
-            "--hand-held", help="Hand-held camera: a new pose for every image; with --board."
-        ),
+        typer.Option("--hand-held", help="Every image from a place of its own; with --board."),
     ] = False,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     workers: WorkersOption = None,
@@ -85,7 +81,7 @@ def plan(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan a session: the poses and camera positions that determine a machine best."""
+    """Plan a session: poses and camera places that determine a machine best."""
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning import request
     from legcal.planning.information import DEFAULT_NOISE

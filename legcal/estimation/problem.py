@@ -543,7 +543,7 @@ class EstimationProblem(Generic[S]):
         return next(factor for factor in self.factors if factor.name == name)
 
     def changed(self, **parts: Any) -> Self:
-        """Return the problem with other fields; its layout is reused as far as it still holds."""
+        """Return the problem with other fields, and with what they leave of its layout."""
         return replace(self, earlier=self.layout, **parts)
 
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:

@@ -49,7 +49,7 @@ MIN_BLOCKS = 4  # of a line
 
 
 def depth_for_blur(blur: float) -> float:
-    """Return the distance from an outline within which pixels are used [px]: just beyond the blur.
+    """Return how far from an outline pixels are used [px]: little more than the blur reaches.
 
     The further inside, the less the shading is that of a limb.
     """
@@ -172,11 +172,11 @@ class Blocks:
         return bins
 
     def kept(self) -> BoolArray:
-        """Return the mask of blocks on the lines of their edges, (n,)."""
+        """Return which blocks lie on the lines of their edges, (n,)."""
         return np.asarray(self.shares() > 0.0)
 
     def shares(self) -> Array:
-        """Return the weights of blocks on the lines of their edges, 0 for the others, (n,)."""
+        """Return how much blocks count that lie on the lines of their edges, 0 of others, (n,)."""
         nothing = [np.zeros(n) for n in np.diff(self.bounds)]
         lines = zip(self.lines, nothing, strict=True)
         return np.concatenate([none if line is None else line.share for line, none in lines])
@@ -283,7 +283,7 @@ class BlockFit:
     power: Array  # of grey levels
 
     def sharpness(self) -> Array:
-        """Return the decrease of chi^2 (n,) by a step of light, over a mere bend of the shading."""
+        """Return how much chi^2 (n,) falls by there being more than a bend of the shading."""
         kept = list(BEND)
         part = self.normal[:, kept][:, :, kept] + 1e-3 * np.eye(len(kept))
         right = self.right[:, kept]

@@ -1,4 +1,4 @@
-"""Common mistakes, each as a changed hypothesis on readings, model or images."""
+"""Common mistakes in a session, each as a changed hypothesis of readings, model or cameras."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, readings_at
 from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 
-_STEP = 1.0 / 16.0  # of the way from home to readings, at least
+_STEP = 1.0 / 16.0  # smallest step from home to readings, relative to the way
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
-_FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)  # of scaled and cropped images
-_FOCAL_STEP = 1.25  # between them, about
-_LATE = {1: "late", -1: "early"}  # by how many rows readings are moved back
-_ZEROS = 8  # steps of the zero of an encoder, in its travel
-_STILL = 0.1  # of such a step: readings that move by less are of an encoder that stands still
-_SAME_END = 0.01  # of the largest reading: ends of a travel as far from zero
-_SAME_RADIUS = 1e-3  # relative: parts that are equally thick are one kind
+# focal lengths of scaled and cropped images, relative to the stated one
+_FOCAL_LENGTHS = (2.0, 0.5, 1.5, 2.0 / 3.0, 1.25, 0.8)
+_FOCAL_STEP = 1.25  # approximate ratio of neighbours
+_LATE = {1: "late", -1: "early"}  # in words, by the number of rows that readings are moved back
+_ZEROS = 8  # steps of the zero of an encoder in its travel
+_STILL = 0.1  # largest range of readings of an encoder at rest, in steps
+_SAME_END = 0.01  # largest asymmetry of a symmetric travel, relative to the largest reading
+_SAME_RADIUS = 1e-3  # largest relative difference of equal radii
 
 
 TURNS = LEFT_RIGHT, UPSIDE_DOWN
@@ -36,26 +37,27 @@ _TURNS_IN_WORDS = (
     ("images mirrored", "mirrored"),
     ("images upside down", "turned upside down"),
 )
-_MOVE_ONE = "move one leg alone and see which column changes, and which leg moves in a photograph"
-_LETTERING = "look at lettering in a photograph"
+_MOVE_ONE = "move one leg alone and compare the column that changes with the leg that moves"
+_OFFSET_REMOVED = "with the offset removed"
+_LETTERING = "look at lettering in an image"
 
 
 @dataclass(frozen=True, eq=False)
 class Assumed:
-    """A hypothesis on a session: readings, model, orientation of images, camera positions."""
+    """A hypothesis of a session: model, readings, image orientation and camera."""
 
     machine: Machine
-    q: Array  # (n_rows, n_legs) readings [m or rad]
-    flip: Array  # (n_rows, 2) -1 along axes that images are turned over
-    place: IntArray  # (n_rows,) number of the camera position within a view, from 0
-    focal: float = 1.0  # focal length over the stated one
+    q: Array  # (n_rows, n_legs): readings [m or rad]
+    flip: Array  # (n_rows, 2): -1 along mirrored image axes, else 1
+    place: IntArray  # (n_rows,): number of the camera position within the view, from 0
+    focal: float = 1.0  # focal length, relative to the stated one
 
     def joints(self, rows: Sequence[int]) -> tuple[Array, Array]:
-        """Return joint centres in the base link, as :func:`joints_of`."""
+        """Return the joint centres in the base link; see :func:`joints_of`."""
         return joints_of([(self, rows)])[0]
 
     def is_as(self, other: Assumed, rows: Sequence[int]) -> bool:
-        """Whether nothing differs from another in some rows."""
+        """Return whether two hypotheses are equal in the given rows."""
         return (
             self.machine is other.machine
             and self.focal == other.focal
@@ -66,7 +68,7 @@ class Assumed:
 
     @property
     def is_in_travel(self) -> bool:
-        """Whether all readings are inside the travel of their legs, or hardly outside."""
+        """Whether all readings are inside the travel of their legs, with a tolerance."""
         return all(
             bool(leg.in_travel(self.q[:, j]).all())
             for j, leg in enumerate(self.machine.legs)
@@ -76,100 +78,103 @@ class Assumed:
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """A possible mistake, and the hypothesis that corrects it."""
+    """A possible mistake with its correction."""
 
     kind: str  # a word or two, for scripts
     what: str  # clause: "columns leg1_prismatic and leg2_prismatic appear to be swapped"
-    mended: str  # "with the columns swapped"
-    remedy: str  # what to do
-    true: Assumed
-    same_as: tuple[str, ...] = ()  # clauses of mistakes that no image can distinguish from it
-    test: str = ""  # how to decide between them: "move one leg alone and ..."
-    is_small: bool = False  # cameras are about where images put them without correction
-    of_few: tuple[int, ...] = ()  # rows, if only single images are affected
-    amount_of: str = ""  # mistakes of one name differ in amount: only the best is reported
-    # The same mistake by a finer amount, in steps; None where it has no amount.
+    mended: str  # phrase for the correction: "with the columns swapped"
+    remedy: str
+    true: Assumed  # hypothesis with the mistake corrected
+    same_as: tuple[str, ...] = ()  # clauses for mistakes that images cannot distinguish from it
+    test: str = ""  # test that confirms it: "move one leg alone and ..."
+    is_small: bool = False  # whether estimated camera poses hardly change
+    of_few: tuple[int, ...] = ()  # affected rows, if it affects single images
+    amount_of: str = ""  # common name of mistakes that differ by their amount only
+    # returns the mistake with its amount changed by fractions of a step; None without an amount
     finer: Callable[[float], Mistake] | None = None
-    # The opposite mistake: if this one fits better than no correction, its opposite fits worse.
-    # None where the opposite may fit as well.
+    # Hypothesis with the opposite correction, which has to agree worse with the images than the
+    # data as given. None if it may agree as well.
     opposite: Assumed | None = None
 
 
 def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
-    """Return joint centres of some rows under each of many hypotheses, in the base link [m].
+    """Return joint centres A and B of given rows under each of many hypotheses, in the base link.
 
-    Those at A and at B, (n_rows, n_legs, 3) each. From home the readings are followed by the
-    equations of the legs alone, those of one machine all together; what is not reached, and all
-    other rows, are NaN.
+    Each is (n_rows, n_legs, 3) [m]. Poses are found by continuation from home, all hypotheses of a
+    machine together; poses that are not reached, and all other rows, are NaN.
     """
-    found = list[tuple[Array, Array]]()
-    for one, _ in parts:
-        shape = (len(one.q), one.machine.n_legs, 3)
-        found.append((np.full(shape, np.nan), np.full(shape, np.nan)))
-    for machine in {id(one.machine): one.machine for one, _ in parts}.values():
-        own = [k for k, (one, _) in enumerate(parts) if one.machine is machine]
-        rows = [np.array(parts[k][1], dtype=np.intp) for k in own]
-        q = np.concatenate([parts[k][0].q[some] for k, some in zip(own, rows, strict=True)])
-        motors, ends = list(machine.motors), np.cumsum([len(some) for some in rows])
+    joints = list[tuple[Array, Array]]()
+    for hypothesis, _ in parts:
+        shape = (len(hypothesis.q), hypothesis.machine.n_legs, 3)
+        joints.append((np.full(shape, np.nan), np.full(shape, np.nan)))
+    for machine in {id(hypothesis.machine): hypothesis.machine for hypothesis, _ in parts}.values():
+        members = [k for k, (hypothesis, _) in enumerate(parts) if hypothesis.machine is machine]
+        rows = [np.array(parts[k][1], dtype=np.intp) for k in members]
+        q = np.concatenate(
+            [parts[k][0].q[selected] for k, selected in zip(members, rows, strict=True)]
+        )
+        motors, ends = list(machine.motors), np.cumsum([len(selected) for selected in rows])
         first = readings_at(machine, machine.home)[motors]
-        poses, part = follow_poses(machine, machine.home, first, q[:, motors], _STEP)
+        poses, reached = follow_poses(machine, machine.home, first, q[:, motors], _STEP)
         B = np.einsum("kij,nj->kni", poses[:, :, :3], machine.B_platform)
         B += poses[:, None, :, 3]
-        B[part < 1.0] = np.nan
+        B[reached < 1.0] = np.nan
         A = machine.A_at(q[:, list(machine.reads)])
-        for k, some, A_of, B_of in zip(
-            own, rows, np.split(A, ends[:-1]), np.split(B, ends[:-1]), strict=True
+        for k, selected, A_of, B_of in zip(
+            members, rows, np.split(A, ends[:-1]), np.split(B, ends[:-1]), strict=True
         ):
-            found[k][0][some], found[k][1][some] = A_of, B_of
-    return found
+            joints[k][0][selected], joints[k][1][selected] = A_of, B_of
+    return joints
 
 
 def as_given(data: OrderedDataset) -> Assumed:
-    """Return the hypothesis that the files are right."""
+    """Return the hypothesis that the files of the session are correct."""
     n = data.measurements.n_rows
     return Assumed(data.machine, data.measurements.q, np.ones((n, 2)), np.zeros(n, dtype=np.intp))
 
 
-def both(one: Mistake, other: Mistake, beside: Sequence[Mistake] = ()) -> Mistake:
-    """Return two mistakes at once: the other was found with the first one corrected.
+def both(first: Mistake, second: Mistake, ambiguous_with: Sequence[Mistake] = ()) -> Mistake:
+    """Return two mistakes at once; the second was found with the first corrected.
 
-    ``beside`` are mistakes that images cannot distinguish from the first, one of each kind.
+    ``ambiguous_with`` are mistakes that images cannot distinguish from the first, one of each kind.
     """
-    alike = [same.what for same in beside if same.kind != one.kind]
+    alike = [same.what for same in ambiguous_with if same.kind != first.kind]
     return Mistake(
-        f"{one.kind} and {other.kind}",
-        f"{one.what}, and {other.what}",
-        f"{one.mended} and {other.mended}",
-        f"{one.remedy}, and {other.remedy}",
-        other.true,
-        (*one.same_as, *alike, *other.same_as),
-        one.test or other.test,
+        f"{first.kind} and {second.kind}",
+        f"{first.what}, and {second.what}",
+        f"{first.mended} and {second.mended}",
+        f"{first.remedy}, and {second.remedy}",
+        second.true,
+        (*first.same_as, *alike, *second.same_as),
+        first.test or second.test,
     )
 
 
 def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
-    """Return the possible mistakes of a session, the commoner before the rarer.
+    """Return the possible mistakes of a session, the most common first.
 
-    They are changes of the hypothesis ``given``, by default that the files are right.
+    They are changes of the hypothesis ``given``, by default the session as given by its files.
     """
     given = given or as_given(data)
     encoders = _Encoders(given)
-    found = [
-        *_of_columns(data, given),
-        *_of_rows(data, given),
-        *_of_units(encoders),
-        *_of_directions(encoders),
-        *_of_zeros(encoders),
-        *_of_images(data, given),
-        *_of_model(given),
-        *_of_radii(given),
-        *_of_cameras(given),
+    candidates = [
+        *_column_mistakes(data, given),
+        *_row_mistakes(data, given),
+        *_unit_mistakes(encoders),
+        *_direction_mistakes(encoders),
+        *_zero_mistakes(encoders),
+        *_image_mistakes(data, given),
+        *_handedness_mistake(given),
+        *_radius_mistakes(given),
+        *_focal_length_mistakes(given),
     ]
-    return [one for one in found if one.true.is_in_travel or not given.is_in_travel]
+    return [
+        mistake for mistake in candidates if mistake.true.is_in_travel or not given.is_in_travel
+    ]
 
 
-def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings of other legs: columns swapped, reversed, or rotated."""
+def _column_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
+    """Yield wrong orders of the columns: two swapped, reversed, rotated."""
     order = inverse(data.order.legs)  # legs as the files have them
     motors = [j for j in order.tolist() if j in given.machine.motors]
     names = [given.machine.legs[j].prismatic for j in motors]
@@ -180,60 +185,61 @@ def _of_columns(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         return replace(given, q=q)
 
     n = len(motors)
-    every = list(range(n))
-    for i, k in combinations(every, 2):
-        source = every.copy()
+    in_order = list(range(n))
+    for i, k in combinations(in_order, 2):
+        source = in_order.copy()
         source[i], source[k] = k, i
-        ones = [given.machine.legs[motors[i]], given.machine.legs[motors[k]]]
-        legs = " and ".join(leg.motor_label for leg in ones)
-        what = "motors" if all(leg.actuator for leg in ones) else "legs"
+        swapped = [given.machine.legs[motors[i]], given.machine.legs[motors[k]]]
+        legs = " and ".join(leg.motor_label for leg in swapped)
+        noun = "motors" if all(leg.actuator for leg in swapped) else "legs"
         yield Mistake(
             "columns exchanged",
             f"columns {names[i]} and {names[k]} appear to be swapped",
             "with the columns swapped",
             "swap the headers of these columns",
             with_columns(source),
-            (f"{what} {legs} appear to be swapped in the model",),
+            (f"{noun} {legs} appear to be swapped in the model",),
             _MOVE_ONE,
         )
-    if n > 3:  # of three these are two exchanged
+    if n > 3:  # reversing three columns is the same as swapping two
         yield Mistake(
             "columns reversed",
-            "the reading columns appear to be in reverse order",
+            "the columns of readings appear to be in reverse order",
             "with the columns reversed",
             "reverse the headers of the columns",
-            with_columns(every[::-1]),
+            with_columns(in_order[::-1]),
             ("the legs appear to be numbered in reverse order in the model",),
             _MOVE_ONE,
         )
     for k in range(1, n) if n > 2 else ():
         yield Mistake(
             "columns rotated",
-            f"the reading columns appear to be shifted: column {names[0]} contains the readings "
-            f"of {names[(n - k) % n]}",
-            f"with the columns shifted by {k}",
+            f"the columns of readings appear to be rotated (column {names[0]} contains the "
+            f"readings of {names[(n - k) % n]})",
+            f"with the columns rotated by {k}",
             "correct the headers of the columns",
-            with_columns([(j + k) % n for j in every]),
-            ("the legs appear to be numbered from another starting leg in the model",),
+            with_columns([(j + k) % n for j in in_order]),
+            ("the legs appear to be numbered from a different starting leg in the model",),
             _MOVE_ONE,
         )
 
 
 def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
-    """Return readings of a view that are a row late (k = 1) or early (-1) from its row *first* on.
+    """Return readings of a view that are one row late (k = 1) or early (-1) from a row on.
 
-    Rows count in the order of the file. The last row, whose readings are unknown, keeps its own.
+    *first* is the number of that row in the view. The readings of the last row are unknown and
+    stay.
     """
     rows = rows_of_views(data)[v][first:]
     q = given.q.copy()
     q[rows[:-k] if k > 0 else rows[-k:]] = given.q[rows[k:] if k > 0 else rows[:k]]
     name, row = data.measurements.views[v].name, data.order.rows[rows[0]]
-    where = row_names(data.dataset.measurements)[row]
+    row_name = row_names(data.dataset.measurements)[row]
     return Mistake(
         "readings shifted",
-        f"from {where} on, the readings of view {name} appear to be 1 row too {_LATE[k]}; "
-        f"{'an image' if k > 0 else 'a row of readings'} may be missing there",
-        "with the readings shifted by 1 row",
+        f"from {row_name} on, the readings of view {name} appear to be one row {_LATE[k]} "
+        f"({'an image' if k > 0 else 'a row of readings'} may be missing there)",
+        "with the readings moved by 1 row",
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows of view {name}",
@@ -249,56 +255,55 @@ def rows_of_views(data: OrderedDataset) -> list[IntArray]:
     ]
 
 
-def _of_rows(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings of other images: shifted by a row, in all views or in one."""
+def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
+    """Yield readings shifted by a row, in all views or in one."""
     of_view = rows_of_views(data)
-    names = [one.name for one in data.measurements.views]
-    every = [rows for rows in of_view if len(rows)]
+    nonempty = [rows for rows in of_view if len(rows)]
 
-    def moved(which: Sequence[IntArray], k: int, view: str = "") -> Iterator[Mistake]:
-        if any(len(rows) <= 2 for rows in which):
+    def moved(shifted: Sequence[IntArray], k: int, view: str = "") -> Iterator[Mistake]:
+        if any(len(rows) <= 2 for rows in shifted):
             return
         q = given.q.copy()
-        for rows in which:
+        for rows in shifted:
             q[rows] = given.q[np.roll(rows, -k)]
-        where = f" of view {view}" if view else ""
+        view_in_words = f" of view {view}" if view else ""
         yield Mistake(
             "readings shifted",
-            f"the readings{where} appear to be 1 row too {_LATE[k]}: each image is paired with "
-            "the readings of its neighbour",
-            "with the readings shifted by 1 row",
+            f"the readings{view_in_words} appear to be one row {_LATE[k]} (each image is paired "
+            "with the readings of a neighbour)",
+            "with the readings moved by 1 row",
             "check which image belongs to which row",
             replace(given, q=q),
-            amount_of=f"rows{where}",
+            amount_of=f"rows{view_in_words}",
         )
 
     for k in _LATE:
-        yield from moved(every, k)
+        yield from moved(nonempty, k)
     for v, rows in enumerate(of_view):
-        if len(every) > 1:
+        if len(nonempty) > 1:
             for k in _LATE:
-                yield from moved([rows], k, names[v])
+                yield from moved([rows], k, data.measurements.views[v].name)
 
 
 @dataclass(frozen=True, eq=False)
 class _Encoders:
-    """The encoders of a session, their readings, and their names in messages."""
+    """The encoders of a session with their readings and names."""
 
     given: Assumed
 
     @cached_property
     def legs(self) -> list[Leg]:
-        """The leg that each encoder reads, or the first leg that its motor moves."""
+        """The leg of each encoder, or the first of several legs."""
         return [self.given.machine.legs[j] for j in self.given.machine.motors]
 
     @property
     def names(self) -> list[str]:
-        """Their columns in the table of readings."""
+        """The columns of the encoders in the table of readings."""
         return [str(leg.prismatic) for leg in self.legs]
 
     @property
-    def every(self) -> list[int]:
-        """All of them."""
+    def indices(self) -> list[int]:
+        """Indices of all encoders."""
         return list(range(len(self.legs)))
 
     @cached_property
@@ -308,89 +313,89 @@ class _Encoders:
 
     @property
     def move_legs_alone(self) -> bool:
-        """Whether each reads the length of a leg."""
+        """Whether each encoder reads the length of a leg."""
         return not any(leg.actuator for leg in self.legs)
 
     @property
-    def turning(self) -> list[int]:
-        """Indices of encoders that read angles."""
+    def angular(self) -> list[int]:
+        """Indices of the encoders that read angles."""
         return [k for k, leg in enumerate(self.legs) if leg.reads_angle]
 
     @cached_property
     def zero_steps(self) -> Array:
-        """Step by which zeros are varied (n_encoders,) [m or rad]."""
+        """Step of the zero of each encoder, (n_encoders,) [m or rad]."""
         width = np.array([leg.travel[1] - leg.travel[0] for leg in self.legs])
-        is_known = (width > 0.0) & np.isfinite(width)
-        return np.where(is_known, width, np.ptp(self.q, axis=0)) / _ZEROS
+        has_travel = (width > 0.0) & np.isfinite(width)
+        return np.where(has_travel, width, np.ptp(self.q, axis=0)) / _ZEROS
 
     @property
     def moving(self) -> list[int]:
-        """Indices of encoders that move: images can confirm their direction and their zero."""
+        """Indices of the encoders that move, whose direction and zero images can confirm."""
         return np.flatnonzero(np.ptp(self.q, axis=0) > _STILL * self.zero_steps).tolist()
 
     @property
     def in_words(self) -> str:
-        """``legs`` or ``motors``, for messages."""
+        """Noun for all encoders."""
         return "legs" if self.move_legs_alone else "motors"
 
-    def reading(self, q: Array, which: Sequence[int]) -> Assumed:
-        """Return the hypothesis that some encoders had other readings (n_rows, n_some)."""
+    def reading(self, q: Array, encoders: Sequence[int]) -> Assumed:
+        """Return the hypothesis with other readings (n_rows, n) of some encoders."""
         motors, changed = self.given.machine.motors, self.given.q.copy()
-        changed[:, [motors[k] for k in which]] = q
+        changed[:, [motors[k] for k in encoders]] = q
         return replace(self.given, q=changed)
 
 
-def _of_units(encoders: _Encoders) -> Iterator[Mistake]:
-    """Yield angles in another unit; lengths in another one are outside the travel and refused."""
-    turning = encoders.turning
-    of = (
+def _unit_mistakes(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield angles in another unit; lengths in another unit are outside the travel and refused."""
+    turning = encoders.angular
+    columns = (
         ""
         if len(turning) == len(encoders.legs)
         else f" of {few([encoders.names[k] for k in turning])}"
     )
-    angles = (np.pi / 180.0, "degrees"), (180.0 / np.pi, "radians that were taken for degrees")
+    angles = (np.pi / 180.0, "in degrees"), (180.0 / np.pi, "radians interpreted as degrees")
     for scale, unit in angles if turning else ():
         yield Mistake(
             "unit",
-            f"the readings{of} look like {unit}",
+            f"the readings{columns} appear to be {unit}",
             "interpreted that way",
             f"multiply these readings by {scale:g}",
             encoders.reading(scale * encoders.q[:, turning], turning),
         )
 
 
-def _of_directions(encoders: _Encoders) -> Iterator[Mistake]:
-    """Yield readings of the other direction, of one encoder or of all."""
+def _direction_mistakes(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield readings with reversed direction, of one encoder or of all."""
     q = encoders.q
     ends = np.array([sum(leg.travel) for leg in encoders.legs])
     ends = np.where(np.isfinite(ends), ends, q.min(axis=0) + q.max(axis=0))
-    # Where a travel is as far both ways, as of most servos, the other end has the opposite sign.
+    # For a symmetric travel, as of most servos, reversal is the same as the opposite sign.
     reversible = np.abs(ends) > _SAME_END * np.abs(q).max(axis=0)
-    for reversed_q, what, which in (
-        (-q, "the opposite sign", encoders.every),
+    for reversed_q, description, affected in (
+        (-q, "the opposite sign", encoders.indices),
         (ends - q, "the opposite direction", np.flatnonzero(reversible).tolist()),
     ):
-        if which:
+        if affected:
             yield Mistake(
                 "direction of encoders",
-                f"the readings of all {encoders.in_words} appear to have {what}",
+                f"the readings of all {encoders.in_words} appear to have {description}",
                 "with the readings reversed",
                 "reverse them in the table of readings",
-                encoders.reading(reversed_q, encoders.every),
+                encoders.reading(reversed_q, encoders.indices),
             )
-        for k in (k for k in encoders.moving if k in which):
+        for k in (k for k in encoders.moving if k in affected):
             yield Mistake(
                 "direction of an encoder",
-                f"column {encoders.names[k]} appears to have {what}",
+                f"column {encoders.names[k]} appears to have {description}",
                 "with the column reversed",
                 "reverse the column in the table of readings",
                 encoders.reading(reversed_q[:, k : k + 1], [k]),
             )
 
 
-def _of_zeros(encoders: _Encoders) -> Iterator[Mistake]:
-    """Yield wrong zeros of one encoder or of all."""
-    are_alike = len(encoders.turning) in (0, len(encoders.legs))  # else no zero is common
+def _zero_mistakes(encoders: _Encoders) -> Iterator[Mistake]:
+    """Yield readings with a zero offset, of one encoder or of all."""
+    are_alike = len(encoders.angular) in (0, len(encoders.legs))  # of one unit
     for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
         if are_alike:
             yield _zero_of_all(encoders, m)
@@ -399,16 +404,16 @@ def _of_zeros(encoders: _Encoders) -> Iterator[Mistake]:
 
 
 def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
-    """Return a wrong zero of all encoders, by m steps."""
-    step, is_angle = float(encoders.zero_steps.mean()), bool(encoders.turning)
+    """Return a common zero offset of all encoders by -m steps."""
+    step, is_angle = float(encoders.zero_steps.mean()), bool(encoders.angular)
     zeros = "the offsets" if encoders.move_legs_alone else "the zeros of motors"
     return Mistake(
         "zero of encoders",
-        f"the readings of all {encoders.in_words} appear to have a wrong zero: about "
-        f"{_too_small(m, step, is_angle=is_angle)}",
-        _with_that(m),
+        f"the readings of all {encoders.in_words} appear to have a zero offset of about "
+        f"{_offset_in_words(-m * step, is_angle=is_angle)}",
+        _OFFSET_REMOVED,
         f"correct the table of readings, or {zeros} in the model",
-        encoders.reading(encoders.q + m * step, encoders.every),
+        encoders.reading(encoders.q + m * step, encoders.indices),
         is_small=True,
         amount_of="zero of all encoders",
         finer=lambda more: _zero_of_all(encoders, m + more),
@@ -416,14 +421,14 @@ def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
 
 
 def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
-    """Return a wrong zero of the k-th encoder, by m steps."""
+    """Return a zero offset of the k-th encoder by -m steps."""
     step, name = float(encoders.zero_steps[k]), encoders.names[k]
     zero = f"the zero of {name}" if encoders.legs[k].actuator else "the offset of the leg"
     return Mistake(
         "zero of an encoder",
-        f"column {name} appears to have a wrong zero: about "
-        f"{_too_small(m, step, is_angle=k in encoders.turning)}",
-        _with_that(m),
+        f"column {name} appears to have a zero offset of about "
+        f"{_offset_in_words(-m * step, is_angle=k in encoders.angular)}",
+        _OFFSET_REMOVED,
         f"correct the column in the table of readings, or {zero} in the model",
         encoders.reading(encoders.q[:, [k]] + m * step, [k]),
         is_small=True,
@@ -432,24 +437,20 @@ def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
     )
 
 
-def _too_small(m: float, step: float, *, is_angle: bool) -> str:
-    """Return the error of readings that lack m steps [m or rad], in words."""
-    amount, unit = (np.degrees(step), "deg") if is_angle else (1e3 * step, "mm")
-    return f"{abs(m * amount):.0f} {unit} too {'small' if m > 0 else 'large'}"
+def _offset_in_words(offset: float, *, is_angle: bool) -> str:
+    """Return an offset [m or rad] in words."""
+    amount, unit = (np.degrees(offset), "deg") if is_angle else (1e3 * offset, "mm")
+    return f"{amount:+.0f} {unit}"
 
 
-def _with_that(m: float) -> str:
-    return f"after {'adding' if m > 0 else 'subtracting'} it"
-
-
-def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield images that are mirrored or upside down, all or those of a view."""
+def _image_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
+    """Yield mirrored or upside-down images, all or those of a view."""
     views = data.measurements.views
-    every = list(range(data.measurements.n_rows))
+    all_rows = list(range(data.measurements.n_rows))
     for turn in TURNS:
-        yield _turned_over(data, given, every, turn, "")
+        yield _turned_over(data, given, all_rows, turn, "")
     for v, view in enumerate(views) if len(views) > 1 else ():
-        # Not upside down: of one camera, it may be held so.
+        # Not upside down: a single camera may be mounted that way.
         rows = np.flatnonzero(data.measurements.view == v).tolist()
         yield _turned_over(data, given, rows, LEFT_RIGHT, f" of view {view.name}")
 
@@ -457,74 +458,76 @@ def _of_images(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 def turned_images(
     data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array
 ) -> Mistake:
-    """Return some images of a view that are turned over while the others are not."""
+    """Return mirrored or upside-down images in some rows of a view."""
     m = data.measurements
-    which = f" {_images(data, rows)} of view {m.views[m.view[rows[0]]].name}"
-    one = _turned_over(data, given, rows, turn, which)
-    return replace(one, of_few=tuple(rows), test="")
+    rows_in_words = f" {_images(data, rows)} of view {m.views[m.view[rows[0]]].name}"
+    mistake = _turned_over(data, given, rows, turn, rows_in_words)
+    return replace(mistake, of_few=tuple(rows), test="")
 
 
 def moved_cameras(
     data: OrderedDataset, given: Assumed, views: Sequence[Sequence[Sequence[int]]]
 ) -> Mistake:
-    """Return images of some views taken from several positions, by the rows of each position."""
-    m, place, things = data.measurements, given.place.copy(), _things(data)
-    others, said = list[int](), list[str]()
+    """Return views with several camera positions, each given by its rows."""
+    m, place, noun = data.measurements, given.place.copy(), _observation_noun(data)
+    moved_rows, clauses = list[int](), list[str]()
     for places in views:
-        others += [row for rows in places[1:] for row in rows]
+        moved_rows += [row for rows in places[1:] for row in rows]
         for k, rows in enumerate(places):
             place[list(rows)] = k
         in_file = sorted(places, key=lambda rows: int(data.order.rows[list(rows)].min()))
-        of_each = [f"{_images(data, rows)} from {'another' if k else 'one'}"
-                   for k, rows in enumerate(in_file)]  # fmt: skip
-        what = "those" if said else f"the {things}"
-        said.append(
-            f"{what} of view {m.views[m.view[places[0][0]]].name} appear to be taken from "
-            f"{len(places)} camera positions: {', '.join(of_each)}"
+        positions_in_words = ", ".join(
+            f"{_images(data, rows)} from position {k}" for k, rows in enumerate(in_file, 1)
+        )
+        subject = "those" if clauses else f"the {noun}"
+        clauses.append(
+            f"{subject} of view {m.views[m.view[places[0][0]]].name} appear to be taken from "
+            f"{len(places)} camera positions ({positions_in_words})"
         )
     return Mistake(
         "camera moved",
-        ", and ".join(said),
+        ", and ".join(clauses),
         "with a view for each position",
-        f"give the {things} of each position their own view (for legcal init a folder, or a "
+        f"give the {noun} of each position a separate view (for legcal init a folder, or a "
         "column view)",
         replace(given, place=place),
-        of_few=tuple(others),
+        of_few=tuple(moved_rows),
     )
 
 
-def _things(data: OrderedDataset) -> str:
-    """Return ``images`` or ``outlines``, whichever the dataset has."""
+def _observation_noun(data: OrderedDataset) -> str:
+    """Return the noun for the observations of the session."""
     return "images" if len(data.photographs.detect) else "outlines"
 
 
 def _images(data: OrderedDataset, rows: Sequence[int]) -> str:
-    """Return the name of the first of some images in the file, and the number of others."""
+    """Return images in words: the first one in the file and the number of others."""
     in_file = sorted(data.order.rows[list(rows)].tolist())
-    return f"{row_names(data.dataset.measurements)[in_file[0]]} and {len(rows) - 1} more"
+    others = f"{len(rows) - 1} other{'s' * (len(rows) != 2)}"
+    return f"{row_names(data.dataset.measurements)[in_file[0]]} and {others}"
 
 
 def _turned_over(
-    data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array, which: str
+    data: OrderedDataset, given: Assumed, rows: Sequence[int], turn: Array, rows_in_words: str
 ) -> Mistake:
-    kind, what = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
+    kind, description = _TURNS_IN_WORDS[turn is UPSIDE_DOWN]
     flip = given.flip.copy()
     flip[list(rows)] *= turn
-    things, remedy = _things(data), "replace these images with the originals"
-    if things == "outlines":
-        remedy = "correct the sign of a coordinate in their table"
+    noun, remedy = _observation_noun(data), "replace these images by the originals"
+    if noun == "outlines":
+        remedy = "correct the direction of an axis of their table"
     return Mistake(
         kind,
-        f"the {things}{which} appear to be {what}",
-        f"with the {things} turned back",
+        f"the {noun}{rows_in_words} appear to be {description}",
+        f"with the {noun} turned back",
         remedy,
         replace(given, flip=flip),
         test=_LETTERING,
     )
 
 
-def _of_model(given: Assumed) -> Iterator[Mistake]:
-    """Yield a model made from a left-handed table of joints."""
+def _handedness_mistake(given: Assumed) -> Iterator[Mistake]:
+    """Yield the joints of a left-handed table."""
     machine = given.machine
     mirrored = replace(
         machine,
@@ -533,16 +536,16 @@ def _of_model(given: Assumed) -> Iterator[Mistake]:
     )
     yield Mistake(
         "handedness",
-        "the model appears to be mirrored: the y coordinates of its joints have the wrong sign",
-        "with the sign of y reversed",
-        "reverse the sign of all y in the model",
+        "the model appears mirrored: the y coordinates of its joints have the wrong sign",
+        "with the signs of y reversed",
+        "reverse the signs of all y in the model",
         replace(given, machine=mirrored),
-        test="compare the signs of y in the model with the positions of the legs in a photograph",
+        test="compare the signs of y in the model with the order of the legs in an image",
     )
 
 
 def _mirrored(leg: Leg) -> Leg:
-    """Return a leg with y of joints and axes reversed, and rotations too."""
+    """Return a leg with y of its joints and axes reversed; axes of rotation are pseudovectors."""
     base, platform = (
         None if axis is None else _MIRROR @ axis for axis in (leg.base_axis, leg.platform_axis)
     )
@@ -553,31 +556,31 @@ def _mirrored(leg: Leg) -> Leg:
     return replace(leg, A=A, B=B, base_axis=base, platform_axis=platform, actuator=actuator)
 
 
-def _of_radii(given: Assumed) -> Iterator[Mistake]:
-    """Yield diameters in place of radii: of all parts, or of all equally thick parts."""
+def _radius_mistakes(given: Assumed) -> Iterator[Mistake]:
+    """Yield diameters in place of radii: of all parts, or of parts of one radius."""
     machine = given.machine
     radii = sorted({c.radius for leg in machine.legs for c in leg.cylinders})
     kinds = [r for i, r in enumerate(radii) if i == 0 or r > (1.0 + _SAME_RADIUS) * radii[i - 1]]
 
-    def halved(only: float | None) -> Assumed:
+    def halved(single: float | None) -> Assumed:
         def radius(r: float) -> float:
-            return 0.5 * r if only is None or abs(r - only) <= _SAME_RADIUS * r else r
+            return 0.5 * r if single is None or abs(r - single) <= _SAME_RADIUS * r else r
 
         return replace(given, machine=machine.with_radii(lambda _, c: radius(c.radius)))
 
-    which = [(None, "the radii"), *((r, f"the radius {1e3 * r:g} mm") for r in kinds[:2])]
-    for only, name in which[: 1 if len(kinds) < 2 else None]:
+    all_radii: list[tuple[float | None, str, str]] = [(None, "the radii", "appear to be diameters")]
+    single_radii = [(r, f"the radius {1e3 * r:g} mm", "appears to be a diameter") for r in kinds]
+    for single, name, appears in all_radii + (single_radii[:2] if len(kinds) > 1 else []):
         yield Mistake(
             "diameter for radius",
-            f"{name} of the legs in the model appear{'s' * (only is not None)} to be twice too "
-            "large: a diameter in place of a radius",
+            f"{name} of the legs in the model {appears}",
             f"with {name} halved",
             "correct the <visual> cylinders of the model",
-            halved(only),
+            halved(single),
         )
 
 
-def _of_cameras(given: Assumed) -> Iterator[Mistake]:
+def _focal_length_mistakes(given: Assumed) -> Iterator[Mistake]:
     """Yield focal lengths of images that were scaled or cropped."""
     yield from (_focal_length(given, factor) for factor in _FOCAL_LENGTHS)
 
@@ -585,8 +588,8 @@ def _of_cameras(given: Assumed) -> Iterator[Mistake]:
 def _focal_length(given: Assumed, factor: float) -> Mistake:
     return Mistake(
         "focal length",
-        f"the focal length appears to be {factor:.2g} times the stated one: images were scaled or "
-        "cropped after the camera was calibrated, or the zoom is different",
+        f"the focal length appears to be {factor:.2g} times the stated one (images scaled or "
+        "cropped after the camera calibration, or another zoom)",
         "with that focal length",
         "calibrate the camera with unscaled images at the same zoom as these (legcal camera)",
         replace(given, focal=factor * given.focal),

@@ -449,7 +449,7 @@ def legs_left_out(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     )
 
 
-def arms_with_wrong_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str]:
+def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str]:
     """Return the legs whose arms have another width than the model's in most images, with reasons.
 
     *is_arm* marks the outlines of arms in the table. Both edges of an arm of another shape or

@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit.determinacy import (
     undetermined_directions,
 )
 from legcal.calibration.joint_fit.diagnostics import (
-    arms_with_wrong_widths,
+    arms_of_other_widths,
     blaming_stated_values,
     refuse_contradicted_board,
     refuse_contradicted_priors,
@@ -140,7 +140,7 @@ def _fit_without_wrong_arms(
     the estimated noise. If the fit fails with arms, all of them are left out.
     """
     is_arm = are_of_arms(outlines, legs)
-    notes, wrong = list[str](), arms_with_wrong_widths(outlines, is_arm)
+    notes, wrong = list[str](), arms_of_other_widths(outlines, is_arm)
     while True:
         if wrong:
             left_out = is_arm & np.isin(outlines.leg, list(wrong))

@@ -226,7 +226,7 @@ def _doubts(
     if undecided:
         doubts.append(
             f"the readings of {few(undecided)} contradict each other, and the measurements do not "
-            "determine which motor is wrong; check them, or remove the images"
+            "show which motor is wrong; check them, or remove the images"
         )
     expected_squares, squares = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if squares > expected_squares + _SIGNIFICANT * np.sqrt(2.0 * expected_squares):
