@@ -138,23 +138,23 @@ class Examination:
 
     @property
     def n_used(self) -> int:
-        """Number of usable outlines."""
+        """How many outlines can be used."""
         return sum(view.outlines_used or 0 for view in self.views)
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is no error."""
+        """Whether nothing stands against calibrating."""
         return not self.count("error")
 
     @property
     def sentence(self) -> str:
-        """The number of errors and warnings, or the command to go on with."""
+        """Whether to go on, and with what."""
         wrong, odd = self.count("error"), self.count("warning")
-        look = f", {odd} warning{'s' * (odd != 1)}" * (odd > 0)
+        look = f", {odd} thing{'s' * (odd != 1)} to look at" * (odd > 0)
         if wrong:
-            return f"{wrong} error{'s' * (wrong != 1)} to correct before calibrating{look}."
+            return f"{wrong} thing{'s' * (wrong != 1)} to mend before calibrating{look}."
         folder = shlex.quote(printable(self.dataset))
-        return f"Ready to calibrate{look}: legcal calibrate {folder} -o OUT"
+        return f"Nothing stands against calibrating{look}: legcal calibrate {folder} -o OUT"
 
     def document(self) -> dict[str, Any]:
         """Return what ``legcal doctor --json`` prints."""

@@ -182,9 +182,9 @@ def examination_page(found: Examination, detection: Detection, token: str = "") 
 
 def _verdict(found: Examination) -> Verdict:
     if found.count("error"):
-        return Verdict("bad", "Errors", found.sentence, [])
+        return Verdict("bad", "To be mended", found.sentence, [])
     if found.count("warning"):
-        return Verdict("doubtful", "Warnings", found.sentence, [])
+        return Verdict("doubtful", "To be looked at", found.sentence, [])
     return Verdict("good", "Ready", found.sentence, [])
 
 

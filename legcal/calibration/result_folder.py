@@ -99,8 +99,8 @@ def write_result(
                 # The nominal model, of which the refusal speaks, is not the cause: the calibrated
                 # one was made from it in the same way.
                 note = (
-                    "staged.yaml was not written: the joints of the four steps do not form a model "
-                    "that closes at home. The calibrated model does not depend on it."
+                    "There is no model of the four steps (staged.yaml): the joints that they found "
+                    "make none that loads and closes. The calibrated model does not depend on it."
                 )
                 calibration = replace(calibration, notes=(*calibration.notes, note))
                 for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
@@ -132,13 +132,13 @@ def _urdf_of(yaml: Path) -> Path:
 
 def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     """Write a mechanism with other legs; loaded again it must be what was computed, and close."""
-    start = f"{yaml}: the model could not be written:"
+    start = f"{yaml}: the model could not be written: found"
     write_urdf(machine, legs, _urdf_of(yaml))
     home = home_of_legs(machine, legs, MAX_HOME_RESIDUAL)
     if home is None:
         raise DidNotConverge(
-            f"{start} its legs do not close near legcal.home; check legcal.home of "
-            f"{machine.yaml_path}, and the nominal model."
+            f"{start} no closed pose of its legs near legcal.home, needed one; check legcal.home "
+            f"of {machine.yaml_path}, and the nominal model."
         )
     moved = None if home is machine.home else home
     write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved, legs)
@@ -149,8 +149,8 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     off = float(np.abs(apart / unit).max())
     if not off <= RELOAD_TOLERANCE:
         raise DidNotConverge(
-            f"{start} its parameters, loaded again, differ by {off:.1e} leg lengths or rad from "
-            f"the computed ones (limit {RELOAD_TOLERANCE:.0e}); please report this."
+            f"{start} that its parameters, loaded again, differ by {off:.1e} leg lengths or rad "
+            f"from the computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
         )
 
 
