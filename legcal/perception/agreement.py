@@ -206,8 +206,8 @@ def _agreement(task: _Task) -> Agreement:
     placed = place_camera(task.pictures, task.n_legs, task.starts, task.known)
     if len(placed.poses) == 0:
         return nothing
-    found = np.isin(row, task.known_rows)
+    is_known = np.isin(row, task.known_rows)
     cost = float(placed.support[0].sum() - placed.score[0]) / len(task.known_rows)
-    support[found] = np.maximum(placed.support[0] - cost, 0.0)
-    expected[found] = placed.expected[0]
+    support[is_known] = np.maximum(placed.support[0] - cost, 0.0)
+    expected[is_known] = placed.expected[0]
     return Agreement(row, support, expected, (placed.pose(),))

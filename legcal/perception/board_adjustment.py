@@ -143,7 +143,7 @@ def adjust_board(
     moving = problem
     if held:
         moving = replace(problem, variables=tuple(map(_held, problem.variables)))
-    found = minimise(
+    minimum = minimise(
         moving,
         state,
         LOSS,
@@ -151,14 +151,14 @@ def adjust_board(
         tolerance=tolerance,
         must_converge=False,
     )
-    linear = linearize(problem, found.state) if held else found.linear
-    normal = normal_equations(problem, found.state, linear, LOSS)
+    linear = linearize(problem, minimum.state) if held else minimum.linear
+    normal = normal_equations(problem, minimum.state, linear, LOSS)
     return AdjustedBoard(
-        found.state.camera,
-        found.state.board_pose.motions,
-        found.state.sheet,
+        minimum.state.camera,
+        minimum.state.board_pose.motions,
+        minimum.state.sheet,
         -linear["corners"].r * seen.sigma_px[:, None],
-        found.cost,
+        minimum.cost,
         normal.kept_covariance(),
         clustered(problem, linear, normal, LOSS),
         normal.V,

@@ -63,10 +63,12 @@ def _refine(
 ) -> PlanePose | None:
     """Return the pose of least cost near a start; None if it puts points behind the camera."""
     one = BoardImages(np.zeros(len(px), dtype=np.intp), points, px, sigma_px)
-    found = adjust_board(camera, [start], one)
-    if found is None:
+    adjusted = adjust_board(camera, [start], one)
+    if adjusted is None:
         return None
-    return PlanePose(found.T_camera_board[0], found.cost, found.residual, found.information[0])
+    return PlanePose(
+        adjusted.T_camera_board[0], adjusted.cost, adjusted.residual, adjusted.information[0]
+    )
 
 
 def _distinct(poses: list[PlanePose], angle: float) -> list[PlanePose]:

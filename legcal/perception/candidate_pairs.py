@@ -245,7 +245,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
 
     What bends is cut where it is farthest from the line between its ends.
     """
-    found = []
+    pieces = []
     x, y = points
     gx, gy = gradient.astype(np.float64)
     for _ in range(MAX_CUTS + 1):
@@ -269,7 +269,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
         ends = np.stack([one.reduceat(place, first) for one in (np.minimum, np.maximum)])
         middle = np.stack([mx, my])
         lines = (middle + ends[:, None] * u).transpose(2, 0, 1)
-        found.append(lines[is_straight])
+        pieces.append(lines[is_straight])
         bent = np.flatnonzero(np.repeat(~is_straight, n))
         if len(bent) == 0:
             break
@@ -287,7 +287,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
         )
         order = np.argsort(chain, kind="stable")
         x, y, gx, gy, chain = (one.take(order) for one in (x, y, gx, gy, chain))
-    return np.concatenate([np.zeros((0, 2, 2)), *found])
+    return np.concatenate([np.zeros((0, 2, 2)), *pieces])
 
 
 def _first_of(values: Array, value: Array, first: IntArray, n: IntArray) -> IntArray:

@@ -114,16 +114,16 @@ def _candidates(grey: Grey) -> tuple[Array, Array, Array]:
 def _summit(strength: Grey, row: IntArray, column: IntArray) -> Array:
     """Return the subpixel offsets of peaks, (n, 2), by parabolas."""
     height, width = strength.shape
-    found = []
+    offsets = []
     for dr, dc, size, at in ((0, 1, width, column), (1, 0, height, row)):
         inner = (at > 0) & (at < size - 1)
         r, c = np.where(inner, row, 1), np.where(inner, column, 1)
         before, here, after = (strength[r + k * dr, c + k * dc] for k in (-1, 0, 1))
         bend = before - 2.0 * here + after
-        found.append(
+        offsets.append(
             np.where(inner & (bend < 0.0), 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
         )
-    return np.asarray(np.clip(np.column_stack(found), -0.5, 0.5))
+    return np.asarray(np.clip(np.column_stack(offsets), -0.5, 0.5))
 
 
 def _sampled(image: Grey, px: Array) -> Array:
@@ -302,8 +302,8 @@ def expected(
     ridge = np.array([1e-9, 1e-6, 1e-6, _STIFF, _STIFF, _STIFF])
     N[:, np.arange(6), np.arange(6)] += ridge * size[:, None]
     centre = (weight @ px) / size[:, None]
-    found = np.linalg.solve(N, W @ (px - centre[:, None]))
-    return centre + found[:, 0], np.swapaxes(found[:, 1:3], 1, 2) / pitch
+    slopes = np.linalg.solve(N, W @ (px - centre[:, None]))
+    return centre + slopes[:, 0], np.swapaxes(slopes[:, 1:3], 1, 2) / pitch
 
 
 def measured(

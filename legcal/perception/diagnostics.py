@@ -105,16 +105,16 @@ def find_wrong_images(
     usable = [row for row in rows.tolist() if row not in defects]
     defective = set(view[rows].tolist()) - set(view[usable].tolist())
     placement = _without_views(search.measurements, placement, sorted(defective), defects)
-    found = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
-    suspects = _suspects(found, view)
-    usual = _usual(search, placement, found, suspects, run)
+    counts = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
+    suspects = _suspects(counts, view)
+    usual = _usual(search, placement, counts, suspects, run)
     task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
     single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
     notes = defect_notes(search.measurements, single)
     left_out, barely = dict[int, Cause](), dict[int, Cause]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
-        reason, said = image_verdict(search.measurements, row, explanation, usual, found)
+        reason, said = image_verdict(search.measurements, row, explanation, usual, counts)
         if reason:
             reasons[row] = reason
         if reason.reason is Reason.OTHER_SCENE:
@@ -124,7 +124,7 @@ def find_wrong_images(
         else:
             barely[row] = Cause("{}.", (said,))
     notes += _left_out_notes(search.measurements, left_out)
-    notes += _leg_notes(search, placement, outlines, found, reasons)
+    notes += _leg_notes(search, placement, outlines, counts, reasons)
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
@@ -169,17 +169,17 @@ def _without_views(
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
-        own = {row: why.cause for row, why in defects.items() if measurements.view[row] == v}
-        images = [f"{measurements.image[row]}: " for row in own] if len(own) == 1 else []
-        causes = [cause for cause, _ in by_cause(own)]
+        of_view = {row: why.cause for row, why in defects.items() if measurements.view[row] == v}
+        images = [f"{measurements.image[row]}: " for row in of_view] if len(of_view) == 1 else []
+        causes = [cause for cause, _ in by_cause(of_view)]
         cameras[v] = None
         unplaced[name] = NotPlaced(
             name,
             Cause(
-                f"its camera could not be placed: {'none of ' * (len(own) != 1)}its {{}} image"
-                f"{'s' * (len(own) != 1)} is {'un' * (len(own) == 1)}usable "
+                f"its camera could not be placed: {'none of ' * (len(of_view) != 1)}its {{}} image"
+                f"{'s' * (len(of_view) != 1)} is {'un' * (len(of_view) == 1)}usable "
                 f"({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}); take them again.",
-                (len(own), *images, *causes),
+                (len(of_view), *images, *causes),
             ),
         )
     return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)
@@ -190,12 +190,12 @@ def image_verdict(
     row: int,
     explanation: ImageExplanation,
     usual: Mapping[int, float],
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
 ) -> tuple[Rejection, Cause]:
     """Return the rejection of an image, false if it is used, and its cause with a remedy."""
     if explanation.reason:
         return explanation.reason, Cause("{}; {}", (explanation.reason.cause, explanation.remedy))
-    much = Cause("{} of {} predicted outlines were found", tuple(found[row]))
+    much = Cause("{} of {} predicted outlines were found", tuple(counts[row]))
     view = int(measurements.view[row])
     if explanation.own >= SHARE_OF_OTHERS * usual[view]:
         little = "shows little of the legs: {}, in other images most; check its light and sharpness"
@@ -224,15 +224,15 @@ def _left_out_notes(measurements: Measurements, why: Mapping[int, Cause]) -> lis
 
 def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
     """Return the commonest rejection of images with no used outline, by row."""
-    found = {}
+    rejections = {}
     for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
-        own = np.flatnonzero(outlines.row == row)
-        if outlines.used[own].any():
+        of_image = np.flatnonzero(outlines.row == row)
+        if outlines.used[of_image].any():
             continue
-        shown = [why for i in own.tolist() if (why := outlines.reason[i])
+        shown = [why for i in of_image.tolist() if (why := outlines.reason[i])
                  and why.reason not in NOT_IN_SIGHT]  # fmt: skip
-        found[row] = _most_common(shown or [NO_OUTLINE])
-    return found
+        rejections[row] = _most_common(shown or [NO_OUTLINE])
+    return rejections
 
 
 def _most_common(rejections: Sequence[Rejection]) -> Rejection:
@@ -366,11 +366,15 @@ def _best(
 def _other_readings(search: Search, row: int) -> list[int]:
     """Return a row with an image of each other pose, of the same view where there is one."""
     measurements = search.measurements
-    own, view = int(measurements.pose[row]), int(measurements.view[row])
+    pose_of_row, view = int(measurements.pose[row]), int(measurements.view[row])
     of_pose: dict[int, int] = {}
     for other, image in enumerate(measurements.image):
         pose = int(measurements.pose[other])
-        if pose != own and image and (pose not in of_pose or measurements.view[other] == view):
+        if (
+            pose != pose_of_row
+            and image
+            and (pose not in of_pose or measurements.view[other] == view)
+        ):
             of_pose[pose] = other
     return list(of_pose.values())
 
@@ -404,21 +408,21 @@ def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
     visible = is_visible(outlines)
     counts = {}
     for row in rows:
-        own = (outlines.row == row) & visible
-        if own.any():
-            counts[row] = OutlineCount(int(outlines.used[own].sum()), int(own.sum()))
+        of_image = (outlines.row == row) & visible
+        if of_image.any():
+            counts[row] = OutlineCount(int(outlines.used[of_image].sum()), int(of_image.sum()))
     return counts
 
 
-def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
+def _suspects(counts: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     """Return the images in which far fewer outlines were found than in others of their view.
 
     Where a view has few images, all others are compared with.
     """
     suspects = []
-    for row, count in found.items():
-        own = [other.share for r, other in found.items() if view[r] == view[row]]
-        every = [other.share for other in found.values()]
+    for row, count in counts.items():
+        own = [other.share for r, other in counts.items() if view[r] == view[row]]
+        every = [other.share for other in counts.values()]
         usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, GOOD_PERCENTILE))
         if usual >= MIN_USUAL_SHARE and count.share < SHARE_OF_OTHERS * usual:
             suspects.append(row)
@@ -428,7 +432,7 @@ def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
 def _usual(
     search: Search,
     placement: Placement,
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
     suspects: Sequence[int],
     run: Run,
 ) -> dict[int, float]:
@@ -439,7 +443,7 @@ def _usual(
     views = np.unique(search.measurements.view[list(suspects)]).tolist() if suspects else []
     usual = {}
     for v in views:
-        good = {row: count for row, count in found.items() if row not in suspects}
+        good = {row: count for row, count in counts.items() if row not in suspects}
         rows = _references(search.measurements, good, v)
         task = partial(share_shown, search, placement)
         usual[v] = float(np.median(list(run(task, rows))))
@@ -447,31 +451,31 @@ def _usual(
 
 
 def _references(
-    measurements: Measurements, found: Mapping[int, OutlineCount], view: int
+    measurements: Measurements, counts: Mapping[int, OutlineCount], view: int
 ) -> list[int]:
     """Return the images of a view in which most was found; of all views if it has none."""
-    own = [row for row in found if measurements.view[row] == view]
-    return sorted(own or found, key=lambda row: -found[row].share)[:N_REFERENCES]
+    of_view = [row for row in counts if measurements.view[row] == view]
+    return sorted(of_view or counts, key=lambda row: -counts[row].share)[:N_REFERENCES]
 
 
 def _leg_notes(
     search: Search,
     placement: Placement,
     outlines: Outlines,
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
     reasons: Mapping[int, Rejection],
 ) -> list[str]:
     """Return notes on the legs listed for views."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
-        rows = [r for r in found if measurements.view[r] == v and r not in reasons]
+        rows = [r for r in counts if measurements.view[r] == v and r not in reasons]
         if view.legs is None or not rows:
             continue
-        own = np.isin(outlines.row, rows)
-        used = set(outlines.leg[own & outlines.used].tolist())
+        of_view = np.isin(outlines.row, rows)
+        used = set(outlines.leg[of_view & outlines.used].tolist())
         for leg in np.flatnonzero(search.wanted[v]).tolist():
-            mine = own & (outlines.leg == leg)
+            mine = of_view & (outlines.leg == leg)
             if leg in used or not used or not mine.any():
                 continue
             why = _most_common([outlines.reason[i] for i in np.flatnonzero(mine).tolist()])
@@ -480,7 +484,7 @@ def _leg_notes(
                 f"outline of it ({why}); inspect them with legcal detect, or remove it from the "
                 "list."
             )
-        good = {row: found[row] for row in rows}
+        good = {row: counts[row] for row in rows}
         notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
     return notes
 

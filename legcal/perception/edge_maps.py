@@ -54,8 +54,8 @@ class EdgeMaps:
         of_pictures = [_edges(picture, part) for picture, part in flat]
         shape = np.max([one.shape for one in of_pictures], axis=0)
         maps = np.zeros((len(pictures), *shape), dtype=np.float32)
-        for into, own in zip(maps, of_pictures, strict=True):
-            into[:, : own.shape[1], : own.shape[2]] = own
+        for into, of_picture in zip(maps, of_pictures, strict=True):
+            into[:, : of_picture.shape[1], : of_picture.shape[2]] = of_picture
         corner = np.array([corner for _, corner, _ in grids])
         return cls(maps, corner, np.array([cell for _, _, cell in grids]))
 

@@ -95,14 +95,14 @@ def _blur(grey: Grey, half: Grey) -> float:
     direction = np.rint(angle / np.float32(np.pi / DIRECTIONS)).astype(np.int8) % DIRECTIONS
     least = max(MIN_EDGES, int(MIN_EDGES_PART * len(coarse)))  # else they are corners of others
     of_directions = [np.flatnonzero(direction == d) for d in range(DIRECTIONS)]
-    strong = [own[_strongest(coarse[own])] for own in of_directions if len(own) >= least]
+    strong = [edges[_strongest(coarse[edges])] for edges in of_directions if len(edges) >= least]
     strong = [one[:: -(-len(one) // MAX_EDGES)] for one in strong]
     if not strong:
         return 0.0
     every = np.concatenate(strong)
     ratios = _greatest_slopes(grey, 2 * row[every], 2 * column[every]) / coarse[every]
     blurs = [
-        _blur_of(own) for own in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]
+        _blur_of(edges) for edges in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]
     ]
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
     return sorted(blurs)[min(1, len(blurs) - 1)]
@@ -161,8 +161,8 @@ def image_defects(
     ``view`` and ``camera`` are those of each row: images of a view show about the same through the
     same lens. Where a view has few, as of a camera in the hand, all of its camera are compared.
     """
-    found = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
-    good = {row: exposure.blur for row, exposure in exposures.items() if row not in found}
+    defects = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
+    good = {row: exposure.blur for row, exposure in exposures.items() if row not in defects}
     for row, blur in good.items():
         others, whose = [b for r, b in good.items() if view[r] == view[row]], "view"
         if len(others) < MIN_IMAGES:
@@ -173,5 +173,5 @@ def image_defects(
         factor, more = MAX_BLUR_OF_OTHERS
         if blur > max(factor * usual, usual + more):
             detail = Cause("{:.1f} px, the others of its {} by {:.1f}", (blur, whose, usual))
-            found[row] = Rejection(Reason.BLURRED, detail)
-    return found
+            defects[row] = Rejection(Reason.BLURRED, detail)
+    return defects

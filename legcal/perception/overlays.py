@@ -160,9 +160,9 @@ def _part_marks(
 ) -> tuple[Mark, ...]:
     """Return the outlines of a part, its axis if both are used, and where it should be if not."""
     marks: list[Mark] = []
-    found = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
-    used = pair.used & found
-    for i in np.flatnonzero(found).tolist():
+    are_measured = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
+    used = pair.used & are_measured
+    for i in np.flatnonzero(are_measured).tolist():
         kind: MarkKind = "rejected"
         if pair.used[i]:
             kind = "edge 1" if pair.edge[i] == 1 else "edge 2"
@@ -172,10 +172,10 @@ def _part_marks(
         # h1 . M = R and h2 . M = -R of all points M of the axis, eq (5): it is seen at h1 + h2.
         ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
         marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
-    if leg is not None and not np.all(found) and not pair.rejected_for(Reason.OUTSIDE).any():
+    if leg is not None and not np.all(are_measured) and not pair.rejected_for(Reason.OUTSIDE).any():
         for i, segment in enumerate(leg.segments):
             if segment.link == part:
-                edges = [e - 1 for e, seen in zip(pair.edge, found, strict=True) if not seen]
+                edges = [e - 1 for e, seen in zip(pair.edge, are_measured, strict=True) if not seen]
                 marks += [mark for k, mark in enumerate(_prediction(camera, leg, i)) if k in edges]
     return tuple(marks)
 

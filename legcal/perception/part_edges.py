@@ -119,16 +119,16 @@ def _pairs(
     of_pair = predicted + np.stack([shift[every, 0, i], shift[every, 1, j]], axis=1)
     convincing = alone & (np.stack([i, j], axis=1) == 0)
     of_single = predicted + shift[every, edge, 0][:, None]
-    found: list[EdgePair | None] = []
+    pairs: list[EdgePair | None] = []
     for k in every.tolist():
         if together[k]:
-            found.append(EdgePair(of_pair[k], np.ones(2, dtype=np.bool_), convincing[k]))
+            pairs.append(EdgePair(of_pair[k], np.ones(2, dtype=np.bool_), convincing[k]))
         elif single[k]:
             own = np.arange(2) == edge[k]
-            found.append(EdgePair(of_single[k], own, own))
+            pairs.append(EdgePair(of_single[k], own, own))
         else:
-            found.append(None)
-    return found
+            pairs.append(None)
+    return pairs
 
 
 def _best_pairs(

@@ -129,10 +129,10 @@ class Photographs:
             self.still,
         )
 
-    def with_found(self, found: Outlines) -> Outlines:
+    def with_found(self, outlines: Outlines) -> Outlines:
         """Return found outlines and kept ones in one table; edited ones win."""
         others = self.keep.choose(~is_edited(self.keep))
-        return join_outlines([merge_edited(found, self.keep), others])
+        return join_outlines([merge_edited(outlines, self.keep), others])
 
     def narrowed(self, rows: IntArray, outlines: Outlines) -> Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
@@ -278,11 +278,11 @@ class _Measured:
         view, known = self.photographs.measurements.view, ~np.isnan(self.blur)
         n_views = len(self.photographs.measurements.views)
         of_views = [self.blur[known & (view == v)] for v in range(n_views)]
-        return tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
+        return tuple(float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views)
 
 
 def _with_other_radii(
-    found: _Measured,
+    measured: _Measured,
     views: PlacedViews,
     report: Report,
     *,
@@ -292,33 +292,33 @@ def _with_other_radii(
 
     *views* are where its images were recognised.
     """
-    machine, m = found.photographs.machine, found.photographs.measurements
-    suspects = _parts_not_found(machine.legs, found.outlines)
+    machine, m = measured.photographs.machine, measured.photographs.measurements
+    suspects = _parts_not_found(machine.legs, measured.outlines)
     while suspects:
-        placement = views.with_other_radii(suspects, found.photographs.run)
+        placement = views.with_other_radii(suspects, measured.photographs.run)
         if placement is None:
             break
         radii = placement.radii
-        photographs = replace(found.photographs, machine=machine.with_radii(radii.corrected))
-        search = replace(found.search, cylinders=photographs.cylinders)
+        photographs = replace(measured.photographs, machine=machine.with_radii(radii.corrected))
+        search = replace(measured.search, cylinders=photographs.cylinders)
         stage = f"{MEASURING} with other radii"
         outlines, blur = _measured(
             photographs, search, placement, report, method=method, stage=stage
         )
-        found = replace(found, blur=np.where(np.isnan(blur), found.blur, blur))
-        shown = _images_with_more(machine.legs, radii, m.view, found.outlines, outlines)
+        measured = replace(measured, blur=np.where(np.isnan(blur), measured.blur, blur))
+        shown = _images_with_more(machine.legs, radii, m.view, measured.outlines, outlines)
         of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
         if of_one and not radii.common:  # what one camera sees may be light and shade
             left = [part for part in suspects if not _is_among(part, of_one)]
             suspects = left if len(left) < len(suspects) else []
             continue
-        if outlines.used.sum() > found.outlines.used.sum():
+        if outlines.used.sum() > measured.outlines.used.sum():
             seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
             notes = radius_notes(radii, search.leg_names, seen_in)
             placement = replace(placement, notes=(*placement.notes, *notes))
-            found = _Measured(photographs, search, placement, outlines, found.blur)
+            measured = _Measured(photographs, search, placement, outlines, measured.blur)
         break
-    return found
+    return measured
 
 
 def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
@@ -340,7 +340,7 @@ def _with_free_poses(
     machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
-    found = find_free_poses(
+    poses = find_free_poses(
         photographs.search(nominal, pairs),
         machine,
         rows.tolist(),
@@ -349,9 +349,9 @@ def _with_free_poses(
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
         photographs.clicked_poses,
     )
-    nominal = replace(nominal, T_base_camera=found.T_base_camera)
-    first = {pose: choices[0] for pose, choices in found.T_base_platform.items()}
-    return _at_poses(photographs, nominal, first), found.T_base_platform
+    nominal = replace(nominal, T_base_camera=poses.T_base_camera)
+    first = {pose: choices[0] for pose, choices in poses.T_base_platform.items()}
+    return _at_poses(photographs, nominal, first), poses.T_base_platform
 
 
 def _at_poses(
@@ -372,10 +372,10 @@ def _in_doubt(
     reasons = dict.fromkeys(rows[~checked].tolist(), Rejection(Reason.FEW_LEGS))
     left, view = rows[checked], measurements.view
     for v in np.unique(view[left]).tolist():
-        own = left[view[left] == v]
-        if len(np.unique(measurements.pose[own])) < MIN_POSES:
+        of_view = left[view[left] == v]
+        if len(np.unique(measurements.pose[of_view])) < MIN_POSES:
             why = Rejection(Reason.FEW_LEGS, "as most of its view do")
-            reasons |= dict.fromkeys(own.tolist(), why)
+            reasons |= dict.fromkeys(of_view.tolist(), why)
     return reasons
 
 
@@ -449,21 +449,21 @@ def with_measured_radii(
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, found = np.array(outlines.part), dict[tuple[int, float], float]()
+    part, factors = np.array(outlines.part), dict[tuple[int, float], float]()
     for j, leg in enumerate(machine.legs):
         for cylinder in leg.cylinders:
-            own = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
-            if 2 * np.count_nonzero(wrong[own]) <= len(own):
+            of_cylinder = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
+            if 2 * np.count_nonzero(wrong[of_cylinder]) <= len(of_cylinder):
                 continue
-            row, edge = outlines.row[own], outlines.edge[own]
+            row, edge = outlines.row[of_cylinder], outlines.edge[of_cylinder]
             A = np.array([places[int(m.view[r])].apply(placement.A_base[r, j]) for r in row])
-            distance = np.sum(outlines.h[own] * A, axis=1) * np.array(EPSILON)[edge - 1]
+            distance = np.sum(outlines.h[of_cylinder] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                found[j, cylinder.radius] = float(np.mean(of_edges))
-    if not found:
+                factors[j, cylinder.radius] = float(np.mean(of_edges))
+    if not factors:
         return None
-    other = machine.with_radii(lambda j, c: found.get((j, c.radius), c.radius))
+    other = machine.with_radii(lambda j, c: factors.get((j, c.radius), c.radius))
     return replace(photographs, machine=other)
 
 
@@ -575,9 +575,9 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
     parts = []
     for j, leg in enumerate(legs):
         for link, radius in leg.radius_along.items():
-            own = visible & (outlines.leg == j) & (part == link)
-            is_seen = own.any() or not visible.any()
-            if is_seen and used[own].sum() <= MAX_USED_SHARE * own.sum():
+            of_part = visible & (outlines.leg == j) & (part == link)
+            is_seen = of_part.any() or not visible.any()
+            if is_seen and used[of_part].sum() <= MAX_USED_SHARE * of_part.sum():
                 parts.append((j, radius))
     return parts
 
@@ -599,7 +599,7 @@ def _images_with_more(
     With a radius that is wrong by as much as light and shade suggest, a part loses its outlines in
     most images; where it gains some in all together, views that gain speak for that radius.
     """
-    found = {}
+    images = {}
     for leg, radius in radii.factor:
         links = [link for link, r in legs[leg].radius_along.items() if look_alike(r, radius)]
         gain = Counter[int]()
@@ -612,8 +612,8 @@ def _images_with_more(
             of_view[int(view[row])] += more
         speaks = {v for v, more in of_view.items() if more > 0} if gain.total() > 0 else set()
         rows = [row for row, more in gain.items() if more > 0 and int(view[row]) in speaks]
-        found[leg, radius] = sorted(rows)
-    return found
+        images[leg, radius] = sorted(rows)
+    return images
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

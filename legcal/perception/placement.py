@@ -135,7 +135,7 @@ def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cy
     A convex solid is as wide as its circumference over pi, in the mean of all directions from
     which it is seen; a square one differs from that by up to 21 %.
     """
-    found: list[list[Cylinder]] = [[] for _ in range(n_legs)]
+    housings: list[list[Cylinder]] = [[] for _ in range(n_legs)]
     for occluder in occluders:
         half = occluder.carrier
         if not isinstance(half, LegHalf):
@@ -147,8 +147,8 @@ def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cy
         radius = around / (2.0 * np.pi)
         off = float(np.linalg.norm(hull.mean(axis=0)))
         if off <= HOUSING_OFF * radius and end - start >= HOUSING_LENGTH * radius:
-            found[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
-    return found
+            housings[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
+    return housings
 
 
 def sensor_extent(camera: Camera) -> Array:
@@ -199,7 +199,7 @@ def placed_arms(
     radii: Mapping[tuple[int, str], float] = MappingProxyType({}),  # of those that a fit has seen
 ) -> dict[int, PlacedArm]:
     """Return the arms that are cylinders, by the legs that have them as parts."""
-    found = {}
+    arms = {}
     for j, ends in arms_at(legs, q).items():
         actuator = legs[j].actuator
         if actuator is not None and actuator.arm is not None:
@@ -208,8 +208,8 @@ def placed_arms(
             seen = radii.get((j, actuator.arm.link))
             arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
             error = PREDICTED_JOINT_ERROR if seen is None else 0.0
-            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends[pose], error)
-    return found
+            arms[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends[pose], error)
+    return arms
 
 
 class NotPlaced(NamedTuple):
@@ -310,11 +310,11 @@ class Group:
 
     def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
         """Return the pictures of some rows, in the frame of the group."""
-        found = []
+        pictures_of_rows = []
         for row in rows:
             T = self.T_group_camera[self.view_of_row[row]].inv()
-            found.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
-        return found
+            pictures_of_rows.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
+        return pictures_of_rows
 
 
 def group_views(
@@ -333,13 +333,15 @@ def group_views(
     groups = [[v] for v in views if v not in together] + ([together] if together else [])
     found = []
     for group in groups:
-        own = [row for row, v in view_of.items() if v in group]
+        rows_of_group = [row for row, v in view_of.items() if v in group]
         T = {v: RigidTransform.identity() for v in group}
         if joined is not None and group == together:
             T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
         given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
         hint = None if not given else given[0][0] * given[0][1].inv()
-        spread = np.unique(np.rint(np.linspace(0, len(own) - 1, min(NEAR_IMAGES, len(own)))))
-        some = [own[k] for k in spread.astype(int).tolist()]
-        found.append(Group(group, T, own, some, view_of, hint))
+        spread = np.unique(
+            np.rint(np.linspace(0, len(rows_of_group) - 1, min(NEAR_IMAGES, len(rows_of_group))))
+        )
+        some = [rows_of_group[k] for k in spread.astype(int).tolist()]
+        found.append(Group(group, T, rows_of_group, some, view_of, hint))
     return found

@@ -174,8 +174,8 @@ def _by_lines(pictures: Pictures, placed: CameraPoses) -> CameraPoses:
     """Return a pose by where pairs are, which widths hardly move: joints stay as in the model."""
     pose = CameraPoses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
-        found = _whatever_the_width(pictures, pose, tolerance)
-        pose = gauss_newton_step(pictures, pose, found, tolerance)
+        matches = _whatever_the_width(pictures, pose, tolerance)
+        pose = gauss_newton_step(pictures, pose, matches, tolerance)
     return pose
 
 
@@ -184,11 +184,11 @@ def _whatever_the_width(pictures: Pictures, pose: CameraPoses, tolerance: float)
     best = match_pairs(pictures, pose, tolerance)
     for factor in FACTORS[1:]:
         scaled = replace(pictures, radius=factor * pictures.radius)
-        found = match_pairs(scaled, pose, tolerance)
-        better = found.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
+        matches = match_pairs(scaled, pose, tolerance)
+        better = matches.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
         best = PairMatches(
-            np.where(better, found.score, best.score),
-            np.where(better, found.pair, best.pair),
+            np.where(better, matches.score, best.score),
+            np.where(better, matches.pair, best.pair),
             best.visible,
         )
     return best
@@ -230,13 +230,13 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
 
 
 def radius_notes(
-    found: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
+    factors: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
 ) -> list[str]:
     """Return notes on radii that differ from the model; *seen_in* names the images of each."""
-    if not found.factor:
+    if not factors.factor:
         return []
-    if found.common:
-        way = _away(found.common)
+    if factors.common:
+        way = _away(factors.common)
         return [
             f"All legs appear {way} than in the model; the radii found in the images were used. "
             "Correct the radii of the model, or, if these are right, the unit and scale of the "
@@ -246,7 +246,7 @@ def radius_notes(
         f"{legs[leg]} may be {_away(factor)} than in the model: its radius is about "
         f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, not {1e3 * radius:.2f} mm; the "
         "measured radius was used; measure the leg, and correct the model if confirmed."
-        for (leg, radius), factor in sorted(found.factor.items())
+        for (leg, radius), factor in sorted(factors.factor.items())
     ]
 
 

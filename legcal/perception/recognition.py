@@ -229,12 +229,12 @@ def _pictures(
     search: Search, rows: Sequence[int], progress: Callable[[int], None] | None, run: Run
 ) -> dict[int, Picture]:
     """Return edge pairs and predicted legs of the images of rows."""
-    found = {}
+    pictures = {}
     for row, picture in zip(rows, run(search.picture, rows), strict=True):
-        found[row] = picture
+        pictures[row] = picture
         if progress is not None:
             progress(row)
-    return found
+    return pictures
 
 
 class _ByEdges(NamedTuple):
@@ -279,7 +279,7 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
         return near
     if len(near.poses) == 0:
         return anywhere
-    mean = [float(found.support[0].mean()) for found in (near, anywhere)]
+    mean = [float(candidates.support[0].mean()) for candidates in (near, anywhere)]
     return anywhere if mean[1] > 1.1 * mean[0] else near
 
 

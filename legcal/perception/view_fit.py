@@ -496,10 +496,10 @@ def refine_views(
     near = replace(placement, window=_windows(search, groups, fits, outlines))
     rows = sorted(row for group in groups for row in group.rows)
     again, _ = measure_outlines(search, near, rows, method=method, run=run, progress=progress)
-    found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
-    kept = outlines.choose(~_among(outlines, found))
-    outlines = join_outlines([kept, again.choose(_among(again, found))])
-    fits = _fits(search, groups, placement, outlines, fits, {row for row, _ in found})
+    measured = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
+    kept = outlines.choose(~_among(outlines, measured))
+    outlines = join_outlines([kept, again.choose(_among(again, measured))])
+    fits = _fits(search, groups, placement, outlines, fits, {row for row, _ in measured})
     outlines, fits = _without_outliers(search, groups, placement, outlines, fits)
     placement = _without_weak_views(
         search, groups, _placed_by_fits(search, groups, placement, fits), fits

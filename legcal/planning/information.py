@@ -85,10 +85,12 @@ class PredictedNoise:
         n = len(outlines.row)
         length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
         of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
-        found = replace(outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends)
+        with_noise = replace(
+            outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends
+        )
         if self.gamma_px == 0.0:
-            return found
-        return replace(found, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
+            return with_noise
+        return replace(with_noise, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
 
 
 DEFAULT_NOISE = PredictedNoise()
@@ -314,22 +316,22 @@ def _by_element(rows: Array, element: IntArray, n: int) -> Array:
     order = np.argsort(element, kind="stable")
     count = np.bincount(element, minlength=n)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    found = np.zeros((n, int(count.max(initial=0)), q, c))
-    found[element[order], np.arange(m) - first[element[order]]] = rows[order]
-    return found.reshape(n, -1, c)
+    padded = np.zeros((n, int(count.max(initial=0)), q, c))
+    padded[element[order], np.arange(m) - first[element[order]]] = rows[order]
+    return padded.reshape(n, -1, c)
 
 
 def _are_lengths(problem: FitProblem) -> BoolArray:
     """Return the mask of kept unknowns in metres, (n_kept,)."""
-    found = np.zeros(problem.n_kept, dtype=np.bool_)
+    are_lengths = np.zeros(problem.n_kept, dtype=np.bool_)
     for block in problem.variables:
         where = problem.where(block.name)
         if block.units:
-            found[where] = [unit == "m" for unit in block.units]
+            are_lengths[where] = [unit == "m" for unit in block.units]
         elif block.unknown.shape[1] == 6:  # motions: turns before displacements
             displaced = block.unknown[:, 3:]
-            found[where[displaced[displaced >= 0]]] = True
-    return found
+            are_lengths[where[displaced[displaced >= 0]]] = True
+    return are_lengths
 
 
 def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:

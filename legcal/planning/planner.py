@@ -669,14 +669,14 @@ class _Search:
             notes=tuple(notes),
         )
 
-    def _growth(self, found: Sequence[Contributions]) -> Array:
+    def _growth(self, contributions: Sequence[Contributions]) -> Array:
         """Numbers of images and their criterion, (n, 2), extrapolated beyond the plan."""
-        n = sum(len(part.rows) for part in found)
-        session = Session(found, self.given)
+        n = sum(len(part.rows) for part in contributions)
+        session = Session(contributions, self.given)
         order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
         rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
         for times in _EXTRAPOLATED:
-            more = [part.repeated(times) for part in found]
+            more = [part.repeated(times) for part in contributions]
             rows.append((round(times * n), self.value(more)))
         return np.array(rows)
 
@@ -692,7 +692,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
             for k in range(len(view.poses.poses))
         ]
         labels = pose_labels(len(views), task.n_given)
-        return tuple(replace(view, name=own) for view, own in zip(views, labels, strict=True))
+        return tuple(replace(view, name=label) for view, label in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
     return tuple(view if view.name else replace(view, name=next(free)) for view in views)

@@ -151,14 +151,14 @@ class PredictedObservations:
 
         Those by the line of an arm (``ActuatorColumns.ARM``) are by its motions (``Line.moved``).
         """
-        found = np.zeros((len(self.t), len(self.arms), 2, 3, LegColumns.COUNT))
+        derivatives = np.zeros((len(self.t), len(self.arms), 2, 3, LegColumns.COUNT))
         for a, motions in enumerate(self._motions_of_arms()):
             for end, (motion, slope) in enumerate(motions):
-                found[:, a, end, :, ActuatorColumns.AXIS] = motion.by_axis
-                found[:, a, end, :, ActuatorColumns.POINT] = motion.by_point
-                found[:, a, end, :, ActuatorColumns.GAIN] = motion.by_gain
-                found[:, a, end, :, ActuatorColumns.ARM] = motion.by_A @ slope
-        return found
+                derivatives[:, a, end, :, ActuatorColumns.AXIS] = motion.by_axis
+                derivatives[:, a, end, :, ActuatorColumns.POINT] = motion.by_point
+                derivatives[:, a, end, :, ActuatorColumns.GAIN] = motion.by_gain
+                derivatives[:, a, end, :, ActuatorColumns.ARM] = motion.by_A @ slope
+        return derivatives
 
     def _motions_of_arms(self) -> list[list[tuple[JointMotion, Array]]]:
         """Return the motion of both ends of arms, with derivatives (3, 4) by the arm's line."""
@@ -221,15 +221,15 @@ class PredictedObservations:
     @cached_property
     def A_by_local(self) -> Array:
         """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 21)."""
-        found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
-        found[..., LegColumns.A] = np.eye(3)
+        derivatives = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
+        derivatives[..., LegColumns.A] = np.eye(3)
         for j, actuator, a in self._carried():
             motion = actuator.motion(self.legs[j].A, self.q[:, a])
-            found[:, j, :, LegColumns.A] = motion.by_A
-            found[:, j, :, ActuatorColumns.AXIS] = motion.by_axis
-            found[:, j, :, ActuatorColumns.POINT] = motion.by_point
-            found[:, j, :, ActuatorColumns.GAIN] = motion.by_gain
-        return found
+            derivatives[:, j, :, LegColumns.A] = motion.by_A
+            derivatives[:, j, :, ActuatorColumns.AXIS] = motion.by_axis
+            derivatives[:, j, :, ActuatorColumns.POINT] = motion.by_point
+            derivatives[:, j, :, ActuatorColumns.GAIN] = motion.by_gain
+        return derivatives
 
     @cached_property
     def ends_by_reading(self) -> tuple[Array, Array]:
@@ -326,8 +326,8 @@ class PredictedObservations:
     def ties(self) -> Array:
         """Derivative of what ties the parameters to each other, in metres, (w, p), independent."""
         tie_constraints = self.tie_constraints or ties_of(self.legs, self.frame_legs)
-        found = tie_constraints.at(self.legs)
-        return independent(found, by_step(found, self.parametrization.place) * self.unit)[1]
+        rows = tie_constraints.at(self.legs)
+        return independent(rows, by_step(rows, self.parametrization.place) * self.unit)[1]
 
     @cached_property
     def with_length(self) -> BoolArray:
@@ -342,8 +342,8 @@ class PredictedObservations:
 
     def columns(self, kind: int) -> IntArray:
         """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
-        found = self.parametrization.place[:, kind]
-        return np.unique(found[found >= 0])
+        columns_of_legs = self.parametrization.place[:, kind]
+        return np.unique(columns_of_legs[columns_of_legs >= 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -515,11 +515,11 @@ def orientations_of(dataset: Dataset, predicted: PredictedObservations) -> Array
     Cameras whose place the dataset does not give look at the legs.
     """
     to_Rb, views = dataset.machine.T_base_Rb.inv(), dataset.measurements.views
-    found = looking_at(predicted)
+    orientations = looking_at(predicted)
     for v, view in enumerate(views[i] for i in np.unique(dataset.measurements.view).tolist()):
         if view.T_base_camera is not None:
-            found[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
-    return found
+            orientations[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
+    return orientations
 
 
 def cameras_of(dataset: Dataset) -> tuple[str, ...]:
@@ -602,10 +602,10 @@ def perturbed_machine(
     nominal = geometries(machine)
     A, B = ends_at_pose(nominal, home)
     length = float(np.linalg.norm(B - A, axis=1).mean())
-    found = parametrization_of(machine)
-    scale = np.where([unit == "m" for unit in found.units], length, 1.0)
-    legs = perturbed(nominal, found, length, rng)
-    return on_ties(legs, nominal, machine_ties(machine), found.place, scale), length, rng
+    parametrization = parametrization_of(machine)
+    scale = np.where([unit == "m" for unit in parametrization.units], length, 1.0)
+    legs = perturbed(nominal, parametrization, length, rng)
+    return on_ties(legs, nominal, machine_ties(machine), parametrization.place, scale), length, rng
 
 
 def perturbed(
@@ -641,15 +641,15 @@ def travel_of(machine: Machine) -> Array:
 
     Of rods on actuators it is the travel of these [m or rad].
     """
-    found = []
+    travels = []
     for leg in machine.legs:
         if leg.actuator is not None:
-            found.append(list(leg.actuator.travel))
+            travels.append(list(leg.actuator.travel))
         elif leg.kind is LegKind.CONSTANT:
-            found.append([leg.q0, leg.q0])
+            travels.append([leg.q0, leg.q0])
         else:
-            found.append(sorted(leg.length_at(q) for q in leg.travel))
-    return np.array(found)
+            travels.append(sorted(leg.length_at(q) for q in leg.travel))
+    return np.array(travels)
 
 
 def _showing(dataset: Dataset, link: Link) -> BoolArray:

@@ -164,8 +164,8 @@ class Identifiability:
         document["scale"] = document["scale"] or None
         for board in ("board", "platform_board"):
             document[board]["with"] = document[board].pop("with_board")
-        found = IdentifyDocument.model_validate(document)
-        return found.model_dump(mode="json", by_alias=True)
+        model = IdentifyDocument.model_validate(document)
+        return model.model_dump(mode="json", by_alias=True)
 
 
 class ConditionBlock(SparseDocument):
