@@ -167,7 +167,8 @@ class LegcalError(Exception):
         super().__init__("\n".join(_shortened(self.facts, self.problems)))
 
     def __reduce__(self) -> tuple[type, tuple[tuple[Problem, ...]], dict[str, object]]:
-        state = {"diagnosis": self.diagnosis, "consequences": self.consequences}
+        state: dict[str, object] = {"diagnosis": self.diagnosis}
+        state["consequences"] = self.consequences
         return type(self), (self.facts,), state
 
     def documents(self) -> list[dict[str, Any]]:

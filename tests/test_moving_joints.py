@@ -127,9 +127,9 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
         notes=(),
     )
     text = " ".join(str(line) for line in _verdict(report))
-    assert "Except for the scale: calibrate needs a stated length or radii" in text
+    assert "calibrate refuses this machine until a length or radii are stated" in text
     assert "leg1.length measured to 0.019 mm" in identify_verdict(report).reasons[0]
-    assert "With radii alone it is 3.1 mm, mostly from the scale" in text
+    assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
     assert "better is leg1.length measured to 0.019 mm, or a calibration board on the base" in text
 
 

@@ -315,7 +315,7 @@ def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 0}, UsageError, "--images 0"),
     ({"images": 401}, UsageError, "1 to 400"),
-    ({"images": 9, "images_per_view": 3}, UsageError, "images per view"),
+    ({"images": 9, "images_per_view": 3}, UsageError, "--images-per-view"),
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
     ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
@@ -338,8 +338,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
         DidNotConverge,
         "; plan with a smaller length",
     ),
-    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds, nearer"),
-    ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds, farther"),
+    ({"bounds": np.array([[5.0, 6.0]] * 3), "images": 4}, NotVisible, "bounds towards"),
+    ({"bounds": np.array([[0.3, 0.31]] * 3), "images": 4}, NotVisible, "bounds away"),
 ]
 
 
@@ -438,7 +438,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     for listed, remedy in (
         (tripods(a=[0.0, 90.0, 90.0]), "move a nearer"),
         (tripods(a=[0.0, 0.0, 0.2]), "move a further away"),
-        (away, "0 of 1 camera places .* turn a to the machine"),
+        (away, "0 of 1 camera positions .* point a at the machine"),
     ):
         refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])

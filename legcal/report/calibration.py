@@ -65,9 +65,9 @@ def _platform(found: PlatformBlock) -> RenderableType:
     after: PlatformBlock | WorkspaceAccuracy = found.workspace or found
     where = "poses" if found.workspace is None else "workspace"
     rows = [
-        ("nominal vs. calibrated model", found.change_dX_m, found.change_dE_rad),
+        ("nominal model, off the calibrated one", found.change_dX_m, found.change_dE_rad),
         (f"calibrated, predicted (1 sigma, {where})", after.sigma_dX_m, after.sigma_dE_rad),
-        ("calibrated, maximum", after.sigma_dX_max_m, after.sigma_dE_max_rad),
+        ("at most", after.sigma_dX_max_m, after.sigma_dE_max_rad),
     ]
     return table(
         "platform error",
@@ -114,8 +114,8 @@ def check_summary(check: Check) -> RenderableType:
         what, amount = best.change.what, _amount(best)
         if best.p_value < movement.significance:
             lines.append(
-                f"No single leg explains it; {what} explains most ({amount}; residual statistic "
-                f"{best.remaining:.1f} of {movement.statistic:.1f})."
+                f"No single leg explains it; {what} explains most ({amount}; {best.remaining:.1f} "
+                f"of {movement.statistic:.1f} are left)."
             )
         else:
             lines.append(f"It is explained by {what}: {amount}.")

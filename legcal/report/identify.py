@@ -31,7 +31,9 @@ CONDITIONS = {
     "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
-_LEGEND = "known length: leg with an encoder (length = reading + offset), or of constant length"
+_LEGEND = (
+    "known length law: a leg with a reading (length = reading + offset), or of constant length"
+)
 _NEEDS = {"full": "the joint fit"}
 _MAX_WEAK = 6  # directions shown
 _MAX_MENDED = 3
@@ -39,7 +41,7 @@ _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
 def identify_table(report: Identifiability) -> RenderableType:
-    """Return an identifiability report as a text of 80 columns."""
+    """Return an identifiability report as people read it, on 80 columns."""
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
@@ -53,10 +55,10 @@ def identify_table(report: Identifiability) -> RenderableType:
 
 
 def _heading(report: Identifiability) -> list[str]:
-    """Return the machine and the views that are judged."""
+    """Return what is judged."""
     space = "spatial" if report.spatial else "planar"
     r = f", {report.r} with a revolute joint at the base" if report.r else ""
-    lines = [f"{space}, {report.n} legs ({report.n_ac} with known length{r})"]
+    lines = [f"{space}, {report.n} legs ({report.n_ac} of known length law{r})"]
     labels = leg_labels(report.legs)
     first = 0
     for (view, images), group in groupby(zip(report.views, report.images, strict=True)):
@@ -75,9 +77,9 @@ def _heading(report: Identifiability) -> list[str]:
 
 
 def _recommendation(report: Identifiability) -> list[str | RenderableType]:
-    """Return the sufficient sets of views."""
+    """Return the sets of views that suffice."""
     if not report.recommendation:
-        return ["No sufficient set of views was found; one view of all legs is judged."]
+        return ["No set of views was found that suffices; all legs in one view are judged."]
     labels, rows = leg_labels(report.legs), []
     for found in report.recommendation:
         number = len(found.views)
@@ -86,8 +88,8 @@ def _recommendation(report: Identifiability) -> list[str | RenderableType]:
         judged = "  *" if found.views == report.views else ""
         words = f"{number} view{'s' * (number != 1)}: {views}"
         rows.append((words, str(found.legs_a_view), sigma + judged))
-    columns = ("smallest sufficient sets of views", ">legs each", "sigma [mm]")
-    legend = "sigma: predicted error of the platform; *: the set judged here"
+    columns = ("smallest sets of views that suffice", ">legs each", "sigma [mm]")
+    legend = "sigma: predicted error of the platform; *: the set that is judged here"
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
@@ -104,11 +106,11 @@ def _conditions(report: Identifiability) -> Table:
 
 
 def _weak(ranks: Ranks) -> Table:
-    """Return the undetermined directions."""
+    """Return the directions that are not determined."""
     rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
     if len(ranks.weak) > _MAX_WEAK:
         rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
-    return table("undetermined combination", ">hides [mm]", ">[deg]", rows=rows)
+    return table("not determined", ">hides [mm]", ">[deg]", rows=rows)
 
 
 def _hidden(weak: WeakDirection) -> tuple[str, str]:
@@ -130,21 +132,21 @@ def _two_digits(value: float) -> str:
 
 
 def _scale(report: Identifiability) -> list[str | RenderableType]:
-    """Return possible sources of the scale, with its uncertainty."""
+    """Return what would fix the scale, and how well."""
     rows = []
     for source in report.scale:
-        scale = "undetermined" if source.sigma is None else f"{100 * source.sigma:.2g} %"
+        scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
         motion = source.platform_sigma
         rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
     return [
-        "Readings are angles or missing: the leg radii alone determine the scale, unless one of "
-        "these is given.",
-        table("source of the scale", ">sigma of scale", ">platform [mm]", rows=rows),
+        "Readings carry no length here: the scale of the machine is that of the radii, unless "
+        "something else fixes it.",
+        table("what fixes the scale", ">sigma of it", ">platform [mm]", rows=rows),
     ]
 
 
 def _boards(report: Identifiability) -> list[str]:
-    """Return the effect of boards; of one on the platform only if present or helpful."""
+    """Return what boards do; of one on the platform only where there is one, or it would help."""
     of, moving = report.full.of, report.platform_board
     helps = moving.needed_for or moving.without != moving.with_board
     on_platform = [_board(moving, of, "platform")] if moving.present or helps else []
@@ -152,7 +154,7 @@ def _boards(report: Identifiability) -> list[str]:
 
 
 def _board(board: BoardReport, of: int, link: Link) -> str:
-    """Describe the effect of a calibration board on a link."""
+    """Return what a calibration board on a link does, in a few sentences."""
     subject = f"The calibration board on the {link}" if board.present else "A calibration board"
     before, after = board.without, board.with_board
     if not board.needed_for and before == after:
@@ -175,7 +177,7 @@ def _board(board: BoardReport, of: int, link: Link) -> str:
 
 
 def _intrinsics(found: CameraIntrinsics) -> str:
-    """Describe the intrinsics of a camera that the legs determine."""
+    """Return what the legs determine of a camera."""
     camera = f"Camera of {found.camera}: the legs"
     known = {name: sigma for name, sigma in found.sigma.items() if sigma is not None}
     if not found.determined:
@@ -186,7 +188,7 @@ def _intrinsics(found: CameraIntrinsics) -> str:
 
 
 def _remedies(report: Identifiability) -> Table:
-    """Return the remedies with the rank that each reaches."""
+    """Return what would help."""
     of = report.full.of
     rows = [
         (
@@ -205,12 +207,14 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     determined = f"the joint fit determines {report.full.rank} of {report.full.of} parameters"
     lines: list[str | RenderableType] = []
     if report.identifiable:
-        rest = f"; {harmless} undetermined directions do not move the platform" if harmless else ""
+        rest = (
+            f"; {harmless} directions that stay open do not move the platform" if harmless else ""
+        )
         lines.append(f"Identifiable: {determined}{rest}.")
         if report.scale:
             lines.append(
-                "Except for the scale: calibrate needs a stated length or radii (--length, --set), "
-                "or a board."
+                "But for the scale: calibrate refuses this machine until a length or radii are "
+                "stated (--length, --set), or a board is seen."
             )
     else:
         lines.append(Text(f"NOT identifiable: {determined}.", style="bold"))
@@ -226,11 +230,11 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         for radii in (s.platform_sigma for s in report.scale if s.source == "radii"):
             if radii is not None:
                 lines.append(
-                    f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm, mostly from the "
-                    f"scale; better: {', or '.join(ways)}."
+                    f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "
+                    f"largest part of it; better is {', or '.join(ways)}."
                 )
     if any(weak.dX_m is not None and not weak.harmless for weak in report.full.weak):
-        hidden = "hides: unobserved platform error if the largest component is 1 mm."
+        hidden = "The platform error of a direction is that for 1 mm in its largest component."
         lines.append(Text(hidden, style="dim"))
     failed = [CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:

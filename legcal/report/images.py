@@ -93,7 +93,7 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Rende
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
             Text(
-                "Angle readings do not determine the scale, and nothing else in this dataset "
+                "Readings of motors that turn carry no length, and nothing else in this dataset "
                 "does: simulate with --board charuco, or calibrate with --length "
                 f"{to_measure}=MEASURED±SIGMAmm.",
                 style="yellow",

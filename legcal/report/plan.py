@@ -1,4 +1,4 @@
-"""Tables, pictures and checklist of a plan: camera positions, images, expected accuracy."""
+"""What is said and drawn of a plan: places, images, expected accuracy, and what to look after."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ROOM = 0.1  # of its width, around what it shows
 
 
 def plan_table(plan: Plan, output: Path | None) -> RenderableType:
-    """Return the tables of a plan: views, expected accuracy, and the folder written, if given."""
+    """Return what a plan is, what is expected of it, and where it is written, if that is told."""
     names = plan.machine.leg_names
     views = [
         (
@@ -81,20 +81,20 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
             rows=[tuple(map(printable, row)) for row in views],
         ),
         table(
-            "view", *(f">lens to A{j + 1} [mm]" for j in _measured(plan)), ">above them [mm]",
+            "lens of", *(f">to A{j + 1} [mm]" for j in _measured(plan)), ">above these [mm]",
             rows=[tuple(map(printable, row)) for row in distances],
             title="Distances to measure, from the middle of the lens to joints of the base"
             + plan.machine.at_zero,
         ),
-        table("parameter", ">sigma", "unit", rows=parameters, title="Least certain parameters"),
+        table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
         table(
             ">images", ">expected", rows=growth,
-            title="Expected error by number of images",
+            title="With other numbers of images",
         ),
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
+            *([printable(f"once it is shot, {_to_be_added(plan)}")] if plan.given else []),
             printable(
                 f"calibrate with: legcal calibrate {plan.given or output} -o OUT{length}"
             ),
@@ -103,7 +103,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
 
 
 def _to_be_added(plan: Plan) -> str:
-    """Return how to merge a session into the given one."""
+    """Return what to do with a session that adds to another one."""
     return (
         "copy the photographs, the views in dataset.yaml and the rows of "
         f"measurements.csv into {plan.given}"
@@ -183,9 +183,9 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "nor background.",
         "A background that differs from the legs in brightness along their whole length.",
         "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
-        "Move the machine through poses.csv in order, by way of the poses in 'on the way'. "
+        "Lead the machine as poses.csv says, in its order, by way of what stands in 'on the way'. "
         f"It begins at home, where motors read {_home_in_words(plan)}.",
-        "Wait until it rests; write the encoder readings, not the commands, into measurements.csv.",
+        "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
     ]
     if plan.given:
@@ -196,8 +196,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
     if measured is not None:
         items.insert(
             1,
-            f"Measure the rod of {measured[0].name} from joint centre to joint centre: angle "
-            "readings do not determine the scale. Calibrate with "
+            f"Measure the rod of {measured[0].name} from joint centre to joint centre: readings of "
+            "motors that turn carry no length. Calibrate with "
             f"{plan.machine.length_option}.",
         )
     return items
@@ -216,7 +216,7 @@ def _home_in_words(plan: Plan) -> str:
 
 
 def _board_in_words(plan: Plan, board: LaidBoard) -> str:
-    """Describe the position of the board."""
+    """Return where the board is to lie."""
     A = _measured_joints(plan)
     far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
     x, y, z = 1e3 * board.middle
@@ -242,8 +242,8 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         for name, data in previews.items()
     ]
     blocks: list[Any] = [
-        Drawing(Markup(places), "Camera positions from above and from the side."),
-        Drawing(Markup(growth), "Expected error over the number of images."),
+        Drawing(Markup(places), "Camera places from above and from the side."),
+        Drawing(Markup(growth), "What is expected of other numbers of images."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
@@ -354,7 +354,7 @@ def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
 
 
 def _draw_growth(plan: Plan) -> Figure:
-    """Return a figure of the expected error over the number of images."""
+    """Return a figure of what is expected over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
     least = 1 if plan.given else min(_LEAST, plan.n_images)
     known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)

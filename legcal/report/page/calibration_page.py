@@ -66,8 +66,8 @@ def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]
     missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
     lines = Text(
         [
-            "Green: measured outline, red if the fit rejected it; dashed orange: predicted by the "
-            "fit. Click to enlarge; then scroll to zoom and drag to move."
+            "Green is the outline as measured, red if the fit rejected it, dashed orange where the "
+            "fit has it. A click enlarges; then scroll to zoom and drag to move."
         ],
         dim=True,
     )
@@ -78,7 +78,7 @@ def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]
                 crops.worst,
                 f"The worst {len(crops.worst)}, by their distance in standard deviations",
             ),
-            (crops.median, f"{len(crops.median)} typical ones (median distance)"),
+            (crops.median, f"{len(crops.median)} in the middle"),
         )
         if found
     ]

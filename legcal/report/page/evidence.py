@@ -27,7 +27,7 @@ MAX_HASHED = 400_000_000  # of images [bytes]: more would be waited for
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Any]:
-    """Return counts, ranks, and the least certain directions."""
+    """Return counts, ranks, and the directions that are known worst."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
     n_held = len(calibration.solution.kinematic.held_basis)
@@ -66,7 +66,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         ranks: list[list[Cell]] = [[number(full.rank, 0), number(full.of, 0), enough]]
         blocks += [
             Table(("condition of the paper", ">equations", ">unknowns", ""), rows),
-            Table((">predicted rank", ">of", ""), ranks),
+            Table((">rank before any image was searched", ">of", ""), ranks),
         ]
     weak: list[list[Cell]] = [
         [row.in_words, number(1e3 * row.sigma_m, 4), _parts(one.parameters, one.components)]
@@ -74,13 +74,11 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         for one in (row.links or row,)
     ]
     if weak:
-        columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
-        note = "Select one under Show to see it as a motion of the machine above."
+        columns = ("known worst", ">1 sigma [mm]", "as a unit vector")
+        note = "The machine above shows them as motions: choose one under Show."
         blocks.append(Table(columns, weak, note=note))
     if result.held:
-        blocks.append(
-            Items(result.held, title="Kept at nominal: undetermined, no effect on the platform")
-        )
+        blocks.append(Items(result.held, title="Held at nominal, without effect on the platform"))
     return blocks
 
 
@@ -89,7 +87,7 @@ def _parts(names: Any, components: Any) -> str:
 
 
 def correlation_blocks(calibration: Calibration) -> list[Any]:
-    """Return the correlation matrix and the most correlated pairs."""
+    """Return the correlation matrix and the pairs that are correlated most."""
     names, values = correlation(calibration)
     if len(names) < 2:
         return []
@@ -102,36 +100,35 @@ def correlation_blocks(calibration: Calibration) -> list[Any]:
     caption = "Filled squares are positive correlations, outlines negative; the area is the size."
     return [
         Drawing(matrix(names, values, "Correlations of the estimated parameters"), caption),
-        Table(("most correlated", "with", ">correlation"), rows),
+        Table(("correlated most", "with", ">correlation"), rows),
     ]
 
 
 def held_out_blocks(calibration: Calibration) -> list[Any]:
-    """Compare held-out images with the prediction of the fit."""
+    """Return how well the fit predicts images that it has not seen."""
     found = calibration.result.holdout
     if found is None:
-        return [Text(["No held-out images; --holdout 0.2 holds out a fifth."], dim=True)]
+        return [Text(["No images were kept aside; --holdout 0.2 keeps a fifth."], dim=True)]
     if found.rms_px is None:
-        return [Text(["The held-out images have no outline that could be compared."])]
+        return [Text(["The images that were kept aside show no outline that could be compared."])]
     facts = {
-        "Held out": f"{found.images} images of {found.poses} poses, {found.outlines} outlines, "
-        f"{found.wrong} of them rejected",
-        "Prediction error": f"{found.rms_px:.3f} px (rms); expected "
-        f"{found.expected_px or 0.0:.3f} px",
+        "Kept aside": f"{found.images} images of {found.poses} poses, {found.outlines} outlines, "
+        f"{found.wrong} of them far off and left out",
+        "Off by": f"{found.rms_px:.3f} px (rms); {found.expected_px or 0.0:.3f} px were expected",
     }
     if found.platform is not None:
         pair = found.platform
         facts["At the platform"] = (
             f"{1e3 * pair.dX_m:.3f} mm / {np.degrees(pair.dE_rad):.4f} deg (rms over {pair.poses} "
-            f"poses); expected {1e3 * pair.expected_dX_m:.3f} mm / "
-            f"{np.degrees(pair.expected_dE_rad):.4f} deg"
+            f"poses); {1e3 * pair.expected_dX_m:.3f} mm / {np.degrees(pair.expected_dE_rad):.4f} "
+            "deg were expected"
         )
     rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in found.views.items()]
     return [Facts(facts), Table(("view", ">rms [px]"), rows)]
 
 
 def note_blocks(calibration: Calibration) -> list[Any]:
-    """Return the diagnosis, and the notes by topic."""
+    """Return the diagnosis, and the notes by what they are about."""
     blocks: list[Any] = []
     diagnosis: list[list[Cell]] = [
         [one.what, "; ".join(one.same_as), number(one.images_before, 0),
@@ -139,8 +136,8 @@ def note_blocks(calibration: Calibration) -> list[Any]:
         for one in calibration.result.diagnosis or ()
     ]  # fmt: skip
     if diagnosis:
-        columns = ("likely mistake", "indistinguishable from", ">images that agree",
-                   ">with correction", "remedy")  # fmt: skip
+        columns = ("what looks wrong", "cannot be told from", ">images that agree", ">without it",
+                   "remedy")  # fmt: skip
         blocks.append(Table(columns, diagnosis, "Diagnosis"))
     for topic in Topic:
         if topic is Topic.DIAGNOSIS:
@@ -155,7 +152,7 @@ def note_blocks(calibration: Calibration) -> list[Any]:
 
 
 def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
-    """Return version, command, settings, and the hashes of all input files."""
+    """Return version, command, settings, and the hashes of all files that went in."""
     dataset, problem = calibration.dataset, calibration.solution.posterior.problem
     settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(problem.settings).items()}
     facts = {
@@ -175,7 +172,7 @@ def reproducibility_blocks(calibration: Calibration, command: str, when: str) ->
     }
     rows, note = _hashes(calibration)
     columns = ("file", ">bytes", "SHA-256")
-    return [Facts(facts), Table(columns, rows, "Input files", note, folded=True)]
+    return [Facts(facts), Table(columns, rows, "Files that went in", note, folded=True)]
 
 
 def _encoder_sigma(dataset: Dataset) -> str:

@@ -18,9 +18,9 @@ from legcal.pages.svg import change_bars
 _BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
 _PARALLEL = 1e-9
 _STATUS = {
-    "estimated": "estimated",
+    "estimated": "by images and readings",
     "fixed": "fixed",
-    "weak": "undetermined combination, kept at nominal",
+    "weak": "in a combination that nothing determines, held at nominal",
 }
 _JOINT = {"base": "A", "platform": "B"}
 
@@ -39,7 +39,7 @@ class _Row:
 
     @property
     def parameter(self) -> ParameterId:
-        """The parsed name."""
+        """What its name says."""
         return ParameterId.parse(self.name)
 
     @property
@@ -71,16 +71,16 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     machine = calibration.dataset.machine
     motors = ""
     if any(motor.turns for motor in machine.actuators):
-        motors = "; axis_point is the lateral displacement of the axis of an arm"
+        motors = "; axis_point is how far the axis of an arm has moved across itself"
         if any(motor.arm is not None for motor in machine.actuators):
-            motors += ", arm_point that of its own line"
+            motors += ", arm_point how far its own line has"
     elif machine.actuators:
         motors = "; directions of carriages too"
     note = (
         f"A are joints of the base in the link {links[0]}{machine.at_zero}, B those of the "
         f"platform in {links[-1]}, as in calibrated.urdf; axes are turns from the nominal ones"
-        f"{motors}. Sigma is one standard deviation; coordinates without one fix the frame R_b or "
-        "R_e, which photographs of legs cannot determine. Click a heading to sort."
+        f"{motors}. Sigma is one standard deviation; coordinates without one define where R_b or "
+        "R_e stands, which cannot be seen in photographs of legs. A click on a heading sorts."
     )
     return [
         Table(columns, [row.cells for row in (*of_links, *others)], note=note),

@@ -33,7 +33,7 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
         return [Text([f"No error of the platform is predicted, because {why}."])]
     change, sigma = calibration.platform.change, calibration.platform.sigma
     rows = [
-        _figures("before: nominal vs. calibrated model", change.displacement,
+        _figures("before: nominal model against the calibrated one", change.displacement,
                  change.rotation),
         _figures("after: predicted error of the calibrated model, 1 sigma", sigma.displacement,
                  sigma.rotation),
@@ -54,9 +54,9 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
         "same readings; errors of the readings themselves are not in sigma."
     )
     histograms = [
-        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm] (number of poses)"),
+        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm], how many poses"),
                 wide=False),
-        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm] (number of poses)"),
+        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm], how many poses"),
                 wide=False),
     ]  # fmt: skip
     blocks: list[Any] = [Table(columns, rows, note=note), Row(histograms)]
