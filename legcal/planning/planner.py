@@ -370,7 +370,7 @@ def _no_visible_places(
         f"{scene.task.machine.yaml_path}: no session could be planned: only "
         f"{n_places - len(blind)} of {n_places} camera positions see legs{board} with the tripod "
         f"tolerance of {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg; {needed} "
-        f"are needed; {remedy.format(names or 'the cameras')}."
+        f"{'are' if needed > 1 else 'is'} needed; {remedy.format(names or 'the cameras')}."
     )
 
 
