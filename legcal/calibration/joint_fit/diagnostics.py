@@ -161,18 +161,18 @@ class _Comparison:
     unit: str
     mean: float
     sigma: float  # zero where it is fixed
-    found: float
-    together: float  # difference in standard deviations, other stated values free
-    alone: float  # the same, other stated values right
+    estimate: float
+    sigmas_joint: float  # difference in standard deviations, other stated values free
+    sigmas_alone: float  # the same, other stated values right
 
     def __str__(self) -> str:
-        apart = self.together if self.together > _SIGNIFICANT else self.alone
+        apart = self.sigmas_joint if self.sigmas_joint > _SIGNIFICANT else self.sigmas_alone
         stated = f"{self.mean:.6g} {self.unit}"
         if self.sigma:
             stated = f"{self.mean:.6g} +- {self.sigma:.2g} {self.unit}"
         return (
             f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
-            f"measurements: stated {stated}, measured about {self.found:.4g} {self.unit}, "
+            f"measurements: stated {stated}, measured about {self.estimate:.4g} {self.unit}, "
             f"{apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct it, "
             f"{'' if self.sigma else 'give it a prior, '}or free it (--set {self.name}=free)."
         )
@@ -233,9 +233,11 @@ def refuse_contradicted_values(
             continue
         comparisons = _compare(fit, held, stated, wide)
         break
-    contradicted = [comparison for comparison in comparisons if comparison.together > _SIGNIFICANT]
+    contradicted = [
+        comparison for comparison in comparisons if comparison.sigmas_joint > _SIGNIFICANT
+    ]
     contradicted = contradicted or [
-        comparison for comparison in comparisons if comparison.alone > _SIGNIFICANT
+        comparison for comparison in comparisons if comparison.sigmas_alone > _SIGNIFICANT
     ]
     if contradicted:
         raise DidNotConverge([str(comparison) for comparison in contradicted])

@@ -128,7 +128,7 @@ class KnownParameters:
         """All names of parameters, with synonyms."""
         return (*self.by_name, *self.synonyms)
 
-    def counted(self, name: str) -> str:
+    def canonical(self, name: str) -> str:
         """Return the canonical name."""
         return self.synonyms.get(name, name)
 
@@ -354,10 +354,10 @@ def _decisions(
 def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
     """Canonical names of the parameters that an override matches."""
     if override.name in known.names:
-        return (known.counted(override.name),)
+        return (known.canonical(override.name),)
     if ":" in override.name:
         return _matching_length(override, known)
-    names = [known.counted(name) for name in known.names if fnmatchcase(name, override.name)]
+    names = [known.canonical(name) for name in known.names if fnmatchcase(name, override.name)]
     return tuple(dict.fromkeys(names))
 
 

@@ -107,7 +107,7 @@ class Fit:
         minimum = replace(self.minimum, state=state)
         return replace(self, problem=problem, minimum=minimum, edge_biases=biases)
 
-    def passed(self, relative_tolerance: float = 0.0) -> Fit:
+    def reoptimised(self, relative_tolerance: float = 0.0) -> Fit:
         """Approach the minimum of the problem from the minimum for other weights."""
         return replace(
             self, minimum=_approach_minimum(self.problem, self.minimum, relative_tolerance)
@@ -212,21 +212,21 @@ def _without_outliers(fit: Fit) -> Fit:
     if given.legs.is_redundant:
         rough, tolerance = with_inflated_reading_noise(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
-        fit = replace(fit, problem=with_rejected_readings_of(given, rough), minimum=minimum).passed(
-            tolerance
-        )
+        fit = replace(
+            fit, problem=with_rejected_readings_of(given, rough), minimum=minimum
+        ).reoptimised(tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
         fit = fit.weighted(robust_noise(offsets[before], claimed[before]))
         if np.sum(before != fit.accepted) <= settings.error_tolerance * fit.accepted.sum():
             break  # left to the rounds of noise estimation
-        fit = fit.passed(_REJECTION_TOLERANCE)
+        fit = fit.reoptimised(_REJECTION_TOLERANCE)
     _refuse_disagreement(fit)
     for _ in range(_BOARD_ROUNDS if any(map(len, given.boards)) else 0):
         judged = _with_corner_noise(fit.problem, fit.state)
-        fit = replace(fit, problem=judged).passed(_REJECTION_TOLERANCE)
+        fit = replace(fit, problem=judged).reoptimised(_REJECTION_TOLERANCE)
     if given.legs.is_redundant:
-        fit = fit.passed()
+        fit = fit.reoptimised()
         problem, minimum = _without_wrong_readings(fit.problem, given, fit.minimum)
         fit = replace(fit, problem=problem, minimum=minimum)
     return fit
@@ -251,7 +251,7 @@ def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tupl
             )
             are_white = not len(biases) and not len(fit.state.biases)
             fit = fit.with_edge_biases(biases)
-        fit = fit.passed()
+        fit = fit.reoptimised()
         if not fit.accepted.any():
             break
         changes = Changes.of(before, fit)
