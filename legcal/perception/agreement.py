@@ -29,7 +29,7 @@ class Agreement:
     """Agreement of images with one hypothesis."""
 
     row: IntArray  # (n,) of the images
-    support: Array  # (n,) legs that agree with each, less its part of what shifted joints cost
+    support: Array  # (n,) legs that agree with each, less its share of the cost of shifted joints
     expected: Array  # (n,) legs that each should show
     cameras: tuple[RigidTransform | None, ...]  # T_base_group of each group of views, where found
 

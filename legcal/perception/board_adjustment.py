@@ -100,8 +100,10 @@ class AdjustedBoard:
     sheet: Sheet | None  # None where the board was taken as flat
     residual: Array  # (n, 2) corners less where they should be seen [px]
     cost: float  # half the sum of squares, in standard deviations, large ones by Huber's loss
-    covariance: Array  # (k, k) of the free intrinsics, then of the sheet, by those of corners
-    clusters: Clusters  # what each image says of these
+    covariance: (
+        Array  # (k, k) of the free intrinsics, then of the sheet, from the covariances of corners
+    )
+    clusters: Clusters  # scores of these by image
     # (n_images, 6, 6) of a rotation vector [rad] and a displacement [m] of the board, the camera
     # being known
     information: Array

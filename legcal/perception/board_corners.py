@@ -28,7 +28,7 @@ from legcal.vision.image_file import Grey, possible_scale, quiet_opencv, reduced
 from legcal.workers import Run
 
 STAGE = "Searching the board"
-MAX_ASKED = 2  # images of a view that are searched for what they show instead
+MAX_ASKED = 2  # images of a view that are searched for other boards
 
 _STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
 _FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
@@ -456,7 +456,7 @@ _MIN_MARKERS = 3  # of another dictionary that are no chance
 
 
 def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
-    """Return the board that images show, and what is to be said of it, "" for nothing.
+    """Return the board that images show, and a note on it, "" for none.
 
     Of a chessboard squares are stated, and most people count its inner corners: it is the reading
     that more images show. None where they show a larger one: which one goes after "found".

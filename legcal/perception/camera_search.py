@@ -116,7 +116,7 @@ class PoseCandidates:
 
     @property
     def lead(self) -> float:
-        """Score of the first pose beyond that of the second one, in legs."""
+        """Score of the first pose less the score of the second, in legs."""
         if len(self.poses) < 2:
             return float("inf")
         return float(self.score[0] - self.score[1])
@@ -331,7 +331,7 @@ def with_first(
 
 
 def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
-    """Return poses with their support, best first, without those that say the same."""
+    """Return poses with their support, best first, without equivalent ones."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
@@ -402,7 +402,7 @@ def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
 
 
 def _starts(picture: Picture, n_legs: int) -> CameraPoses:
-    """Return the poses that suit a picture best, among those that two of its pairs suggest."""
+    """Return the poses that fit an image best, among the poses suggested by two of its pairs."""
     poses = _suggested(picture, n_legs)
     if len(poses) == 0:
         return poses

@@ -42,7 +42,7 @@ STRIDE = 4  # every such row and column is enough for a median
 _ASIDE = 1e-3
 N_SECTORS = 8  # of directions in which light changes along one edge
 MIN_PIXELS = 6  # of a piece
-MAX_SUBPIXEL = 0.6  # of the middle of an edge from that of its pixel [reduced px]
+MAX_SUBPIXEL = 0.6  # distance of the middle of an edge from its pixel [reduced px]
 MAX_SAG = 1.3  # of the pixels of a piece from its line [reduced px]
 MAX_CUTS = 3  # of a chain, each into two
 
@@ -108,7 +108,7 @@ def _differs(picture: Grey, still: Still) -> BoolArray:
 
 
 def moving_pixels(picture: Grey, still: Still) -> Image:
-    """Return 1 near pixels of a picture that are not those of what stands still, else 0."""
+    """Return 1 near pixels of an image that differ from the static background, else 0."""
     size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
 
@@ -210,7 +210,7 @@ def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray
 def _components(i: IntArray, j: IntArray, n: int) -> IntArray:
     """Return the connected component of each of n nodes, by links from i to greater j."""
     label: IntArray = np.arange(n)
-    while len(i):  # each round at least halves what still has links to others
+    while len(i):  # each round at least halves the nodes that still have links to others
         above: IntArray = np.arange(n)
         above[j] = i  # each node follows a lesser one, if it has a link to any
         higher = above.take(above)

@@ -235,9 +235,9 @@ def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: In
 
 _NEAR = 1.5  # pitches within which corners give how the board lies around a place
 _STIFF = 1e-3  # ridge on squares of distances, as a part of the weights
-_MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 2.0, 2.5  # times what is usual in the image
+_MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 2.0, 2.5  # over the median of the image
 _GOOD_FIT = 0.05  # of the contrast left over: always accepted
-_MIN_CONTRAST_RATIO = 0.3  # of what is usual
+_MIN_CONTRAST_RATIO = 0.3  # over the median
 # From where its neighbours put a corner that is another thing: at least; times what is usual; parts
 # of a pitch, with neighbours all around it and at the rim, where lenses bend what goes on.
 _OFF_PX, _OFF_MEDIANS, _OFF_BETWEEN, _OFF_BESIDE = 0.5, 9.0, 0.03, 0.25
@@ -348,7 +348,7 @@ def measured(
 def _grown(
     grey: Grey, board: Print, ij: IntArray, found: Saddles, tried: set[tuple[int, int]]
 ) -> tuple[IntArray, Array]:
-    """Return columns and rows (k, 2) that seem to go on from those that are known, px (k, 2).
+    """Return columns and rows (k, 2) that continue the known ones, px (k, 2).
 
     One line after the other is expected from those before it, and looked at.
     """
@@ -373,7 +373,7 @@ _MIN_KNOWN = 4  # corners from which others are expected
 
 
 def _beside(board: Print, ij: IntArray, tried: set[tuple[int, int]]) -> IntArray:
-    """Return columns and rows next to those that are known."""
+    """Return columns and rows next to the known ones."""
     around = (ij[:, None] + _STEPS).reshape(-1, 2)
     known = set(map(tuple, ij.tolist())) | tried
     fresh = sorted({at for at in map(tuple, around[board.has(around)].tolist()) if at not in known})
@@ -381,12 +381,12 @@ def _beside(board: Print, ij: IntArray, tried: set[tuple[int, int]]) -> IntArray
 
 
 def _parity(ij: IntArray) -> Array:
-    """Return 1 for corners whose squares are as those of the first one, -1 for the others."""
+    """Return 1 for corners with the contrast of the first one, -1 for the others."""
     return np.where(ij.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def _sign(ij: IntArray, found: Saddles) -> float:
-    """Return the sign of the contrast of the first corner, by that of most."""
+    """Return the sign of the contrast of the first corner, by majority."""
     return 1.0 if np.median(np.sign(found.contrast) * _parity(ij)) >= 0.0 else -1.0
 
 

@@ -51,7 +51,7 @@ _FLIPS = (
 
 N_REFERENCES = 3  # good images that others are compared with
 MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
-GOOD_PERCENTILE = 75.0  # of the shares that images show, for what good ones do
+GOOD_PERCENTILE = 75.0  # percentile of the shares that images show, for good images
 MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 NO_OUTLINE = Rejection(Reason.OTHER, "no outline is used")
@@ -63,7 +63,7 @@ _CAMERA_AXES = {
     "x forward and z up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "x left and y up, or its images are upside down": np.diag([-1.0, -1.0, 1.0]),
 }
-# Three times what a rough pose is good to: part of the distance of the camera, angle
+# Three times the accuracy of a rough pose: part of the distance of the camera, angle
 FAR_OFF = (0.06, np.deg2rad(6.0))
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
@@ -72,8 +72,8 @@ class ImageExplanation(NamedTuple):
     """The explanation of an image whose legs are not where its reading predicts them."""
 
     own: float  # share of the legs, by visible length, that are where its reading has them
-    reason: Rejection = USED  # what it shows instead; false where nothing explains it clearly
-    remedy: str = ""  # what to do then
+    reason: Rejection = USED  # the explanation; false without a clear one
+    remedy: str = ""
 
 
 class OutlineCount(NamedTuple):
@@ -96,7 +96,7 @@ def find_wrong_images(
     defects: Mapping[int, Rejection],
     run: Run,
 ) -> tuple[Placement, dict[int, Rejection]]:
-    """Return the placement with what is said of images, and why they are left out, by row.
+    """Return the placement with notes on images, and the rejections of images by row.
 
     ``rows`` were searched; ``defects`` are what is wrong with single images. A view all of whose
     images have one is not placed, with one note.
@@ -129,7 +129,7 @@ def find_wrong_images(
 
 
 def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outlines:
-    """Return outlines with those of some images rejected; edited ones stay.
+    """Reject the outlines of some images; edited ones stay.
 
     Those that an image should not show keep the reason for that, so that they do not count as
     expected there.
@@ -552,7 +552,7 @@ def hint_notes(
     the tolerance of rough poses. Views with the same misinterpretation have one note. Poses of the
     views ``by_landmarks`` follow from clicks.
     """
-    notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by what they mean
+    notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by misinterpretation
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not far_off(hint, T, reach):
             continue

@@ -102,7 +102,7 @@ class _Scene:
     wanted: BoolArray  # (n_views, n_legs)
     q: Array  # (n_poses, n_legs) readings; of motors alone they have a meaning
     drawn: Array  # (n_drawn, 3, 4) poses of the workspace
-    targets: tuple[LegSegments, ...]  # what is to be seen at them
+    targets: tuple[LegSegments, ...]  # predicted legs at them
     images: Mapping[int, Sequence[_Image]]  # by pose
     # (n, 3, 4) by pose: where clicks have the platform, and around; drawn ones are not tried then
     clicked: Mapping[int, Array] = field(default_factory=dict)
@@ -380,7 +380,7 @@ def _stepped(
     n, unit = 6 + 6 * len(views), _pose_unit(scene)
     J = np.zeros((*of_lines.shape[:2], n))
     J[..., :6] = of_lines[..., 1:]
-    weight, value = np.zeros(n), np.zeros((len(poses), n))  # of what is known without images
+    weight, value = np.zeros(n), np.zeros((len(poses), n))  # of the priors
     weight[:6] = unit**-2
     if rough is not None:
         seen = np.array([views.index(image.view) for image in scene.images[k]] * len(poses))

@@ -17,7 +17,7 @@ from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.light import reduce
 from legcal.vision.image_file import Grey
 
-BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
+BLACK, WHITE = 8.0, 247.0  # bounds of nearly all pixels of an unusable image [grey levels]
 BRIGHTEST = 254.5  # [grey levels]
 TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
 MIN_RANGE = 10.0  # of an image in which something can be seen [grey levels]
@@ -37,7 +37,7 @@ _SMOOTHED, _SLOPES = (  # of a row of pixels, without the ends
     for taps in (_SMOOTH, _SLOPE)
 )
 MARGIN = 3  # of the image of half the size, beyond which edges do not count [px]
-DIRECTIONS = 4  # of edges: what moves is blurred in one
+DIRECTIONS = 4  # of edges: motion blurs one of them
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
 FLAT = 1.0  # slope below which nothing is there: a hundredth of a grey level in a pixel
@@ -45,7 +45,7 @@ MIN_EDGES, MIN_EDGES_PART = 40, 0.1  # places of a direction, and of all
 MAX_EDGES = 1000  # places of a direction that are compared
 MAX_BLUR = 8.0  # that the scales can measure [px]
 MAX_BLUR_OF_OTHERS = (2.0, 1.2)  # against others: factor, and more [px]
-USUAL_PERCENTILE = 40.0  # percentile of blurs, for what is usual
+USUAL_PERCENTILE = 40.0  # percentile of blurs, for the usual blur
 MIN_IMAGES = 3  # images of a view or camera, to be compared
 
 

@@ -64,7 +64,7 @@ _FARTHER = (0.0, 1.0, 2.5, 5.0)  # from the curve, in the least distance of a te
 _APART = 0.25  # of that distance between two texts
 _ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
 _ON_LINE = 0.1  # of the area of a text, that each point of a line under it costs
-_ON_TEXT = 4.0  # times the areas of a text and of what it hides of another
+_ON_TEXT = 4.0  # weight of the overlap of two texts
 _LEADER_POINTS = 8
 
 
@@ -78,7 +78,7 @@ class Mark(NamedTuple):
 class PartMarks(NamedTuple):
     """The drawing of a part of a leg."""
 
-    name: str  # the leg, and the part where the leg has several; "" for what has no label
+    name: str  # the leg, and the part where the leg has several; "" without a label
     reason: str  # why an outline of it is not used, shortened; "" if both are
     marks: tuple[Mark, ...]
 

@@ -27,7 +27,7 @@ BLOCK_LENGTH = 8.0  # along the part [px]
 ROWS, ROWS_NEAR = 4, 2  # of samples in a block, and where all windows are small
 NEAR_WINDOW = 4  # such a window, at most [px]
 MAX_BLOCKS = 80  # of a part
-MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
+MARGIN = 6  # columns beyond the search window, to judge edges [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
@@ -39,7 +39,7 @@ LONE_SCORE = 0.5  # of an edge that may stand alone
 LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
-BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
+BESIDE_WEIGHT = 0.8  # weight of an edge in the columns beside it
 # An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
 # multiples of half a pixel: between two of these, rounding decides nothing.
 MAX_PREDICTION_ERROR = 1.25

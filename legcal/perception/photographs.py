@@ -86,7 +86,7 @@ class Photographs:
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
-    still: dict[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
+    still: dict[int, Still] = field(default_factory=dict)  # static background by view
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -164,7 +164,7 @@ class MeasuredImages:
 
     photographs: Photographs  # the images, and the mechanism with the radii that they show
     placement: Placement  # with views that could not be placed, and notes on views and images
-    outlines: Outlines  # of all images; those of images that are left out are rejected
+    outlines: Outlines  # of all images; rejected in images that are left out
     left_out: dict[int, Rejection]  # why images were left out, by row
     blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
     # T_base_platform of every pose that images show, where the readings do not give it
@@ -308,7 +308,7 @@ def _with_other_radii(
         measured = replace(measured, blur=np.where(np.isnan(blur), measured.blur, blur))
         shown = _images_with_more(machine.legs, radii, m.view, measured.outlines, outlines)
         of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
-        if of_one and not radii.common:  # what one camera sees may be light and shade
+        if of_one and not radii.common:  # one camera alone may see light and shade
             left = [part for part in suspects if not _is_among(part, of_one)]
             suspects = left if len(left) < len(suspects) else []
             continue
@@ -387,7 +387,7 @@ def _decided_by_outlines(
     report: Report,
     joined: Joined,
 ) -> tuple[Placement, FreePosesOf, dict[int, int]]:
-    """Return the legs at those of several poses at which most outlines can be measured.
+    """Return the legs at the pose, of several, at which most outlines can be measured.
 
     With the number of outlines there, by pose. They are measured at the likeliest poses of all
     images first, then at others before cameras that these have placed; twice, since cameras stand

@@ -59,14 +59,14 @@ class Search:
     measurements: Measurements
     A_base: Array  # (n_rows, n_legs, 3) joint centres by the nominal model, in the base link [m]
     B_base: Array
-    cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
+    cylinders: Sequence[Sequence[Cylinder]]  # visible cylinders of each leg
     wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
     size: float  # mean leg length of the machine [m]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
-    occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
-    still: Mapping[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
+    occluders: Sequence[Occluder] = ()  # occluders besides legs and arms
+    still: Mapping[int, Still] = field(default_factory=dict)  # static background by view
 
     @property
     def n_legs(self) -> int:
@@ -243,7 +243,7 @@ class Placement:
     moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, NotPlaced] = field(default_factory=dict)  # by the names of views
-    notes: tuple[str, ...] = ()  # what else a reader should know
+    notes: tuple[str, ...] = ()  # further notes
     # What is said of images that show little or nothing of the legs, by row: near a fit they may
     # show more
     barely: Mapping[int, Cause] = field(default_factory=dict)
@@ -323,7 +323,7 @@ def group_views(
     hints: Sequence[RigidTransform | None],
     joined: Joined,
 ) -> list[Group]:
-    """Return the views of rows that stand alone, and those that are joined by T_board_camera.
+    """Return the single views of rows, and groups of views related by T_board_camera.
 
     Hints are rough T_base_camera of each view.
     """

@@ -28,13 +28,13 @@ from legcal.vision.visibility import look_alike
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
 TOLERANCES = (*2 * (SEARCHING[3],), *2 * (SEARCHING[4],))  # of an axis from its pair
 MIN_MATCH_SCORE = 0.25  # score of a segment with its pair that counts
-PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
+PREFERRED = 1.15  # ratio by which a farther factor must be better than a nearer one
 MIN_CHANGE = 0.08  # from the model, as a logarithm: less does no harm
 CONVERGED = 0.02  # the same once corrected
 MIN_SIGMAS = 4.0  # standard errors
 MIN_PAIRS = 3  # pairs of a part in a view
 MAX_SPREAD = 0.025  # robust standard deviation of their logarithms: else some are of other edges
-NOISE = 0.01  # of what a view says
+NOISE = 0.01  # of a factor by one view
 CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wrong alike
 MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
 MAX_ITERATIONS = 4  # of correcting radii and placing cameras by them

@@ -59,7 +59,7 @@ from legcal.workers import Run, in_turn
 
 MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
-MIRRORED_EDGES = 1.06  # legs along edges of mirrored pictures, in those of the pictures
+MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
 # Of the joint centres of a leg that a view shows: at least, besides standard deviations
@@ -154,7 +154,7 @@ class PlacedViews:
         return _gathered(replace(self, placed=placed), radii, run)
 
     def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
-        """Return the pictures of a group, all of them or those of some rows."""
+        """Return the images of a group, all of them or of some rows."""
         group = self.groups[g]
         return group.pictures(self.pictures, group.rows if rows is None else rows)
 
@@ -411,7 +411,7 @@ def _gap(one: Array, other: Array) -> float:
 
 
 def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
-    """Put the views together, with the reasons of those that could not be placed."""
+    """Assemble the placement of all views, with the causes of unplaced ones."""
     search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
     T, unplaced = list(found.hints), dict[str, NotPlaced]()

@@ -71,7 +71,7 @@ class Saddles:
     # (n,) half of the step over an edge [grey levels]; positive if it is bright where both sides,
     # clockwise from the axes as the image shows them, are
     contrast: Array
-    misfit: Array  # (n,) what the model leaves over (root mean square), as a part of the contrast
+    misfit: Array  # (n,) residual of the model (root mean square), over the contrast
     found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
 
     def choose(self, rows: IntArray | BoolArray) -> Saddles:

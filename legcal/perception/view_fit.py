@@ -81,7 +81,7 @@ class ViewFit:
     row: IntArray  # (n,) legs in images that have outlines
     leg: IntArray  # (n,)
     n_outlines: IntArray  # (n,) how many of each
-    offset: Array  # (n, 3) what their images add to B [m]
+    offset: Array  # (n, 3) shift of B in their images [m]
     distance: Array  # (n,) how far their outlines are from the fit, in standard deviations
     middle: Array  # (3,) of the machine in the base link [m]
     evidence: float  # what it is worth that each outline was found near where the fit has it, less
@@ -125,7 +125,7 @@ class _State:
 
     pose: Frames  # (1,) of the machine in the frame of the group, its origin at the middle
     shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
-    offset: Array  # (n_items, 3) what its image adds to B of each leg [m]
+    offset: Array  # (n_items, 3) shift of B of each leg in its image [m]
 
 
 def fit_view(
@@ -380,7 +380,7 @@ class _Lines:
     whitening: Array  # (n, 2, 2)
     item_row: IntArray  # (n_items,)
     item_leg: IntArray
-    first: IntArray  # (n_items,) its first outline: those of an item follow each other
+    first: IntArray  # (n_items,) its first outline; the outlines of an item are consecutive
     size: IntArray  # (n_items,) offsets that were measured
 
     @property
@@ -551,7 +551,7 @@ def _without_outliers(
     outlines: Outlines,
     fits: Fits,
 ) -> tuple[Outlines, Fits]:
-    """Return outlines without those of legs that do not fit, and the fits to the others."""
+    """Return outlines without legs that do not fit, and the fits to the others."""
     wrong = {
         one
         for fit in fits
@@ -560,7 +560,7 @@ def _without_outliers(
     }
     if not wrong:
         return outlines, fits
-    out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
+    out = _among(outlines, wrong) & ~is_edited(outlines)  # edited outlines stay
     outlines = outlines.reject(out, Reason.VIEW_DISAGREES)
     return outlines, _fits(search, groups, placement, outlines, fits, {row for row, _ in wrong})
 
@@ -568,7 +568,7 @@ def _without_outliers(
 def _placed_by_fits(
     search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
 ) -> Placement:
-    """Return cameras and joint centres by the fits, those of other groups as recognised."""
+    """Return cameras and joint centres by the fits; other groups stay as recognised."""
     T, shift = list(placement.T_base_camera), placement.shift.copy()
     for group, fit in zip(groups, fits, strict=True):
         if fit is not None:
