@@ -45,7 +45,7 @@ class EdgeMaps:
         cameras: Sequence[Camera],
         factors: Sequence[int],
     ) -> EdgeMaps:
-        """Return the edge maps of images reduced by factors, without the static background if given."""
+        """Return the edge maps of images reduced by factors, without static background if given."""
         grids = [_grid(*one) for one in zip(pictures, cameras, factors, strict=True)]
         flat = [
             (_on_plane(picture, grid), None if part is None else _on_plane(part, grid))

@@ -88,10 +88,10 @@ class PixelSums:
 def _by_groups(sums: Array, functions: Array, bounds: Sequence[int]) -> Array:
     """Return sums (n, i, m) times functions (n_groups, i m, k) of their groups, (n, k)."""
     flat = sums.reshape(len(sums), -1)
-    totals = np.empty((len(sums), functions.shape[-1]))
+    found = np.empty((len(sums), functions.shape[-1]))
     for of_group, (first, last) in zip(functions, pairwise(bounds), strict=True):
-        np.matmul(flat[first:last], of_group, out=totals[first:last])
-    return totals
+        np.matmul(flat[first:last], of_group, out=found[first:last])
+    return found
 
 
 @lru_cache(maxsize=8)
