@@ -242,6 +242,10 @@ def table(lines: list[Line], room: str) -> None:
               f"leg ({1e4 * line.stated:.2f} stated)")  # fmt: skip
     print(f"{'':20}plateau      outlines used and error against factor 1")
     for number, low, high, trials in plateaus(lines, room):
+        if all((t.used, t.off) == (usual[t.session].used, usual[t.session].off) for t in trials):
+            names = dict.fromkeys(line.session for line in trials)
+            print(f"{number:20}no part in {', '.join(names)}")
+            continue
         words = []
         for factor in sorted({line.factor for line in trials}):
             each = [
