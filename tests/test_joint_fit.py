@@ -381,7 +381,7 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
         assert found.start == "nominal"
         said = (*found.notes, *found.details)
         assert any("the four steps" in note for note in said)
-        start = "From the nominal model, the joint fit reached a cost of"
+        start = "Starting from the nominal model, the joint fit reached a cost of"
         assert any(note.startswith(start) for note in found.details)
         assert not any(note.startswith(start) for note in found.notes)
     equal = replace(disturbed_start(small, seed=9), label="staged")
