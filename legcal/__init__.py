@@ -3,7 +3,7 @@
 The method is Renaud, Andreff, Gogu, Martinet, *On vision-based kinematic calibration of
 n-leg parallel mechanisms* (IFAC 2002), followed by one joint fit in the image.
 
-Notation, the same everywhere (the letters are the paper's):
+Notation, the same everywhere (with the letters of the paper):
 
 =====================  =====================================================================
 ``T_to_from``          a rigid motion; neighbours cancel: ``p_base = T_base_camera.apply(p_camera)``

@@ -1,4 +1,4 @@
-"""What an interactive session shows of an object that holds much: a few lines."""
+"""Short representations of large objects for interactive sessions: a few lines."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 T = TypeVar("T")
 
-_MAX_FIELDS = 9  # lines
-_MAX_TEXT = 70  # characters of a value
-_MAX_ITEMS = 4  # of a sequence of numbers or names that is shown whole
-_MAX_NUMBERS = 6  # of an array that is shown whole
+_MAX_FIELDS = 9  # maximum number of lines
+_MAX_TEXT = 70  # maximum characters of a value
+_MAX_ITEMS = 4  # maximum length of a sequence of numbers or names that is shown whole
+_MAX_NUMBERS = 6  # maximum length of an array that is shown whole
 _WIDTH = 100  # characters of a line
 
 
 def brief(cls: type[T]) -> type[T]:
-    """Give a class a ``repr`` of at most ten lines, however much it holds, and a table of HTML.
+    """Give a class a ``repr`` of at most ten lines, whatever its content, and a table of HTML.
 
     The class is a dataclass or a pydantic model.
 
-    Large arrays are shown by their shape, sequences by what is in them, dataclasses by their name.
+    Large arrays are shown by their shape, sequences by their types, dataclasses by their name.
     """
     cls.__repr__ = cls.__str__ = _repr  # type: ignore[method-assign]
     if not hasattr(cls, "_repr_html_"):
@@ -43,20 +43,20 @@ def _repr(self: object) -> str:
         return line
     if len(shown) > _MAX_FIELDS:
         shown = [*shown[: _MAX_FIELDS - 1], f"... and {len(shown) - _MAX_FIELDS + 1} more"]
-    return f"{name}(" + ",".join(f"\n    {one}" for one in shown) + ")"
+    return f"{name}(" + ",".join(f"\n    {entry}" for entry in shown) + ")"
 
 
 def _repr_html(self: object) -> str:
-    """Return what a notebook shows: the answer, if the object is one, and a row a field."""
+    """Return the view in a notebook: the answer, if the object has one, and a row a field."""
     answer = getattr(self, "sentence", None)
-    told = f"<p><b>{escape(answer)}</b></p>" if isinstance(answer, str) else ""
+    answer_in_bold = f"<p><b>{escape(answer)}</b></p>" if isinstance(answer, str) else ""
     rows = "".join(
         f'<tr><td style="text-align:left">{escape(name)}</td>'
         f'<td style="text-align:left">{escape(_value(getattr(self, name)))}</td></tr>'
         for name in _shown(self)
     )
     name = escape(type(self).__name__)
-    return f"{told}<details open><summary>{name}</summary><table>{rows}</table></details>"
+    return f"{answer_in_bold}<details open><summary>{name}</summary><table>{rows}</table></details>"
 
 
 def _shown(self: object) -> list[str]:
@@ -86,7 +86,7 @@ def _value(value: object) -> str:
 
 
 def _several(items: list[object], brackets: str) -> str:
-    """Return what a sequence holds: its items where these are few and plain, else their types."""
+    """Return the items of a sequence if these are few and plain, else their types."""
     if len(items) <= _MAX_ITEMS and all(isinstance(x, str | int | float) for x in items):
         text = ", ".join(map(repr, items))
         if len(text) <= _MAX_TEXT:

@@ -1,7 +1,7 @@
-"""Why something is so, as words and the values in them, so that equal causes are said once.
+"""Causes as words with values, so that equal causes are stated once.
 
-A sentence is made where people read it; until then a cause is data: those with the same words and
-names are one cause, whatever their figures are, and are said together with the range of these.
+Sentences are made for the reader only; until then a cause is data. Causes with the same words and
+names are one cause, whatever their figures, and are stated once with the range of the figures.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _K = TypeVar("_K", bound=Hashable)
 
 
 class Figures(tuple[float, ...]):
-    """Numbers that are said as a range, from the least to the greatest."""
+    """Numbers that are stated as a range, from the smallest to the largest."""
 
     def __format__(self, spec: str) -> str:
         shown = list(dict.fromkeys(format(number, spec) for number in sorted(self)))
@@ -47,13 +47,13 @@ class Cause:
 
 
 def together(causes: Sequence[Cause]) -> Cause:
-    """Return causes of one kind as one, with all their figures."""
+    """Merge causes of one kind, with all their figures."""
     columns = zip(*(cause.values for cause in causes), strict=True)
     return Cause(causes[0].words, tuple(map(_joined, columns)))
 
 
 def _joined(values: tuple[Value, ...]) -> Value:
-    """Return one value of causes of one kind, from that of each."""
+    """Merge a value of several causes of one kind."""
     if isinstance(values[0], str):
         return values[0]
     if isinstance(values[0], Cause):
@@ -68,8 +68,11 @@ def _joined(values: tuple[Value, ...]) -> Value:
 
 
 def by_cause(causes: Mapping[_K, Cause]) -> list[tuple[Cause, tuple[_K, ...]]]:
-    """Return each cause once, with what it is the cause of."""
+    """Return each cause once, with the keys of its effects."""
     alike: dict[Hashable, dict[_K, Cause]] = {}
     for key, cause in causes.items():
         alike.setdefault(cause.kind, {})[key] = cause
-    return [(together(list(same.values())), tuple(same)) for same in alike.values()]
+    return [
+        (together(list(causes_by_key.values())), tuple(causes_by_key))
+        for causes_by_key in alike.values()
+    ]

@@ -1,4 +1,4 @@
-"""Matplotlib figures that are handed out, and names of others in them."""
+"""Matplotlib figures for users, and foreign names in them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def new_figure(
     n_panels: int, columns: int, panel: tuple[float, float]
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with so many panels in rows, each of a width and height in inches.
+    """Give a figure with panels in rows, each of a width and height in inches.
 
     It is laid out at the end. Pyplot has closed it: a notebook shows it once, no window opens, and
     it does not stay in memory.
@@ -37,5 +37,5 @@ def new_figure(
 
 
 def plain(text: str) -> str:
-    """Return a name as a figure shows it letter by letter: a dollar begins no formula."""
+    """Escape a name for a figure, so that a dollar sign does not begin a formula."""
     return printable(text).replace("$", r"\$")

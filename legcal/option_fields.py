@@ -1,6 +1,6 @@
-"""Options of a command as the fields of a dataclass: what reads them declares them, once.
+"""Options of a command as the fields of a dataclass, declared once beside the code that uses them.
 
-Nothing but the standard library is imported here, so that help and completion answer at once.
+Only the standard library is imported here, so that help and completion answer at once.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ def option(
     text: str,
     panel: str | None = None,
     *,
-    flags: tuple[str, ...] = (),  # as typer.Option takes them; by default of the field's name
+    flags: tuple[str, ...] = (),  # for typer.Option; by default from the name of the field
     metavar: str | None = None,
-    shown: str | None = None,  # as the default, where None stands for it
+    shown: str | None = None,  # text for a default of None
 ) -> dict[str, Any]:
-    """Return the metadata of a field that is an option: what the command line knows beside it."""
-    how = {"flags": flags, "help": text, "rich_help_panel": panel, "metavar": metavar}
+    """Return the metadata of a field that is an option of the command line."""
+    keywords = {"flags": flags, "help": text, "rich_help_panel": panel, "metavar": metavar}
     if shown is not None:
-        how["show_default"] = shown
-    return {"option": how}
+        keywords["show_default"] = shown
+    return {"option": keywords}
 
 
 def flag(name: str) -> str:
-    """Return the option of a field without flags of its own."""
+    """Return the option of a field without explicit flags."""
     return f"--{name.replace('_', '-')}"

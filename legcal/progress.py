@@ -1,4 +1,4 @@
-"""How long-running work says where it is: to a function of the caller, or on stderr."""
+"""Progress of long-running work, reported to a function of the caller or on stderr."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Report = Callable[[str, int, int], None]
 """Called as ``report(stage, done, total)``."""
 
 Progress = Report | bool
-"""What public functions take: True shows bars, in terminals and notebooks; False shows nothing."""
+"""True shows bars, in terminals and notebooks; False shows nothing; a function is called."""
 
-_REFRESH = 0.1  # [s] between two pictures of a bar, at least
+_REFRESH = 0.1  # [s] minimum time between two drawings of a bar
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
@@ -26,7 +26,7 @@ def no_progress(stage: str, done: int, total: int) -> None:
 
 @contextmanager
 def shown_progress(progress: Progress) -> Iterator[Report]:
-    """Yield what is called with the progress of the work within; see :data:`Progress`."""
+    """Yield the function to call with the progress of the work within; see :data:`Progress`."""
     if callable(progress):
         yield progress
     elif progress:
@@ -54,7 +54,7 @@ def _on_stderr() -> Iterator[Report]:
     )
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    # Without a thread of its own, beside which no process can be copied.
+    # Without a refresh thread: a process with threads cannot be forked.
     with Progress(*columns, TimeElapsedColumn(), console=console, auto_refresh=False) as bars:
         tasks = {}
         refreshed = -_REFRESH
@@ -70,7 +70,7 @@ def _on_stderr() -> Iterator[Report]:
                 refreshed = now
 
         yield report
-        for task in bars.tasks:  # what was left out of a stage is done as well
+        for task in bars.tasks:  # skipped parts of a stage count as done
             bars.update(task.id, completed=task.total)
 
 

@@ -1,9 +1,9 @@
-"""Stopping by a signal: what the command line does about Ctrl-C, SIGTERM and SIGHUP.
+"""Stopping by a signal: the handling of Ctrl-C, SIGTERM and SIGHUP by the command line.
 
-Only the command line installs handlers (:func:`stopped_by_signals`); in a program that imports
-legcal those of Python and of the program stay. The first signal raises KeyboardInterrupt in the
-main thread, and nothing is recorded any more (:func:`raise_if_stopped`), should a library swallow
-that on its way. The second one ends the process, whatever it does.
+Only the command line installs handlers (:func:`stopped_by_signals`); a program that imports legcal
+keeps the handlers of Python and its own. The first signal raises KeyboardInterrupt in the main
+thread; if a library swallows it, nothing is recorded any more (:func:`raise_if_stopped`). The
+second signal ends the process unconditionally.
 """
 
 import signal
@@ -12,39 +12,39 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
-INTERRUPTED = 130  # exit code of a command that a signal stopped
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last is not on every system
+INTERRUPTED = 130  # exit code of a command stopped by a signal
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # SIGHUP does not exist on every system
 _NUMBERS = [signal.Signals[name] for name in _NAMES if hasattr(signal, name)]
-_heard: list[int] = []  # the signals that stopped the command
-_waiting: list[list[int]] = []  # the signals that wait for the end of each block
+_heard: list[int] = []  # signals that stopped the command
+_waiting: list[list[int]] = []  # signals that wait for the end of each block
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt for any signal that asks the block to end; a second ends the process.
+    """Raise KeyboardInterrupt for a signal to end the block; a second signal ends the process.
 
-    Errors after a signal are those of libraries that turned the interrupt into one. A signal that
-    was ignored before, as by ``nohup``, stays so.
+    Errors after a signal come from libraries that converted the interrupt. A signal that was
+    ignored before, such as by ``nohup``, stays ignored.
     """
     before = {n: signal.getsignal(n) for n in _NUMBERS}
     heard = [n for n in _NUMBERS if before[n] is not signal.SIG_IGN]
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        for each in heard:  # by the system, as Python may be kept from answering
-            signal.signal(each, signal.SIG_DFL)
+        for heard_number in heard:  # by the system, as Python may be kept from answering
+            signal.signal(heard_number, signal.SIG_DFL)
         _heard.append(number)
         raise KeyboardInterrupt
 
     try:
-        for each in heard:
-            signal.signal(each, stop)
+        for heard_number in heard:
+            signal.signal(heard_number, stop)
         yield
     except Exception:
         raise_if_stopped()
         raise
     finally:
-        for each in heard:
-            signal.signal(each, before[each])
+        for heard_number in heard:
+            signal.signal(heard_number, before[heard_number])
         _heard.clear()
 
 
@@ -60,7 +60,7 @@ def held_back_signals(*, first_alone: bool = False) -> Iterator[None]:
 
     The block may look at :func:`is_waiting`.
     """
-    if current_thread() is not main_thread():  # which is the one that hears
+    if current_thread() is not main_thread():  # signals are handled in the main thread
         yield
         return
     waiting: list[int] = []
@@ -88,14 +88,14 @@ def held_back_signals(*, first_alone: bool = False) -> Iterator[None]:
 
 
 def is_waiting() -> bool:
-    """Say whether a signal waits for the end of a block."""
+    """Return whether a signal waits for the end of a block."""
     return any(_waiting)
 
 
 def leave_interrupts_to_parent() -> None:
-    """Let a process of a pool ignore Ctrl-C, which its parent answers, and be ended by the others.
+    """Let a process of a pool ignore Ctrl-C, which its parent handles; other signals end it.
 
-    It may be a copy made in :func:`held_back_signals`, so that none was answered before.
+    It may have been forked in :func:`held_back_signals`, with signals still blocked.
     """
     _waiting.clear()
     for number in _NUMBERS:

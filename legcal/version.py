@@ -1,3 +1,3 @@
-"""The version of legcal, kept in this one place."""
+"""The version of legcal, defined here only."""
 
 __version__ = "0.2.0"

@@ -1,7 +1,7 @@
-"""The one way to run work: in this process, in several, on a Dask cluster or by an executor.
+"""Running work in this process, in several, on a Dask cluster or by an executor.
 
-All of them are executors as those of ``concurrent.futures``, and results are the same bit by bit.
-Threads do not pay: the work is many short steps, and they would wait for each other.
+All of them have the interface of ``concurrent.futures`` executors, and equal results to the last
+bit. Threads are no use: the work is many short steps, and they would wait for each other.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ T = TypeVar("T")
 
 
 def _reduced(motion: RigidTransform) -> tuple[Any, ...]:
-    """Return how a motion is pickled: SciPy would make its matrix orthogonal once more.
+    """Return the pickled form of a motion, since SciPy would orthogonalise its matrix again.
 
-    That changes last digits, and measurements by a pickled motion would be others.
+    That changes the last digits, and with them results from a pickled motion.
     """
     return partial(RigidTransform, normalize=False), (motion.as_matrix(),)
 
@@ -52,7 +52,7 @@ copyreg.pickle(MappingProxyType, lambda mapping: (_read_only, (dict(mapping),)))
 
 
 class Submitter(Protocol):
-    """A Dask client, or an executor as those of ``concurrent.futures``."""
+    """A Dask client, or an executor of ``concurrent.futures``."""
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Any:
         """Return the future of a call."""
@@ -64,12 +64,12 @@ Workers = int | str | Submitter
 
 
 def is_number(workers: object) -> TypeGuard[int]:
-    """Say whether workers are a number of processes, or nothing that could be used."""
+    """Return whether workers are a number of processes, valid or not."""
     return not isinstance(workers, str) and not hasattr(workers, "submit")
 
 
 class Run(Protocol):
-    """How work is carried out for all rows; results come in the order that the pool was given."""
+    """A function that runs a task for all rows, with results in the order chosen for the pool."""
 
     def __call__(self, task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
         """Return the results."""
@@ -84,29 +84,29 @@ def in_turn(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
 def worker_pool(
     workers: Workers, failure: str = "The images could not be worked on", *, in_order: bool = True
 ) -> Iterator[Run]:
-    """Give a way to work in that many processes, or on a cluster; one means in this process.
+    """Give a function that runs tasks in processes or on a cluster; 1 means in this process.
 
-    Processes are started when they are first needed. On Linux they are copies of this one, with all
-    that it has loaded, if it has no threads, which copies would lack; else they are started anew: a
+    Processes are started when they are first needed. On Linux they are forked, with all loaded
+    modules, unless this process has threads, which forks would lack; else they are spawned: a
     program that uses them must be safe to import (``if __name__ == "__main__":``). Libraries have
-    one thread in each. When the block is left by an exception, they end at once, in the middle of
-    their work.
+    one thread in each. When the block is left by an exception, processes end at once, in the middle
+    of their work.
 
     Parameters
     ----------
     workers : int, str or Submitter
         Number of processes, the address of a Dask scheduler, or a Dask client or executor.
     failure : str
-        What could not be done if workers are lost: the message begins so.
+        Beginning of the message if workers are lost.
     in_order : bool
         Whether results come in the order of the rows, which are all taken at once. Otherwise they
-        come as they are finished, and rows are taken as workers get free: memory does not grow with
-        their number.
+        come as they are finished, and rows are taken as workers become free: memory does not grow
+        with their number.
 
     Raises
     ------
     OutOfResources
-        If one of the processes is ended from outside, or a cluster does not answer or is lost.
+        If a process is ended from outside, or a cluster does not answer or is lost.
     UsageError
         If workers cannot be used.
     """
@@ -139,7 +139,7 @@ def worker_pool(
 
 
 _TASKS = 4  # for each worker: few enough to spare messages, enough to share the work
-_AHEAD = 2  # tasks for each worker that are handed out where results come as they are finished
+_AHEAD = 2  # tasks handed out ahead for each worker if results come as they are finished
 _lock = RLock()  # held while rows are worked on
 
 
@@ -150,7 +150,7 @@ def _results(
     task: Callable[[S], T],
     rows: Iterable[S],
 ) -> Iterator[T]:
-    """Yield results; what is not wanted any more is cancelled with the executor."""
+    """Yield results; tasks that are no longer needed are cancelled with the executor."""
     if in_order:
         rows = list(rows)
         size = max(1, len(rows) // (_TASKS * slots))
@@ -159,21 +159,21 @@ def _results(
         while futures:
             yield from futures.popleft().result()
         return
-    rest, running = iter(rows), set[Future[list[T]]]()
+    remaining, running = iter(rows), set[Future[list[T]]]()
     while True:
         free = _AHEAD * slots - len(running)
-        running |= {submit(_each, task, [row]) for row in islice(rest, free)}
+        running |= {submit(_each, task, [row]) for row in islice(remaining, free)}
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
         for future in sorted(done, key=lambda future: future.exception() is not None):
-            yield from future.result()  # before an error of another one
+            yield from future.result()  # before an error of another task
 
 
 def _each(task: Callable[[S], T], rows: Sequence[S]) -> list[T]:
     """Work on one row after the other, whatever the number of threads of a worker.
 
-    Libraries and caches are not made for more.
+    Libraries and caches are not thread-safe.
     """
     with _lock:
         return [task(row) for row in rows]
@@ -182,7 +182,7 @@ def _each(task: Callable[[S], T], rows: Sequence[S]) -> list[T]:
 # Processes
 
 
-_ONE_THREAD = (  # of these libraries, read when a process loads them
+_ONE_THREAD = (  # variables for the number of threads, read when a process loads a library
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -195,7 +195,7 @@ class _Processes(ProcessPoolExecutor):
     """Processes of this machine."""
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        """Submit a call; processes that are started for it have one thread for each library."""
+        """Submit a call; new processes for it have one thread for each library."""
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         with held_back_signals():
             os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -230,7 +230,7 @@ def _processes(n: int) -> Iterator[_Processes]:
 
 
 def _has_one_thread() -> bool:
-    """Say whether this process has one thread, those of libraries counted; no if unknown."""
+    """Return whether this process has one thread, including libraries; False if unknown."""
     try:
         return sys.platform == "linux" and len(os.listdir("/proc/self/task")) == 1
     except OSError:
@@ -238,10 +238,10 @@ def _has_one_thread() -> bool:
 
 
 def _end_with(held: connection.Connection, lifeline: connection.Connection | None) -> None:
-    """Leave the answer to Ctrl-C to the process that started this one, and end when it does.
+    """Leave the handling of Ctrl-C to the parent process, and end when it does.
 
-    The other end of what is held closes when the pool is stopped, or its process killed: a pool's
-    processes would then wait for work for ever. A copied process has a copy of that end.
+    The other end of the held connection closes when the pool is stopped, or its process killed: a
+    pool's processes would then wait for work for ever. A forked process has a copy of that end.
     """
     leave_interrupts_to_parent()
     if lifeline is not None:
@@ -256,7 +256,7 @@ def _wait_for_end(lifeline: connection.Connection) -> None:
 
 @contextmanager
 def _told_if_ended(failure: str) -> Iterator[None]:
-    """Say in one sentence that a process was ended."""
+    """Refuse in one sentence if a process was ended."""
     try:
         yield
     except BrokenProcessPool as error:
@@ -269,7 +269,7 @@ def _told_if_ended(failure: str) -> Iterator[None]:
 # Clusters
 
 
-CONNECTING = 10.0  # [s] in which a scheduler must answer and have a worker
+CONNECTING = 10.0  # [s] maximum time until a scheduler answers and has a worker
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+/?")
 
 
@@ -288,7 +288,7 @@ def _client(address: str, failure: str) -> Any:
             f"{failure}: found '{address}', needed the address of a Dask scheduler; write it like "
             "tcp://host:8786."
         )
-    for name in ("distributed", "distributed.client"):  # what they say is said here
+    for name in ("distributed", "distributed.client"):  # our messages replace theirs
         logging.getLogger(name).setLevel(logging.CRITICAL)
     clients: list[Client] = []
     failures: list[str] = []
@@ -310,17 +310,17 @@ def _client(address: str, failure: str) -> Any:
         ) as error:  # fmt: skip
             failures.append(f"'{error}'")
 
-    # By a thread: the library waits for ever for a port that takes connections and does not answer.
+    # In a thread: the library waits for ever for a port that accepts connections without answering.
     thread = Thread(target=connect, daemon=True)
     thread.start()
     thread.join(CONNECTING + 0.5)
     if clients and clients[0].status == "running":
         return clients[0]
-    said = failures[0] if failures else "no answer"
+    cause = failures[0] if failures else "no answer"
     for client in clients:
         _close(client)
     raise OutOfResources(
-        f"{failure}: found no Dask scheduler at {address} ({said}), needed one; see that it runs "
+        f"{failure}: found no Dask scheduler at {address} ({cause}), needed one; see that it runs "
         "(dask scheduler), and that the address is its own, with the port 8786 unless it was "
         "started with another one, not that of its page (8787)."
     )
@@ -329,8 +329,8 @@ def _client(address: str, failure: str) -> Any:
 def _close(client: Any) -> None:
     """Close a client, whatever its scheduler does.
 
-    One that is left to be collected closes in the thread where that happens: it would block the
-    loop of another client.
+    Otherwise garbage collection would close it in any thread, and could block the loop of another
+    client.
     """
     with suppress(OSError):
         client.close(timeout=2)
@@ -338,9 +338,9 @@ def _close(client: Any) -> None:
 
 @contextmanager
 def _cluster(client: Any, failure: str) -> Iterator[tuple[_Submit, int]]:
-    """Give what submits calls to the workers of a client, and their number.
+    """Give a function that submits calls to the workers of a client, and their number.
 
-    Dask has another worker do what a worker that dies was working on.
+    Dask repeats the work of a dead worker on another one.
     """
     from distributed import TimeoutError as NoWorker
     from distributed.comm.core import CommClosedError
@@ -378,7 +378,7 @@ def _cluster(client: Any, failure: str) -> Iterator[tuple[_Submit, int]]:
 
 
 def _called(call: bytes) -> Any:
-    """Call a function; its pickle keeps schedulers, which unpickle tasks, from importing it."""
+    """Call a pickled function: schedulers, which unpickle tasks, need not import it."""
     function, *arguments = pickle.loads(call)
     return function(*arguments)
 
@@ -387,9 +387,9 @@ def _version() -> str:
     return __version__
 
 
-def _compare_versions(found: dict[str, object], failure: str) -> None:
+def _compare_versions(version_of_worker: dict[str, object], failure: str) -> None:
     """Refuse workers without legcal, or with another version of it."""
-    for worker, version in found.items():
+    for worker, version in version_of_worker.items():
         if version != __version__:
             raise UsageError(
                 f"{failure}: found legcal {version} at the worker {worker}, needed {__version__} "

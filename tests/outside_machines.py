@@ -412,7 +412,7 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
     "i4": (_drawn(partial(_bars, "prismatic", 1)), SEVERAL),
     "delta-of-four": (
         _drawn(partial(_bars, "revolute", 0)),
-        ("overconstrained (1 of the 4", "joints at A that move"),
+        ("overconstrained machine (1 of the 4", "moving joints at A"),
     ),
     "couplers": (_drawn(_couplers), LOOP),
     "arm-on-arm": (

@@ -1227,7 +1227,7 @@ def _formats() -> Iterable[Refusal]:
         ("xyz", (link1[1:] + ' xyz="0.0 0.0 0.0"', link1[1:] + ' xyz="0 0"'),
          ("line", "xyz='0 0'")),
         ("motor", ('<joint name="leg1_prismatic"/>', '<joint name="leg"/>'),
-         ("line", "is a motor of no")),
+         ("line", "names no joint of")),
     ]  # fmt: skip
     yield from _of_file("loops", "machine.urdf", "loop_joint", loops)
     beside = text("machine.yaml", (ROOT / "models/hexapod.yaml").read_text().replace(

@@ -231,7 +231,7 @@ def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> 
 ARMS: dict[str, Any] = yaml.safe_load((TABLES / "delta.yaml").read_text())
 
 
-# --- files that are outside the method -----------------------------------------------------------
+# --- machines that are not supported -------------------------------------------------------------
 
 
 LIMITS = 'lower="-0.5235987755982988" upper="1.2217304763960306"'

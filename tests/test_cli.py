@@ -171,7 +171,7 @@ def test_without_a_command_the_help_is_shown(
     assert run(monkeypatch, *words) == 2
     printed = capsys.readouterr()
     assert "Commands" in printed.out
-    assert printed.err == "legcal: Nothing was done: found no command, needed one of those above.\n"
+    assert printed.err == "legcal: No command given: choose one of those above.\n"
 
 
 @pytest.mark.parametrize(

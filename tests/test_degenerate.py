@@ -118,7 +118,9 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
         platform_joints=[[0, -140, 0], [121.24, 70, 0], [-121.24, 70, 0]],
         radius={"tube": 12, "rod": 8}, home={"xyz": [20, -10, 0], "rpy_deg": [0, 0, 35]},
     )  # fmt: skip
-    with pytest.raises(DidNotConverge, match="the legs meet no more or the mechanism is singular"):
+    with pytest.raises(
+        DidNotConverge, match="the legs no longer close or the mechanism is singular"
+    ):
         legcal.forward_kinematics(short, near)
     dataset = replace(legcal.load_dataset(made_set.folder), machine=short)
     calibration = calibrate(dataset, output=tmp_path / "out")

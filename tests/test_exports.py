@@ -34,7 +34,7 @@ from legcal.exports.identifiers import identifiers
 from legcal.exports.subject import ExportOptions, Subject, load_subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
-from legcal.machine.coordinates import COORDINATES, own_coordinates
+from legcal.machine.coordinates import COORDINATES, independent_coordinates
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.model import Machine
 from legcal.simulation.settings import ParameterErrors, Spread
@@ -166,7 +166,7 @@ def test_kinematics_in_c_compile_and_are_those_of_the_model(
     prefix, columns = identifiers([subject.name])[0], column_legs(machine)
     numbers = ctypes.c_double * len(columns)
     pose = ctypes.c_double * 12
-    own = tuple(COORDINATES[k] for k in own_coordinates(machine))
+    own = tuple(COORDINATES[k] for k in independent_coordinates(machine))
 
     def packed(T: RigidTransform) -> Any:
         matrix = T.as_matrix()
@@ -204,7 +204,7 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
     written(subject, "matlab", tmp_path / "kinematics.m")
     readings, poses = poses_of(machine)
     columns = column_legs(machine)
-    own = tuple(COORDINATES[k] for k in own_coordinates(machine))
+    own = tuple(COORDINATES[k] for k in independent_coordinates(machine))
     lines = ["m = kinematics();", "format long"]
     for q, T in zip(readings[:, columns], poses, strict=True):
         matrix = ";".join(" ".join(map(repr, row)) for row in T.as_matrix().tolist())

@@ -282,7 +282,7 @@ def test_readings_that_no_pose_has_are_refused(
 def test_poses_that_legs_forbid_are_refused(name: str, step: tuple[float, ...], found: str) -> None:
     machine = machine_of(name)
     there = displaced(machine.home, step)
-    with pytest.raises(UsageError, match=f"The platform cannot stand there: .*{found}"):
+    with pytest.raises(UsageError, match=f"The platform cannot take this pose: .*{found}"):
         inverse_kinematics(machine, there)
     if name == "3-rps":
         q = inverse_kinematics(machine, machine.home)

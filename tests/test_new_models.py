@@ -325,7 +325,7 @@ def test_what_stands_in_the_way_leaves_nothing_behind(
         create_model(machine, file / "folder")
 
     def refuse(path: Path) -> None:
-        raise OutOfClass(Problem("this machine is outside the method.", file=str(path)))
+        raise OutOfClass(Problem("this machine is not supported.", file=str(path)))
 
     monkeypatch.setattr(sys.modules[create_model.__module__], "load_mechanism", refuse)
     with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):

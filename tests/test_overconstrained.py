@@ -156,7 +156,7 @@ def tilted(end: str, angle: float) -> MachineSpec:
     [
         ("base", 1e-6, "2 of the 5 constraints of its joints follow from the others to 1 mrad"),
         ("platform", 1e-8, "2 of the 5 constraints .* with all digits"),
-        ("base", 0.02, r"overconstrained \(1 of the 5 constraints .* mobility 2"),
+        ("base", 0.02, r"overconstrained machine \(1 of the 5 constraints .* mobility 2"),
     ],
 )
 def test_a_machine_off_its_mobility_is_refused(

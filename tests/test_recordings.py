@@ -238,7 +238,7 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
     "times of another name": (lambda m, t: (_video(m, t), "--readings", _renamed(m, t)),
                               "Column 'Moment' of"),
     "nothing moves": (lambda m, t: (_video(m, t), "--readings", _resting(m, t)),
-                      "readings that change alike all the time"),
+                      "readings that change at one rate all the time"),
     "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
                      "needed the readings of the same time"),
     "no such topic": (lambda m, t: (f"{_bag(m, t)}:/other",), "found no topic '/other'"),

@@ -160,7 +160,7 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
     wrong = q.copy()
     wrong[1] += 0.1
     # one motor too many says by how much, and that any of them may be meant
-    found = r"of leg '(\S+)' \(or as likely one of .*leg\d.*\) (\S+) mm from where the other motors"
+    found = r"of leg '(\S+)' \(or, equally likely, of .*leg\d.*\) (\S+) mm from the value given by"
     with pytest.raises(DidNotConverge, match=found):
         forward_kinematics(machine, wrong)
     follower = Follower(machine)
@@ -256,5 +256,7 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     wrong = "0.12" if float(rows[0][column]) < 0.06 else "0.0"
     of_pose = [row | {column: wrong} if row["pose"] == rows[0]["pose"] else row for row in rows]
     write_rows(table, of_pose)
-    with pytest.raises(DatasetError, match=r"readings of view .* from where the other motors put"):
+    with pytest.raises(
+        DatasetError, match=r"readings of view .* from the value given by the other motors"
+    ):
         legcal.calibrate(folder, output=tmp_path / "refused")

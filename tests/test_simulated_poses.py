@@ -231,7 +231,7 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
     thick = _with_radius(0.037, tmp_path)
     poses = _drawn(load_mechanism("hexapod"), 12)
     overlaps = [_penetration(thick, T) for T in poses.poses]
-    with pytest.raises(DatasetError, match="run through each other there, needed") as caught:
+    with pytest.raises(DatasetError, match="collide there, needed") as caught:
         given_poses(thick, _csv(tmp_path, thick, poses.readings))
     rows = {int(re.findall(r"row (\d+)", problem)[0]) - 1 for problem in caught.value.problems}
     assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}

@@ -43,8 +43,8 @@ def test_a_reading_moves_the_platform_and_no_other_motor(name: str) -> None:
 def test_a_coordinate_of_the_pose_moves_the_legs_and_no_other_coordinate(name: str) -> None:
     machine = load_mechanism(name)
     motion = Motion(machine)
-    assert len(motion.own) == machine.mobility
-    for k, which in enumerate(motion.own.tolist()):
+    assert len(motion.columns) == machine.mobility
+    for k, which in enumerate(motion.columns.tolist()):
         before = motion.coordinates
         before[k] += 0.004 if which < 3 else 0.02
         posture = motion.place(k, before[k])

@@ -200,7 +200,7 @@ def test_a_leg_that_is_welded_to_the_platform_by_another_leg_is_refused(tmp_path
     patch.add_frame("leg2_end", "other", "other", "other_joint", T)
     path.with_suffix(".urdf").write_bytes(patch.content())
     path.write_text(path.read_text().replace("- leg1_seat", "- other"))
-    with pytest.raises(OutOfClass, match="leg 'leg1' is outside the method: found several welds"):
+    with pytest.raises(OutOfClass, match="leg 'leg1' is not supported: found several welds"):
         load_mechanism(path)
 
 

@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. What the commands do lives elsewhere.
+"""The command line: parses, calls, prints. The work of the commands is elsewhere.
 
 Heavy imports happen inside the commands, so that ``legcal --help`` answers at once.
 """
@@ -42,7 +42,7 @@ from legcal.signals import INTERRUPTED, raise_if_stopped
 from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
-NO_COMMAND = "Nothing was done: found no command, needed one of those above."
+NO_COMMAND = "No command given: choose one of those above."
 
 app = typer.Typer(
     name="legcal",
@@ -104,28 +104,29 @@ def _refuse_empty(words: Sequence[str]) -> None:
 
 
 def _with_remedy(error: Exception) -> str:
-    """Return what typer says of options and arguments, and where the right ones are; or nothing."""
-    said = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
-    if not said:
+    """Return the message of typer on options and arguments, with a remedy; "" if there is none."""
+    message = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
+    if not message:
         return ""
     context = getattr(error, "ctx", None)
     command = " ".join(["legcal", *context.command_path.split()[1:]]) if context else "legcal"
     return (
-        f"The command could not be run: {said.rstrip('.')}; {command} --help lists what it takes."
+        f"The command could not be run: {message.rstrip('.')}; {command} --help lists what it "
+        "takes."
     )
 
 
 def _print_warning(message: Warning | str, *_others: object, **_more: object) -> None:
-    """Say a warning on stderr in one line."""
+    """Print a warning on stderr in one line."""
     if sys.stderr is not None:
         sys.stderr.write(f"legcal: {printable(str(message))}\n")
 
 
 def run(*, as_json: bool) -> int:
     """Run the command line and return 0, 1 (data), 2 (use) or 3 (internal)."""
-    # Thousands of small matrices: threads inside a product only get in each other's way.
+    # Thousands of small matrices: threads inside a product would only block each other.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # Plugins for models of files are of no use here, and are looked for in all that is installed.
+    # Plugins of pydantic are not needed here, and the search for them covers all packages.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     warnings.showwarning = _print_warning
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
@@ -135,8 +136,8 @@ def run(*, as_json: bool) -> int:
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error
-    except Exception as error:  # the one place that may: the boundary to the shell
-        raise_if_stopped()  # libraries turn interrupts into errors of their own
+    except Exception as error:  # allowed only here, at the boundary to the shell
+        raise_if_stopped()  # libraries turn interrupts into other errors
         if isinstance(error, LegcalError):
             kind = type(error).__name__
             print_failure(

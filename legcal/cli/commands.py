@@ -1,4 +1,4 @@
-"""The commands beside ``calibrate``, ``simulate`` and ``study``."""
+"""The commands other than ``calibrate``, ``simulate`` and ``study``."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def camera(
         typer.Option(
             metavar="SPEC",
             help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
-            "marker), aprilgrid:6x6:88mm:0.3 (gap as a part of a tag), or a YAML file with a block "
-            "board.",
+            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
+            "block board.",
         ),
     ],
     output: Annotated[
@@ -51,7 +51,7 @@ def camera(
     ],
     model: Annotated[
         DistortionModel | None,
-        typer.Option(help="How the lens distorts; chosen by the images where it is not given."),
+        typer.Option(help="Distortion model; by default chosen by the images."),
     ] = None,
     picture: Annotated[
         Path | None,
@@ -66,7 +66,7 @@ def camera(
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.report.images import camera_table
 
-    found = calibrate_camera(
+    calibration = calibrate_camera(
         images,
         board,
         model=model,
@@ -75,7 +75,7 @@ def camera(
         progress=not quiet,
         workers=image_workers(cluster, workers),
     )
-    show(as_json, found.document, lambda: camera_table(found, output))
+    show(as_json, calibration.document, lambda: camera_table(calibration, output))
 
 
 def detect(
@@ -86,16 +86,16 @@ def detect(
             "--output",
             "-o",
             metavar="OUT",
-            help="The folder to write: observations.csv, index.html and every image with what was "
-            "found in it.",
+            help="The folder to write: observations.csv, index.html and every image with its "
+            "outlines.",
         ),
     ],
     edit: Annotated[
         bool,
         typer.Option(
             "--edit",
-            help="Then serve the page to the browser of this machine: the legs are drawn at the "
-            "cameras that follow from clicks on joints, and these are saved into the dataset.",
+            help="Then serve the page to the browser of this machine. It shows the legs projected "
+            "with the cameras estimated from clicked joints; clicks are saved in the dataset.",
         ),
     ] = False,
     port: Annotated[
@@ -106,7 +106,7 @@ def detect(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Do what doctor does, and show the outlines of the legs over the images, to be corrected.
+    """Run doctor, and show the outlines of the legs over the images for correction.
 
     Exit 1 if a camera could not be placed or no outline can be used.
     """
@@ -119,26 +119,26 @@ def detect(
         from legcal.viewer.click_server import HOST
 
         check_address(Address(HOST, port))
-    found = job.doctor(
+    examination = job.doctor(
         load_dataset(dataset, check_clicks=False) if edit else dataset,
         output=output,
         progress=not quiet,
         workers=image_workers(cluster, workers),
     )
-    show(as_json, found.document, lambda: examination_table(found, output))
-    if edit and found.detection is not None:
-        _serve_clicks(found, found.detection, output, port)
-    if any(view.problem for view in found.views) or not found.n_used:
+    show(as_json, examination.document, lambda: examination_table(examination, output))
+    if edit and examination.detection is not None:
+        _serve_clicks(examination, examination.detection, output, port)
+    if any(view.problem for view in examination.views) or not examination.n_used:
         raise typer.Exit(1)
 
 
-def _serve_clicks(found: Examination, detection: Detection, folder: Path, port: int) -> None:
+def _serve_clicks(examination: Examination, detection: Detection, folder: Path, port: int) -> None:
     """Serve the page of a detection until it is interrupted."""
     from legcal.cli.view import open_browser
     from legcal.viewer.click_server import ClickServer
 
-    server = ClickServer(found, detection, folder, port)
-    typer.echo(f"{server.address} takes clicks on joints; Ctrl-C ends it.", err=True)
+    server = ClickServer(examination, detection, folder, port)
+    typer.echo(f"Click joints at {server.address}; press Ctrl-C to stop.", err=True)
     open_browser(str(server.address))
     with suppress(KeyboardInterrupt):  # the way to end it
         server.run()
@@ -151,17 +151,17 @@ def doctor(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look for all that can stand in the way of calibrating a dataset, common mistakes included.
+    """Check a dataset for anything that would prevent calibration, including common mistakes.
 
-    Exit 0 if nothing stands against it, 1 if something does, 2 if files cannot be used.
+    Exit 0 if it is ready, 1 for problems, 2 if files cannot be used.
     """
     from legcal.calibration import doctor as job
     from legcal.report.doctor import examination_table
 
-    found = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
-    show(as_json, found.document, lambda: examination_table(found))
-    if not found.is_ready:
-        raise typer.Exit(1 if found.is_usable else 2)
+    examination = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
+    show(as_json, examination.document, lambda: examination_table(examination))
+    if not examination.is_ready:
+        raise typer.Exit(1 if examination.is_usable else 2)
 
 
 def evaluate(
@@ -183,8 +183,8 @@ def evaluate(
     from legcal.calibration import evaluation
     from legcal.report.calibration import accuracy_table
 
-    found = evaluation.evaluate(model, reference, dataset=dataset)
-    show(as_json, found.document, lambda: accuracy_table(found))
+    evaluated = evaluation.evaluate(model, reference, dataset=dataset)
+    show(as_json, evaluated.document, lambda: accuracy_table(evaluated))
 
 
 def identify(
@@ -192,7 +192,7 @@ def identify(
         str,
         typer.Argument(
             metavar="MODEL|DATASET",
-            help="A mechanism as for inspect, or a dataset folder, whose own views are judged.",
+            help="A mechanism as for inspect, or a dataset folder (its own views are analysed).",
         ),
     ],
     view: Annotated[
@@ -211,8 +211,8 @@ def identify(
         bool,
         typer.Option(
             "--board",
-            help="A calibration board on the base is seen in every image: cameras are tied to "
-            "each other.",
+            help="A calibration board on the base is seen in every image and relates the cameras "
+            "to each other.",
         ),
     ] = False,
     platform_board: Annotated[
@@ -232,19 +232,19 @@ def identify(
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say which parameters a calibration can identify, and what would identify the others."""
+    """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
     from legcal.report.identify import identify_table
     from legcal.report.page.verdicts import identify_verdict
 
     check_page(page)
     views = [text.split(",") for text in view or []]
-    found = answer(
+    identified = answer(
         model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
     )
-    verdict = identify_verdict(found)
-    write_page(page, f"Identifiability of {model}", identify_table(found), verdict)
-    show(as_json, found.document, lambda: identify_table(found))
+    verdict = identify_verdict(identified)
+    write_page(page, f"Identifiability of {model}", identify_table(identified), verdict)
+    show(as_json, identified.document, lambda: identify_table(identified))
 
 
 def inspect(
@@ -315,7 +315,7 @@ def locate(
     ] = None,
     encoder_sigma: Annotated[
         str | None,
-        typer.Option(help="Sigma of a reading, 2um, of motors that turn 0.01deg; 0 by default."),
+        typer.Option(help="Sigma of a reading, 2um, or 0.01deg for motors that turn; default 0."),
     ] = None,
     tool_position: Annotated[
         str | None,
@@ -350,8 +350,8 @@ def locate(
             "folder of the model to write; name it or leave the names out."
         )
 
-    def quantity(text: str | None, units: Mapping[str, float], what: str) -> float | None:
-        return None if text is None else parse_quantity(text, units, what)
+    def quantity(text: str | None, units: Mapping[str, float], option: str) -> float | None:
+        return None if text is None else parse_quantity(text, units, option)
 
     check_page(page)
     LOCATION_FILE.check_place(output)

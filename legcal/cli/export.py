@@ -40,7 +40,7 @@ def export(
         int | None,
         typer.Option(help="correction: nodes along each coordinate; by default by freedoms."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a calibration or a model for another program or a controller."""
@@ -50,16 +50,16 @@ def export(
     from legcal.exports.subject import ExportOptions
     from legcal.report.render import report
 
-    found = formats.export(
+    exported = formats.export(
         source,
         to,
         output,
         options=ExportOptions(inertia=inertia, nodes=nodes),
         force=force,
     )
-    lines = [f"written: {path}" for path in found.paths] + list(found.notes)
+    lines = [f"written: {path}" for path in exported.paths] + list(exported.notes)
     show(
         as_json,
-        found.document,
+        exported.document,
         lambda: report([Text(line, overflow="fold") for line in lines]),
     )

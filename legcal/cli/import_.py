@@ -48,10 +48,10 @@ def import_(
         float | None,
         typer.Option(
             metavar="SECONDS",
-            help="The clock of the camera less that of the readings; by default found from motion.",
+            help="Camera clock minus reading clock; by default estimated from the motion.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -61,7 +61,7 @@ def import_(
     from legcal.report.new_dataset import import_table, written_lines
 
     with shown_progress(not quiet) as progress:
-        found = plan_import(
+        plan = plan_import(
             sources,
             model,
             output,
@@ -72,10 +72,10 @@ def import_(
             progress=progress,
         )
     if not as_json:
-        print_table(import_table(found))
+        print_table(import_table(plan))
     with shown_progress(not quiet) as progress:
-        written = import_recordings(found, force=force, progress=progress)
+        written = import_recordings(plan, force=force, progress=progress)
     if as_json:
-        print_json(found.document(written))
+        print_json(plan.document(written))
     else:
-        print_table(written_lines(output, written, found.machine))
+        print_table(written_lines(output, written, plan.machine))

@@ -44,8 +44,8 @@ def init(
     unit: Annotated[
         str | None,
         typer.Option(
-            help="Unit of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg, us; by "
-            "default as the headings say, else the one in which they lie in the travel."
+            help="Unit of the readings: m, cm, mm, um; rad, mrad, deg, us for motors that turn; by "
+            "default from the headings, else the unit that puts them in the travel."
         ),
     ] = None,
     lengths: Annotated[
@@ -54,11 +54,11 @@ def init(
     encoder_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, of "
-            "pulses of servos 0.5deg."
+            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, or "
+            "0.5deg for pulses of servos."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
@@ -68,11 +68,11 @@ def init(
     options = SheetOptions(
         cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
     )
-    found = plan_new_dataset(folder, readings, model, output, options)
+    dataset = plan_new_dataset(folder, readings, model, output, options)
     if not as_json:
-        print_table(matching_table(found))
-    written = write_new_dataset(found, force=force)
+        print_table(matching_table(dataset))
+    written = write_new_dataset(dataset, force=force)
     if as_json:
-        print_json(found.document(written))
+        print_json(dataset.document(written))
     else:
-        print_table(written_lines(output, written, found.machine))
+        print_table(written_lines(output, written, dataset.machine))

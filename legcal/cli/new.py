@@ -30,7 +30,7 @@ def new(
             "--template", help="Write a commented table to start from, of --family or a hexapod."
         ),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: JsonOption = False,
     **options: Any,
 ) -> None:
@@ -44,14 +44,14 @@ def new(
     from legcal.report.machine import inspect_table
     from legcal.report.render import report
 
-    given = Dimensions(**options)
+    dimensions = Dimensions(**options)
     if template:
         if table is not None:
             raise UsageError(
                 f"The template could not be written: found the table {table} beside --template, "
                 "needed one of them; leave out the other."
             )
-        written = write_template(output, given, force=force)
+        written = write_template(output, dimensions, force=force)
         lines = (
             f"written: {' '.join(map(str, written))}",
             f"Next: legcal new {shlex.quote(str(written[0]))} -o .",
@@ -62,16 +62,16 @@ def new(
             lambda: report([Text(line, overflow="ignore") for line in lines]),
         )
         return
-    model = description_of(table, given)
+    model = description_of(table, dimensions)
     created = create_model(model, output, force=force)
     description = machine_document(created.machine)
     description["diagnostics"] = [*model.notes, *description["diagnostics"]]
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
-    said = f"written: {paths['yaml']} {paths['urdf']}"
+    written_line = f"written: {paths['yaml']} {paths['urdf']}"
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report(inspect_table(description), Text(said, overflow="ignore")),
+        lambda: report(inspect_table(description), Text(written_line, overflow="ignore")),
     )
 
 

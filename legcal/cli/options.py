@@ -1,4 +1,4 @@
-"""What commands share: options, and what they print: tables for people, or one JSON document."""
+"""Shared parts of commands: options, and output as tables for people or one JSON document."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
 REPORT = "report.html"  # the page in the folder of a result
-MAX_WORKERS = 256  # more are a mistake: all of them are started
+MAX_WORKERS = 256  # more are likely a mistake, and all of them would be started
 
 ModelArgument = Annotated[
     str,
@@ -86,8 +86,8 @@ def declared(request: type) -> Iterator[inspect.Parameter]:
     """Return the fields of a dataclass (``legcal.option_fields``) as parameters of a command."""
     types = get_type_hints(request)
     for field in fields(request):
-        how = dict(field.metadata["option"])
-        option = typer.Option(*how.pop("flags"), **how)
+        keywords = dict(field.metadata["option"])
+        option = typer.Option(*keywords.pop("flags"), **keywords)
         yield inspect.Parameter(
             field.name,
             inspect.Parameter.KEYWORD_ONLY,
@@ -97,9 +97,11 @@ def declared(request: type) -> Iterator[inspect.Parameter]:
 
 
 def parameters_of(command: Callable[..., None]) -> list[inspect.Parameter]:
-    """Return the parameters of a command that it writes out itself, without ``**options``."""
-    own = inspect.signature(command, eval_str=True).parameters.values()
-    return [each for each in own if each.kind is not inspect.Parameter.VAR_KEYWORD]
+    """Return the explicit parameters of a command, without ``**options``."""
+    parameters = inspect.signature(command, eval_str=True).parameters.values()
+    return [
+        parameter for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD
+    ]
 
 
 def declare(command: Callable[..., None], order: Sequence[inspect.Parameter]) -> None:
@@ -124,21 +126,21 @@ def write_page(
     verdict: Verdict | None = None,
     figures: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
-    """Write what is printed as a page, with figures (PNG) by their captions, where one is asked."""
+    """Write the printed text as a page, with figures (PNG) by their captions, if *page* is set."""
     from legcal.report.page import writing
     from legcal.report.page.text_page import picture, text_page
 
     if page is not None:
         blocks = [picture(path, caption) for caption, path in figures.items()]
-        found = text_page(title, text, verdict=verdict, blocks=blocks, command=command_line())
-        writing.write_page(found, page)
+        document = text_page(title, text, verdict=verdict, blocks=blocks, command=command_line())
+        writing.write_page(document, page)
 
 
 @dataclass
 class PageOfResult:
     """Makes the page of a result in the folder of its other files, before that appears.
 
-    Whatever goes wrong then loses the page alone, and :meth:`say` says it.
+    An error then loses the page only, and :meth:`say` prints it.
     """
 
     make: Callable[[Any, Path], object]  # of the result, into the folder
@@ -148,15 +150,15 @@ class PageOfResult:
         """Make the page of a result; its other files are in the folder."""
         try:
             self.make(result, folder)
-        except Exception as error:  # minutes of work are never lost for what only shows them
+        except Exception as error:  # minutes of work must not be lost for a page
             (folder / REPORT).unlink(missing_ok=True)
-            found = f"found {type(error).__name__}: {error}; please report this."
+            cause = f"found {type(error).__name__}: {error}; please report this."
             if isinstance(error, LegcalError):
-                found = " ".join(error.problems)
-            self.failure = f"The result was written without {REPORT}: {found}"
+                cause = " ".join(error.problems)
+            self.failure = f"The result was written without {REPORT}: {cause}"
 
     def say(self) -> None:
-        """Say on stderr what went wrong, if anything did."""
+        """Print the error on stderr, if there was one."""
         if self.failure and sys.stderr is not None:
             sys.stderr.write(f"legcal: {printable(self.failure)}\n")
 
@@ -172,7 +174,7 @@ def image_workers(cluster: str | None, workers: int | None = None) -> int | str:
 
 
 def chosen_workers(cluster: str | None, workers: int | None, by_default: int) -> int | str:
-    """Return the cluster or the number of processes; refuse both, as a cluster has its own."""
+    """Return the cluster or the number of processes; refuse both."""
     if cluster and workers:
         raise UsageError(
             "The command could not be run: found --workers beside a cluster (--cluster or "
@@ -192,7 +194,7 @@ def show(
 
 
 def print_table(renderable: RenderableType) -> None:
-    """Print what a person reads on stdout."""
+    """Print text for people on stdout."""
     from rich.console import Console
 
     if isinstance(renderable, str):
@@ -200,7 +202,7 @@ def print_table(renderable: RenderableType) -> None:
 
         renderable = report(renderable)
     with _writing_to_stdout():
-        # What must not wrap, a path to copy, is wider than some terminals, and is not cut there.
+        # Paths to copy must not wrap: they may be wider than the terminal, and are not cut there.
         Console(highlight=False).print(renderable, crop=False)
         sys.stdout.flush()
 
@@ -214,8 +216,8 @@ def print_json(document: dict[str, Any]) -> None:
 
 @contextmanager
 def _writing_to_stdout() -> Iterator[None]:
-    """Refuse a stdout that cannot be written to; a reader that has left raises BrokenPipeError."""
-    found = "that it is closed"
+    """Refuse a stdout that cannot be written to; a closed pipe raises BrokenPipeError."""
+    cause = "that it is closed"
     if sys.stdout is not None:
         try:
             yield
@@ -223,16 +225,16 @@ def _writing_to_stdout() -> Iterator[None]:
         except BrokenPipeError:
             raise
         except OSError as error:
-            found = f"'{error.strerror}'"
+            cause = f"'{error.strerror}'"
             _leave_stdout()
     raise OutOfResources(
-        f"The output could not be printed: found {found}, needed a stdout that takes it; send it "
+        f"The output could not be printed: found {cause}, needed a stdout that takes it; send it "
         "elsewhere."
     )
 
 
 def _leave_stdout() -> None:
-    """Discard what is left in the buffer of stdout, so that nothing fails there again."""
+    """Discard the rest of the buffer of stdout, so that nothing fails there again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.stdout = None
 
@@ -245,7 +247,7 @@ def print_failure(
     problems: Sequence[dict[str, object]] = (),
     diagnosis: Sequence[dict[str, object]] = (),
 ) -> None:
-    """Write the reason of a failure to stderr, or in JSON to stdout.
+    """Print why a command failed, on stderr, or in JSON on stdout.
 
     Without *problems*, the message is the one problem.
     """
@@ -254,8 +256,8 @@ def print_failure(
         with suppress(OutOfResources):
             error: dict[str, object] = {"kind": kind, "message": message}
             error["problems"] = list(problems) or [{"code": code_of_kind(kind), "what": message}]
-            found = {"diagnosis": list(diagnosis)} if diagnosis else {}
-            print_json({"error": error, **found})
+            extra = {"diagnosis": list(diagnosis)} if diagnosis else {}
+            print_json({"error": error, **extra})
             return
     if sys.stderr is not None:
         sys.stderr.write(f"legcal: {message}\n")

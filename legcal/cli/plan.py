@@ -31,25 +31,27 @@ def plan(
     ],
     images: Annotated[
         int | None,
-        typer.Option(help="Photographs to take in all (in identify: per view); 45."),
+        typer.Option(help="Total number of photographs (in identify: per view); default 45."),
     ] = None,
     images_per_view: Annotated[
         int | None, typer.Option(help="Photographs of each view, in place of --images.")
     ] = None,
-    cameras: Annotated[int | None, typer.Option(help="Camera places; 3.")] = None,
+    cameras: Annotated[
+        int | None, typer.Option(help="Number of camera positions; default 3.")
+    ] = None,
     target: Annotated[
         str | None,
         typer.Option(
             metavar="LENGTH",
-            help="Instead of --images: the fewest with which this error of the platform is "
-            "expected, 0.05mm.",
+            help="Use the fewest photographs expected to reach this platform error, 0.05mm "
+            "(instead of --images).",
         ),
     ] = None,
     noise: Annotated[
         Path | None,
         typer.Option(
             metavar="RESULT",
-            help="Errors of outlines as an earlier result has them.",
+            help="Take the errors of outlines from this earlier result.",
         ),
     ] = None,
     bounds: Annotated[
@@ -61,19 +63,21 @@ def plan(
     ] = None,
     given: Annotated[
         Path | None,
-        typer.Option(metavar="DATASET", help="What was shot already: plan what to add."),
+        typer.Option(metavar="DATASET", help="Existing dataset to extend."),
     ] = None,
     board: Annotated[
         str | None,
         typer.Option(
             metavar="SPEC",
             help="A calibration board on the base in every image, as for legcal camera; the plan "
-            "says where it lies.",
+            "states its pose.",
         ),
     ] = None,
     hand_held: Annotated[
         bool,
-        typer.Option("--hand-held", help="Every image from a place of its own; with --board."),
+        typer.Option(
+            "--hand-held", help="Hand-held camera: a new pose for every image; with --board."
+        ),
     ] = False,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     workers: WorkersOption = None,
@@ -81,7 +85,7 @@ def plan(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan a session: poses and camera places that determine a machine best."""
+    """Plan a session: poses and camera positions that determine a machine best."""
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning import request
     from legcal.planning.information import DEFAULT_NOISE
@@ -92,7 +96,7 @@ def plan(
 
     check_session(output)
     with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
-        found = request.plan(
+        session = request.plan(
             model,
             images=images,
             images_per_view=images_per_view,
@@ -108,12 +112,12 @@ def plan(
             progress=not quiet,
             stop=is_waiting,
         )
-        pictures = plan_files(found, _previews(found), command_line())
-        write_session(found, output, pictures=pictures)
+        pictures = plan_files(session, _previews(session), command_line())
+        write_session(session, output, pictures=pictures)
         if is_waiting() and sys.stderr is not None:
             text = f"The session was written to {output}, with the best plan found before the stop."
             sys.stderr.write(f"legcal: {printable(text)}\n")
-    show(as_json, found.document, lambda: plan_table(found, output))
+    show(as_json, session.document, lambda: plan_table(session, output))
 
 
 def _previews(plan: Plan) -> dict[str, bytes]:

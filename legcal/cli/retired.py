@@ -1,4 +1,4 @@
-"""Commands and options of earlier versions: refused with what does the same now."""
+"""Commands and options of earlier versions: refused, with their replacements."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from legcal.errors import UsageError
 
 
 def _benchmark(program: str) -> str:
-    """Return where a study is that was a command."""
+    """Return in words the place of a study that was a command."""
     return f"run python benchmarks/{program} of the source tree"
 
 
@@ -26,7 +26,7 @@ _TABLE = "write it in the table, for which legcal new --template makes one to st
 
 
 def _setting(text: str) -> str:
-    """Return how a setting of a simulated dataset is chosen in Python."""
+    """Return in words the Python for a setting of a simulated dataset."""
     return f"call legcal.simulate(MODEL, FOLDER, legcal.SimulationSettings({text})) in Python"
 
 
@@ -118,7 +118,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--merge": "the same command goes on from the runs in its folder",
     },
 }
-"""What stands in place of options, or of a choice, by command: the rest of a sentence."""
+"""Replacements of options, or of a choice, by command: the rest of a sentence."""
 
 
 def refuse_retired(words: Sequence[str]) -> None:
@@ -134,13 +134,13 @@ def refuse_retired(words: Sequence[str]) -> None:
         if name in COMMANDS:
             raise UsageError(f"legcal {name} is gone: {COMMANDS[name]}.")
     instead = OPTIONS.get(command, {})
-    given = dict[str, None]()
+    words_given = dict[str, None]()
     for word, following in zip(words[1:], [*words[2:], ""], strict=False):
         name, equals, value = word.partition("=")
-        given |= {name: None, f"{name} {value if equals else following}": None}
+        words_given |= {name: None, f"{name} {value if equals else following}": None}
     problems = [
         f"{option} of legcal {command} is gone: {instead[option]}."
-        for option in given
+        for option in words_given
         if option in instead
     ]
     if problems:

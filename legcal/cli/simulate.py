@@ -1,4 +1,4 @@
-"""``legcal simulate``: a dataset of a machine whose truth is known."""
+"""``legcal simulate``: a dataset of a machine with known truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legcal.cli.options import (
 
 
 class _Level(StrEnum):
-    """What a dataset gives a calibration to work on."""
+    """The kind of observations in a dataset."""
 
     PHOTOGRAPHS = "photographs"
     OUTLINES = "outlines"
@@ -39,9 +39,8 @@ def simulate(
         list[str] | None,
         typer.Option(
             metavar="FILE|KIND",
-            help="Camera file (ROS, OpenCV, Kalibr); or what it does to photographs: machine-jpeg, "
-            "webcam, phone, action or industrial, webcam:60 for another JPEG quality. Once for "
-            "each.",
+            help="Camera file (ROS, OpenCV, Kalibr), or kind of camera: machine-jpeg, webcam, "
+            "phone, action or industrial, webcam:60 for another JPEG quality. Once for each.",
             show_default="1024 x 768 px, slight distortion; industrial",
         ),
     ] = None,
@@ -59,7 +58,7 @@ def simulate(
         list[str] | None,
         typer.Option(
             metavar="KIND=SIZE",
-            help="How far the true machine is from the model: joints, base-joints, "
+            help="Errors of the true machine relative to the model: joints, base-joints, "
             "platform-joints, offsets, lengths (2mm), axes, twists (0.1deg), radii (0mm); uniform "
             "in +-SIZE, or SIZE:normal; none for no errors. May be repeated.",
             show_default="joints, offsets, lengths=2mm; axes, twists=0.1deg",
@@ -77,26 +76,26 @@ def simulate(
     hand_held: Annotated[
         bool,
         typer.Option(
-            "--hand-held", help="Every image from another camera position, with the board in it."
+            "--hand-held", help="A new camera pose for every image, with the board in view."
         ),
     ] = False,
     plan: Annotated[
         Path | None,
         typer.Option(
             metavar="SESSION",
-            help="Instead of poses and cameras: a session that legcal plan wrote, with tripods as "
-            "far off as it allows for.",
+            help="Instead of poses and cameras: a session from legcal plan, with tripods off by "
+            "its tolerances.",
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(help="The same seed gives the same dataset, to the last bit.")
+        int, typer.Option(help="Random seed; equal seeds give equal datasets, to the last bit.")
     ] = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a dataset of a machine whose true model is known, and write it with the truth.
+    """Simulate a dataset of a machine with a known true model, and write it with the truth.
 
     The default is 45 photographs: 3 views of 15 extreme poses each. Python has more choices
     (legcal.SimulationSettings).

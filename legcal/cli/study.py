@@ -28,7 +28,7 @@ OutputFolder = Annotated[
         "-o",
         metavar="OUT",
         help="Folder for the runs, the document and the figures. A study that was stopped "
-        "goes on from what is there.",
+        "is continued.",
     ),
 ]
 
@@ -57,10 +57,10 @@ def paper(
     from legcal.simulation.paper import PaperStudy
     from legcal.simulation.study import StudyResult, run_study
 
-    def make_page(found: StudyResult, folder: Path) -> None:
+    def make_page(study_result: StudyResult, folder: Path) -> None:
         caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."
         title, figures = "The paper's simulation", {caption: folder / "fig4.png"}
-        write_page(folder / REPORT, title, study_table(found.document()), figures=figures)
+        write_page(folder / REPORT, title, study_table(study_result.document()), figures=figures)
 
     noise, page = TableNoise.in_radians() if radians else TableNoise(), PageOfResult(make_page)
     result = run_study(

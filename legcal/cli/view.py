@@ -26,7 +26,7 @@ def view(
         typer.Option(help="The dataset of a result or a model, for its poses and photographs."),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Who can look: 127.0.0.1 this machine alone, 0.0.0.0 everybody.")
+        str, typer.Option(help="Access: 127.0.0.1 for this machine only, 0.0.0.0 for all.")
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port; 0 for any that is free.")
@@ -65,7 +65,7 @@ def open_browser(address: str) -> None:
 
 
 def _has_screen() -> bool:
-    """Say whether a browser with windows can be opened."""
+    """Return whether a browser with windows can be opened."""
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

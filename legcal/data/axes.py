@@ -1,8 +1,8 @@
-"""The table ``axes.csv``: axes of legs as the paper states them, instead of images and outlines.
+"""The table ``axes.csv``: axes of legs as in the paper, instead of images and outlines.
 
 One row an axis: view, image and leg, named as in ``observations.csv``; the Euler angles
 psi and theta (:mod:`legcal.vision.cylinder`) and the point M_LS = (x, 0, z) in the camera; their
-standard deviations, which are taken for true. Angles in radians, lengths in metres.
+standard deviations, which are taken as true. Angles in radians, lengths in metres.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from legcal.vision.cylinder import axis_of_outlines, direction_derivative, direc
 VALUES = ("psi", "theta", "x", "z")
 SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
 MAX_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
-ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
-MAX_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
-SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
-MIN_UPRIGHT = 1e-4  # component along the image y axis: below it M_LS is undetermined
+ANGLE_ROUNDING = 1e-3  # [rad] rounding of limits, such as 3.142
+MAX_DISTANCE = 1000.0  # [m] from M_LS to the camera centre
+SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m] plausible standard deviations of an axis
+MIN_UPRIGHT = 1e-4  # minimum component along the image y axis: below it M_LS is undetermined
 COLUMNS = (
     *(Column(name, "text") for name in ("view", "image", "leg")),
     *(
@@ -74,7 +74,7 @@ COLUMNS = (
     ),
 )
 
-_FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
+_FLOOR_PX = 1e-3  # minimum standard deviation of an outline: keeps weights finite for any file
 
 
 @brief
@@ -82,7 +82,7 @@ _FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a
 class LegAxes(ImageTable):
     """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
 
-    An axis is known as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
+    The errors of an axis: ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
     """
 
     leg: IntArray  # (n,)
@@ -101,7 +101,7 @@ def axes_from_outlines(
     measurements: Measurements,
     radius_of_part: Mapping[str, float],  # radius of each cylinder by its URDF link [m]
 ) -> LegAxes:
-    """Return the axis of every leg of which both outlines are used, eqs (4) and (5).
+    """Return the axis of every leg with two used outlines, eqs (4) and (5).
 
     The cylinders of one leg in one image (a tube and a rod) share an axis: they are joined,
     weighted by their covariances.
@@ -213,12 +213,12 @@ def _joined(
 
 def _pairs(outlines: Outlines) -> IntArray:
     """Return the indices (edge 1, edge 2) of outlines of one cylinder in one image, (n, 2)."""
-    found: dict[tuple[int, int, str], dict[int, int]] = {}
+    edges_of_part: dict[tuple[int, int, str], dict[int, int]] = {}
     for i in np.flatnonzero(outlines.used):
         key = (int(outlines.row[i]), int(outlines.leg[i]), outlines.part[i])
-        found.setdefault(key, {})[int(outlines.edge[i])] = int(i)
-    both = [(edges[1], edges[2]) for _, edges in sorted(found.items()) if len(edges) == 2]
-    return np.array(both, dtype=np.intp).reshape(-1, 2)
+        edges_of_part.setdefault(key, {})[int(outlines.edge[i])] = int(i)
+    pairs = [(edges[1], edges[2]) for _, edges in sorted(edges_of_part.items()) if len(edges) == 2]
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def _end_rays_and_derivatives(
@@ -228,10 +228,10 @@ def _end_rays_and_derivatives(
     rays = np.empty((len(pairs), 2, 2, 3))
     derivative = np.empty((len(pairs), 2, 2, 3))
     for v in np.unique(view):
-        here = pairs[view == v]
+        view_pairs = pairs[view == v]
         camera = measurements.views[v].camera
         rays[view == v], derivative[view == v] = outline_derivative(
-            camera, outlines.h[here], outlines.ends[here]
+            camera, outlines.h[view_pairs], outlines.ends[view_pairs]
         )
     return rays, derivative
 
@@ -241,7 +241,7 @@ def outline_derivative(
     h: Array,  # (..., 3) unit normals of outlines, in its frame
     ends: Array,  # (..., 2, 2) their ends [px]
 ) -> tuple[Array, Array]:
-    """Return the rays of an outline's ends and how its normal follows offsets of these ends.
+    """Return the rays of an outline's ends and the derivative of its normal by offsets of the ends.
 
     Returns rays (..., 2, 3); derivative (..., 2, 3) [1/px].
     """
@@ -253,9 +253,9 @@ def outline_derivative(
     ab = np.broadcast_to(h[..., None, :2], xy.shape)
     normal = np.linalg.solve(np.swapaxes(J, -1, -2), ab[..., None])[..., 0]
     moved = np.linalg.norm(normal, axis=-1)  # d (h . ray) / d offset
-    # dh is normal to h, zero on the ray of the other end, and -moved on its own ray.
-    other = rays[..., ::-1, :]
-    direction = cross(np.broadcast_to(h[..., None, :], rays.shape), other)
+    # dh is normal to h, zero on the ray of the other end, and -moved on the ray of this end.
+    other_rays = rays[..., ::-1, :]
+    direction = cross(np.broadcast_to(h[..., None, :], rays.shape), other_rays)
     scale = -moved / np.sum(direction * rays, axis=-1)
     return rays, direction * scale[..., None]
 
@@ -292,7 +292,7 @@ def write_axis_table(
     measurements: Measurements,
     leg_names: Sequence[str],
 ) -> None:
-    """Write axes that are given as the table has them, the file complete or not at all."""
+    """Write axes in the columns of the table, the file complete or not at all."""
     names = places(measurements)
     numbers = np.hstack([values, sigmas]).tolist()
     rows = (
@@ -306,7 +306,7 @@ def write_axis_table(
 def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:
     """Return the table ``axes.csv`` in the order of the file.
 
-    Raises DatasetError with one sentence for each thing that is wrong.
+    Raises DatasetError with one sentence for each problem.
     """
     table = read_table(
         path,

@@ -1,4 +1,4 @@
-"""The table of outlines as a cache of detection: what to detect again, and what to keep.
+"""The table of outlines as a cache of detection: the images to detect again, the rows to keep.
 
 After detection the outlines are written to ``observations.csv`` beside the dataset, with a
 fingerprint of all that detection depends on in ``.legcal-cache.json``. A table without that
@@ -40,20 +40,20 @@ class CacheEntry(FileSchema):
 
     format: int
     fingerprint: str  # of all that the detected outlines in the table came from
-    given: list[tuple[str, str]]  # the images whose outlines the user gave; they are never detected
-    notes: tuple[str, ...] = ()  # what was to be said of the images
-    outlines: int = 0  # rows of the table: one that has fewer is another, as that of edited rows
+    given: list[tuple[str, str]]  # images with outlines from the user; they are never detected
+    notes: tuple[str, ...] = ()  # notes on the images
+    outlines: int = 0  # rows of the table; a table with fewer rows was changed
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionPlan:
-    """What is left to detect."""
+    """The images to detect, and the outlines to keep."""
 
-    detect: IntArray  # (n,) rows of the measurements whose images are to be detected
+    detect: IntArray  # (n,) rows of the measurements with images to be detected
     keep: Outlines  # outlines to use as they are
-    given: BoolArray  # (n_rows,) rows whose outlines the user gave
-    notes: tuple[str, ...] = ()  # what was to be said of the images when they were searched
-    is_cached: bool = False  # whether all outlines are those that an earlier run left
+    given: BoolArray  # (n_rows,) rows with outlines from the user
+    notes: tuple[str, ...] = ()  # notes on the images from the earlier detection
+    is_cached: bool = False  # whether all outlines come from an earlier run
 
 
 def plan_detection(
@@ -61,9 +61,9 @@ def plan_detection(
     has_image: BoolArray,  # (n_rows,) whether a row has an image file
     recorded: str | None,
     current: str,
-    given: BoolArray,  # (n_rows,)
+    from_user: BoolArray,  # (n_rows,)
 ) -> DetectionPlan:
-    """Return which images to detect and which outlines of the table to keep."""
+    """Return the images to detect and the outlines of the table to keep."""
     if table is None:
         return DetectionPlan(np.flatnonzero(has_image), no_outlines(), np.zeros_like(has_image))
     edited = is_edited(table)
@@ -72,29 +72,31 @@ def plan_detection(
     if recorded is None:
         return DetectionPlan(np.flatnonzero(has_image & ~listed), table, listed)
     if recorded == current:
-        return DetectionPlan(np.zeros(0, dtype=np.intp), table, given)
-    detect = has_image & ~(given & listed)
+        return DetectionPlan(np.zeros(0, dtype=np.intp), table, from_user)
+    detect = has_image & ~(from_user & listed)
     keep = table.choose(edited | ~detect[table.row])
-    return DetectionPlan(np.flatnonzero(detect), keep, given & listed)
+    return DetectionPlan(np.flatnonzero(detect), keep, from_user & listed)
 
 
 def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
-    """Return :func:`plan_detection` for a dataset as it lies in its folder."""
+    """Return :func:`plan_detection` for a dataset with the files in its folder."""
     if dataset.axes is not None:  # they take the place of images
         none = np.zeros(0, dtype=np.intp)
-        given = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
-        return DetectionPlan(none, no_outlines(), given)
+        from_user = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
+        return DetectionPlan(none, no_outlines(), from_user)
     entry = _read_entry(dataset.folder / CACHE_NAME)
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     has_image = np.array(
         [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
     )
     given_names = set(entry.given) if entry else set()
-    given = np.array([name in given_names for name in places(dataset.measurements)], dtype=np.bool_)
+    from_user = np.array(
+        [name in given_names for name in places(dataset.measurements)], dtype=np.bool_
+    )
     recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint
     if entry and dataset.observations is not None and len(dataset.observations) < entry.outlines:
         recorded = _INCOMPLETE
-    plan = plan_detection(dataset.observations, has_image, recorded, current, given)
+    plan = plan_detection(dataset.observations, has_image, recorded, current, from_user)
     if entry is None or recorded != current or len(plan.detect):
         return plan
     return replace(plan, notes=entry.notes, is_cached=True)
@@ -134,7 +136,7 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
     rows = [measurements.image, measurements.view.tolist(), measurements.pose.tolist()]
     document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q]
     document += [dict(measurements.sigma_by_joint)] if measurements.sigma_by_joint else []
-    for fixed in dataset.boards:  # they place the cameras near which outlines are looked for
+    for fixed in dataset.boards:  # they place the cameras for the search of outlines
         T = fixed.T_link_board
         document.append(board_document(fixed.board))
         document.append(None if T is None else T.as_matrix().tolist())
@@ -156,7 +158,7 @@ def _files(dataset: Dataset) -> list[bytes]:
 
 
 def _digest(path: Path) -> bytes:
-    """Return the SHA-256 of a file; that of a file which cannot be read is empty."""
+    """Return the SHA-256 of a file; empty if it cannot be read."""
     try:
         return hashlib.sha256(read_bytes(path, MAX_IMAGE)).digest()
     except OSError:
@@ -167,15 +169,15 @@ def store_outlines(
     dataset: Dataset,
     outlines: Outlines,
     current: str,
-    given: BoolArray,  # (n_rows,) ``DetectionPlan.given``
+    from_user: BoolArray,  # (n_rows,) ``DetectionPlan.given``
     notes: Sequence[str] = (),
 ) -> str | None:
-    """Write outlines and the fingerprint of what they came from beside the dataset.
+    """Write outlines and the fingerprint of their inputs beside the dataset.
 
-    A fingerprint that matches nothing stands until the table does: whatever stops the writing, the
-    outlines that were detected are never taken for outlines that the user gave, nor for others'.
+    Until the table is complete the fingerprint matches nothing: if writing is interrupted, detected
+    outlines are never mistaken for outlines from the user or for current ones.
     """
-    names = zip(places(dataset.measurements), given, strict=True)
+    names = zip(places(dataset.measurements), from_user, strict=True)
     entry = {
         "format": FORMAT,
         "fingerprint": _INCOMPLETE,
@@ -201,7 +203,7 @@ def _write_entry(folder: Path, entry: Mapping[str, object]) -> None:
 
 
 def _read_entry(path: Path) -> CacheEntry | None:
-    """Return the fingerprint file; one that cannot be read matches nothing."""
+    """Return the content of the fingerprint file; an unreadable file matches nothing."""
     try:
         content = read_bytes(path, MAX_DOCUMENT)
         entry = CacheEntry.model_validate_json(content)

@@ -1,8 +1,8 @@
 """The table ``corners.csv``: corners of the calibration board, written and read back.
 
 One row a corner: view and image, named as in ``observations.csv``; the number of the corner on the
-board (with two, those of the platform's follow on those of the base's); where it is seen and the
-standard deviation of that [px]; verdict, reason and source.
+board (with two boards, the corners of the platform's are numbered after those of the base's); its
+pixel and the standard deviation of that [px]; verdict, reason and source.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ COLUMNS = (
     *NUMBERS,
     *(column.name for column in (*VERDICT_COLUMNS, DETAIL_COLUMN)),
 )
-SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says nothing
+SIGMA_RANGE = (1e-6, 100.0)  # [px] plausible standard deviations of a corner
 
 
 @brief
@@ -45,7 +45,7 @@ class Corners(ImageTable):
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
     used: BoolArray
-    reason: tuple[Rejection, ...]  # why a corner was rejected; false for used ones
+    reason: tuple[Rejection, ...]  # reasons of rejections; false for used corners
     source: tuple[str, ...]  # detected or edited
 
     def row_keys(self) -> list[tuple[int, int]]:
@@ -61,7 +61,7 @@ def found_corners(row: IntArray, corner: IntArray, px: Array, sigma_px: Array) -
 
 
 def join_corners(tables: Sequence[Corners]) -> Corners:
-    """Return the corners of several tables, one after the other."""
+    """Concatenate tables of corners."""
     none = np.zeros(0, dtype=np.intp)
     return found_corners(none, none, np.zeros((0, 2)), np.zeros(0)).join(tables)
 
@@ -96,11 +96,11 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
 def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measurements) -> Corners:
     """Return the table ``corners.csv`` of boards in the order of the file.
 
-    An edited row wins over the detected one of the same image and corner. Raises DatasetError with
-    one sentence for each thing that is wrong.
+    An edited row replaces the detected row of the same image and corner. Raises DatasetError with
+    one sentence for each problem.
     """
     least, most = SIGMA_RANGE
-    n_corners = sum(one.board.n_corners for one in boards)
+    n_corners = sum(fixed_board.board.n_corners for fixed_board in boards)
     needed = f"a corner of the board, 0 to {n_corners - 1}"
     remedy = "correct it, or the board in the dataset file"
     table = read_table(
@@ -155,7 +155,7 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
     table.once([None if key[0] < 0 else key for key in keys], "the same image and corner")
     table.check()
     edited = {key for key in keys if key[2] == SOURCES[1]}
-    found = Corners(
+    corners = Corners(
         row,
         np.array(corner, dtype=np.intp),
         numbers[:, :2],
@@ -165,4 +165,4 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
         source,
     )
     wins = [key in edited or (*key[:2], SOURCES[1]) not in edited for key in keys]
-    return found.choose(np.array(wins, dtype=np.bool_))
+    return corners.choose(np.array(wins, dtype=np.bool_))

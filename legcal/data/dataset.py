@@ -66,14 +66,14 @@ AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
-MAX_KEPT = 128 * 2**20  # of decoded images [bytes]
-MIN_CORNERS = 4  # in an image that must place its camera
+MAX_KEPT = 128 * 2**20  # size of the cache of decoded images [bytes]
+MIN_CORNERS = 4  # corners in an image that must place its camera
 
 
 @brief
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Everything that a calibration starts from."""
+    """The input of a calibration."""
 
     folder: Path  # the dataset folder
     yaml_path: Path  # ``dataset.yaml``
@@ -82,19 +82,19 @@ class Dataset:
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the rows of ``observations.csv`` if there is one
-    table_notes: tuple[str, ...] = ()  # what is odd but allowed: in tables and the dataset file
+    table_notes: tuple[str, ...] = ()  # oddities that are allowed in tables and the dataset file
     axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
-    overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
+    overrides: tuple[Override, ...] = ()  # parameters by name, from the block ``parameters``
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
     landmarks: Landmarks | None = None  # the rows of ``landmarks.csv`` if there is one
-    # What the files of images say of themselves, by the names of those that were looked at
+    # Metadata of the image files that were inspected, by name
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
-    file_notes: tuple[str, ...] = ()  # what is odd in these
+    file_notes: tuple[str, ...] = ()  # oddities in these files
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is odd but allowed."""
+        """All notes on oddities that are allowed."""
         return (*self.table_notes, *self.file_notes)
 
     def board_on(self, link: Link) -> FixedBoard | None:
@@ -107,7 +107,7 @@ class Dataset:
         return self.folder / image if image else None
 
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
-        """Return what reads the images of these rows, in this order, in any process."""
+        """Return a reader of the images of these rows, in this order, for use in any process."""
         return ImageReader(
             tuple(None if path is None else path.absolute() for path in map(self.image_path, rows)),
             tuple(self._camera(row) for row in rows),
@@ -115,7 +115,7 @@ class Dataset:
         )
 
     def inspect_image(self, row: int) -> tuple[ImageFacts, Problem | None]:
-        """Return what the image of a row says of itself, and what keeps it from being used."""
+        """Return the metadata of the image of a row, and the problem that prevents its use."""
         path = self.image_path(row)
         if path is None:
             return ImageFacts(), None
@@ -126,7 +126,7 @@ class Dataset:
         return self.measurements.views[int(self.measurements.view[row])].camera
 
     def _where(self, row: int) -> Place:
-        """Return where a row is named."""
+        """Return the place of a row in its table."""
         return Place(str(self.table_path), row + 1)
 
 
@@ -180,7 +180,7 @@ def _decoded(path: Path, camera: Camera, place: Place) -> _Decoded:
         return _kept[key]
     levels = decode_image(path, camera, place)
     _kept[key] = levels
-    while sum(each.nbytes for each in _kept.values()) > MAX_KEPT:
+    while sum(decoded.nbytes for decoded in _kept.values()) > MAX_KEPT:
         _kept.popitem(last=False)
     return levels
 
@@ -191,16 +191,15 @@ def _encoder_sigmas(
     stated: float | Mapping[str, float | str] | None,
     units: Mapping[str, ReadingUnit],
 ) -> tuple[float, dict[str, float]]:
-    """Return the standard deviation of readings in metres, and those by joint [m or rad].
+    """Return the standard deviation of readings in metres, and the deviations by joint [m or rad].
 
-    Hobby servos need none, whose readings are commands: these are taken to be good to half a
-    degree.
+    Hobby servos need none: their readings are commands, assumed accurate to half a degree.
 
     Raises
     ------
     DatasetError
-        If one number is stated and a motor turns, joints are not those of the motors, or a motor
-        has none.
+        If one number is stated and a motor turns, if a name is not a motor joint, or if a motor has
+        no standard deviation.
     """
     turning = [a.joint for a in machine.actuators if a.turns]
     of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}
@@ -211,14 +210,14 @@ def _encoder_sigmas(
         stated = {}
     if not isinstance(stated, Mapping):
         if turning:
-            every = ", ".join(
+            example = ", ".join(
                 f"{name}: {'0.5deg' if name in commanded else 0.0001}"
                 for name in machine.motor_names
             )
             raise DatasetError(
                 f"{path}: encoder_sigma could not be used: found one number [m], but the motor "
                 f"'{turning[0]}' turns, needed one for each motor in its unit; write "
-                f"encoder_sigma: {{{every}}}, with your values."
+                f"encoder_sigma: {{{example}}}, with your values."
             )
         for leg in of_motor.values():
             if too_large := sigma_too_large(stated, leg):
@@ -241,17 +240,17 @@ def _encoder_sigmas(
             f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
             "in the unit of its readings where one turns; add it."
         )
-    found, problems = dict[str, float](), list[str]()
+    sigmas, problems = dict[str, float](), list[str]()
     for name, sigma in stated.items():
         try:
-            found[name] = sigma_in(sigma, units[name], of_motor[name])
+            sigmas[name] = sigma_in(sigma, units[name], of_motor[name])
         except ValueError as error:
             problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
     if problems:
         raise DatasetError(problems)
-    linear = [sigma for name, sigma in found.items() if name not in turning]
-    known = commanded | found
-    return min(linear, default=ENCODER_SIGMAS[0]), {name: known[name] for name in motors}
+    linear = [sigma for name, sigma in sigmas.items() if name not in turning]
+    sigma_of_motor = commanded | sigmas
+    return min(linear, default=ENCODER_SIGMAS[0]), {name: sigma_of_motor[name] for name in motors}
 
 
 def load_dataset(
@@ -278,7 +277,7 @@ def load_dataset(
     Raises
     ------
     DatasetError
-        With one sentence for each thing that is wrong.
+        With one sentence for each problem.
     ModelError, OutOfClass
         If the mechanism does not load.
     """
@@ -288,10 +287,10 @@ def load_dataset(
     boards = () if entry.board is None else parse_boards(entry.board, yaml_path)
     problems: list[str | Problem] = []
     problems += view_problems(yaml_path, entry.views, [board.link for board in boards])
-    if found := path_problem(folder, entry.measurements):
+    if wrong_path := path_problem(folder, entry.measurements):
         problems.append(
-            f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
-            "needed a relative path inside it; move the table there."
+            f"{yaml_path}: measurements could not be used: found {wrong_path} "
+            f"({entry.measurements}), needed a relative path inside it; move the table there."
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
@@ -351,12 +350,12 @@ def load_dataset(
         return dataset
     dataset, unusable = inspect_files(dataset)
     if unusable:
-        raise DatasetError(_without_photographs(dataset) or [what for _, what in unusable])
+        raise DatasetError(_without_photographs(dataset) or [problem for _, problem in unusable])
     return dataset
 
 
 def _check_unread(path: Path, machine: Machine, unread: Sequence[str]) -> None:
-    """Refuse that motors which move joints at A are not read: nothing says where legs begin."""
+    """Refuse unread motors that move joints at A: the positions of A would be unknown."""
     moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
     if moving:
         columns = f"column{'s' * (len(moving) > 1)} {few(moving)}"
@@ -369,17 +368,17 @@ def _check_unread(path: Path, machine: Machine, unread: Sequence[str]) -> None:
 
 def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> str:
     """Return a note on motors without readings."""
-    said = f"{path}: the readings of {few(unread)} are not known (empty cells): "
+    start = f"{path}: the readings of {few(unread)} are not known (empty cells): "
     if machine.is_determined:
-        return said + "the others give the pose of the platform, and these legs are passive."
+        return start + "the others give the pose of the platform, and these legs are passive."
     return (
-        f"{said}the pose of the platform is found in each image, and the offsets of these legs "
+        f"{start}the pose of the platform is found in each image, and the offsets of these legs "
         "stay as the model has them."
     )
 
 
 def _without_photographs(dataset: Dataset) -> str:
-    """Return what is wrong with a dataset none of whose images is there; nothing if some are."""
+    """Return the problem of a dataset with no image file at all; "" if there are some."""
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     if len(paths) < 2 or any(path is None or os.path.exists(path) for path in paths):
         return ""
@@ -391,20 +390,20 @@ def _without_photographs(dataset: Dataset) -> str:
 
 
 def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
-    """Return a dataset with what its images say of themselves, and what is wrong with rows."""
+    """Return a dataset with the metadata of its images, and the problems by row."""
     facts, problems = inspect_rows(dataset)
-    found = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
-    return replace(dataset, facts=facts, file_notes=tuple(one.what for one in found)), problems
+    notes = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
+    return replace(dataset, facts=facts, file_notes=tuple(note.what for note in notes)), problems
 
 
 def _invisible(dataset: Dataset) -> list[str]:
-    """Return which legs images cannot show, where nothing else says where they are.
+    """Return the problems of legs without a visible cylinder, unless tables give their axes.
 
-    The model must have a cylinder along some leg of every view, and of the rods on every motor
-    that carries some.
+    The model must have a cylinder along some leg of every view, and along one of the rods on every
+    motor that carries rods.
     """
-    given = dataset.observations is not None or dataset.axes is not None
-    if given or dataset.board_on("platform") is not None:
+    has_tables = dataset.observations is not None or dataset.axes is not None
+    if has_tables or dataset.board_on("platform") is not None:
         return []
     machine = dataset.machine
     add = "add <visual> cylinders along them, with their radii, to the URDF"
@@ -583,9 +582,9 @@ def rows_without_board(
 
 
 def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, Problem]]]:
-    """Return what images say of themselves, by their names, and what is wrong with rows.
+    """Return the metadata of images by their names, and the problems by row.
 
-    That is one problem for each row that neither an image nor tables make usable.
+    There is one problem for each row that neither an image nor tables make usable.
     """
     table_path, measurements = dataset.table_path, dataset.measurements
     held = [view.hand_held for view in measurements.views]
@@ -613,14 +612,14 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
         return {}, [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
     facts: dict[str, ImageFacts] = {}
     outlines = dataset.observations
-    given = set() if outlines is None else set(outlines.row.tolist())
+    in_tables = set() if outlines is None else set(outlines.row.tolist())
     tables = f"outlines of it in {OBSERVATIONS_NAME}"
     if dataset.board_on("platform") is not None and dataset.corners is not None:
-        given |= set(dataset.corners.row[dataset.corners.used].tolist())
+        in_tables |= set(dataset.corners.row[dataset.corners.used].tolist())
         tables += f" or corners in {CORNERS_NAME}"
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
-        if path is None and row not in given:
+        if path is None and row not in in_tables:
             problem = Problem(
                 "the row could not be used",
                 f"neither an image nor {tables}",
@@ -631,16 +630,16 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
                 columns=("image",),
             )
             problems.append((row, problem))
-        elif path is not None and (os.path.exists(path) or row not in given):
-            facts[measurements.image[row]], found = dataset.inspect_image(row)
-            problems += [(row, found)] if found else []
+        elif path is not None and (os.path.exists(path) or row not in in_tables):
+            facts[measurements.image[row]], problem_of_image = dataset.inspect_image(row)
+            problems += [(row, problem_of_image)] if problem_of_image else []
     return facts, problems
 
 
 def expand_hand_held(
     path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
 ) -> tuple[Measurements, tuple[int, ...], list[Problem]]:
-    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
+    """Give every image of a hand-held view a separate view: NAME-1, NAME-2, ... by rows."""
     new: list[View] = []
     origin: list[int] = []
     problems: list[Problem] = []
@@ -660,11 +659,11 @@ def expand_hand_held(
         problems += [
             entry_problem(
                 path,
-                f"views.{other}",
+                f"views.{view_name}",
                 f"the name that an image of the hand-held view {name} gets",
                 "another",
                 "rename it",
             )
-            for other in taken
+            for view_name in taken
         ]
     return replace(measurements, views=tuple(new), view=index), tuple(origin), problems

@@ -1,4 +1,4 @@
-"""The file dataset.yaml: its schema, and what contradicts itself in it."""
+"""The file dataset.yaml: its schema, and checks for contradictions."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from legcal.machine.directions import list_in_words
 from legcal.machine.files import DATASET_YAML
 from legcal.vision.board import Link
 
-ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+ENCODER_SIGMAS = (1e-12, 1.0)  # [m] plausible standard deviations of an encoder
 _Text = Annotated[str, Strict(), WithJsonSchema({"type": "string"})]
 _BOUNDS = ("minimum", "maximum")
-GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
+GAMMAS = (0.2, 5.0)  # plausible gammas of a camera
 
 
 class ViewEntry(FileSchema):
     """One camera position."""
 
     camera: str
-    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
+    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # None: unknown
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
     legs: list[str] | None = None  # none of them where a board on the platform is all that counts
@@ -59,7 +59,7 @@ def _can_be_fixed(text: str) -> str:
 
 
 class ParametersEntry(FileSchema):
-    """What is known of parameters, which are left as they are and which are looked for."""
+    """Priors of parameters, and the parameters to fix or to free."""
 
     priors: dict[
         Name, Annotated[Quantity, BeforeValidator(read_prior), WithJsonSchema(PRIOR_SCHEMA)]
@@ -71,7 +71,7 @@ class ParametersEntry(FileSchema):
     free: list[Name] = Field(default_factory=list)
 
     def overrides(self, path: Path) -> tuple[Override, ...]:
-        """Return what the block asks for; ``path`` is that of the file, for messages."""
+        """Return the overrides of the block; ``path`` is the file, for messages."""
         block = f"{path}: parameters"
         return (
             *(
@@ -94,12 +94,12 @@ class ParametersEntry(FileSchema):
 
 
 def _by_joint_or(of_all: str) -> Discriminator:
-    """Return what tells an entry by joint from one for all motors, which has this tag."""
+    """Return the discriminator of an entry by joint from one for all motors, which has this tag."""
 
-    def form(given: Any) -> str:
-        if given is None:
+    def form(value: Any) -> str:
+        if value is None:
             return "[none]"
-        return "[by joint]" if isinstance(given, dict) else of_all
+        return "[by joint]" if isinstance(value, dict) else of_all
 
     return Discriminator(form)
 
@@ -125,7 +125,7 @@ class DatasetEntry(FileSchema):
         ]
         | Annotated[None, Tag("[none]")],
         _by_joint_or("[number]"),
-    ] = None  # of servos whose readings are their pulses
+    ] = None  # None: servos with pulses as readings have a default
     readings: Annotated[
         Annotated[ReadingUnitName, Tag("[unit]")]
         | Annotated[dict[str, ReadingsEntry], Field(min_length=1), Tag("[by joint]")]
@@ -152,49 +152,49 @@ class DatasetEntry(FileSchema):
         return sigma
 
 
-def find_dataset_file(given: Path) -> Path:
+def find_dataset_file(location: Path) -> Path:
     """Return the path of dataset.yaml."""
     path = (
-        given
-        if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
-        else given / DATASET_YAML
+        location
+        if location.suffix in (".yaml", ".yml") and not os.path.isdir(location)
+        else location / DATASET_YAML
     )
     if not os.path.isdir(path.parent):
         raise DatasetError(
-            f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
-            f"{DATASET_YAML}; check the path."
+            f"{location}: the dataset could not be read: found no such folder, needed a folder "
+            f"with a {DATASET_YAML}; check the path."
         )
     if not os.path.exists(path):
         raise DatasetError(
-            f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
-            "one; give the folder of a dataset, or make one of photographs and a table of readings "
-            "(legcal init)."
+            f"{location}: the dataset could not be read: found no {path.name} in the folder, "
+            "needed one; give the folder of a dataset, or make one of photographs and a table of "
+            "readings (legcal init)."
         )
     return path
 
 
 def read_dataset_file(path: Path) -> DatasetEntry:
     """Return the checked content of dataset.yaml."""
-    found = read_yaml(path, "dataset file")
-    version = found.get("legcal_dataset", 1)
+    document = read_yaml(path, "dataset file")
+    version = document.get("legcal_dataset", 1)
     if version != 1 or isinstance(version, bool):
         raise DatasetError(
             f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
             "needed version 1; use the legcal that wrote it, or write the file as version 1."
         )
-    return validate(DatasetEntry, found, path)
+    return validate(DatasetEntry, document, path)
 
 
 def entry_problem(path: Path, entry: str, found: str, needed: str, remedy: str) -> Problem:
-    """Return why an entry of the dataset file cannot be used."""
-    what = f"{entry} could not be used"
-    return Problem(what, found, needed, remedy, str(path), name=entry, code=Code.BAD_VALUE)
+    """Return the problem of an entry of the dataset file that cannot be used."""
+    sentence = f"{entry} could not be used"
+    return Problem(sentence, found, needed, remedy, str(path), name=entry, code=Code.BAD_VALUE)
 
 
 def view_problems(
     path: Path, views: Mapping[str, ViewEntry], boards: Collection[Link]
 ) -> list[Problem]:
-    """Return what keeps views from showing no leg, and from being hand-held.
+    """Return the problems of views without legs and of hand-held views.
 
     *boards* are the links that have a board.
     """

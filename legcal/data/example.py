@@ -35,7 +35,7 @@ def copy_example(destination: Path) -> None:
             "that come with legcal; install it again."
         )
     with result_folder(destination, KIND) as folder:
-        for name in _OWN:  # and not what a calibration left beside them
+        for name in _OWN:  # without results of a calibration beside them
             if (source / name).is_dir():
                 shutil.copytree(source / name, folder / name)
             else:

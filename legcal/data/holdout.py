@@ -1,8 +1,8 @@
-"""Held-out images: a fit that has not seen them must predict what they show.
+"""Held-out images: a fit without them must predict their outlines.
 
-Whole poses are held out, since images of one pose share what is unknown of it. They are drawn at
-random, in an order that does not depend on the files, and so that every leg in every view loses no
-more than its share.
+Whole poses are held out, since images of one pose share its unknowns. They are drawn at random, in
+an order that does not depend on the files, and so that every leg in every view loses no more than
+its share.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SEED = 20020721
 
 
 def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]:
-    """Return the rows of images to fit and of held-out ones, both rising."""
+    """Return the rows of the images to fit and of the held-out images, each ascending."""
     if not 0.0 < fraction < 1.0:
         raise UsageError(
             f"The images to keep aside could not be chosen: found the fraction {fraction:g}, "
@@ -69,27 +69,27 @@ def _shuffled_poses(dataset: Dataset) -> IntArray:
 
 
 def _shown(dataset: Dataset) -> BoolArray:
-    """Return which leg in which view each row shows or may show, (n_rows, n_views * n_legs)."""
+    """Return a mask of the legs by view that each row shows or may show, (n_rows, views * legs)."""
     measurements, names = dataset.measurements, dataset.machine.leg_names
     shown = np.zeros((measurements.n_rows, len(measurements.views), len(names)), dtype=np.bool_)
-    given = np.zeros(measurements.n_rows, dtype=np.bool_)
+    has_observations = np.zeros(measurements.n_rows, dtype=np.bool_)
     for table, used in _tables(dataset):
         row, leg = table[used].T
         shown[row, measurements.view[row], leg] = True
-        given[row] = True
-    for row in np.flatnonzero(~given).tolist():
+        has_observations[row] = True
+    for row in np.flatnonzero(~has_observations).tolist():
         view = int(measurements.view[row])
         shown[row, view] = [measurements.views[view].uses(name) for name in names]
     return shown.reshape(measurements.n_rows, -1)
 
 
 def _tables(dataset: Dataset) -> list[tuple[IntArray, BoolArray]]:
-    """Return image row and leg of everything that tables list, and whether it is used."""
-    found = []
+    """Return for each table the image row and leg (n, 2) of its entries, and the mask of use."""
+    tables = []
     if dataset.axes is not None:
         axes = dataset.axes
-        found.append((np.column_stack([axes.row, axes.leg]), np.ones(len(axes), dtype=np.bool_)))
+        tables.append((np.column_stack([axes.row, axes.leg]), np.ones(len(axes), dtype=np.bool_)))
     if dataset.observations is not None:
         outlines = dataset.observations
-        found.append((np.column_stack([outlines.row, outlines.leg]), outlines.used))
-    return found
+        tables.append((np.column_stack([outlines.row, outlines.leg]), outlines.used))
+    return tables

@@ -1,4 +1,4 @@
-"""What is said of many images, one sentence a cause: those that share it are named together."""
+"""Notes on images, one sentence for each cause, with all images that share it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from legcal.data.measurements import Measurements, few, few_views, row_names
 
 
 def image_notes(measurements: Measurements, causes: Mapping[int, Cause]) -> list[str]:
-    """Return what is said of rows as sentences, one a cause, that begin with the images."""
+    """Return one sentence for each cause, which begins with the images of its rows."""
     return [
         f"{images_in_words(measurements, rows)}{': ' if len(rows) == 1 else ', each: '}{cause}"
         for cause, rows in by_cause(causes)
@@ -17,7 +17,7 @@ def image_notes(measurements: Measurements, causes: Mapping[int, Cause]) -> list
 
 
 def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
-    """Return rows as a sentence names them: ``3 images of views c1, c2 (a.png, b.png, c.png)``.
+    """Return rows in words: ``3 images of views c1, c2 (a.png, b.png, c.png)``.
 
     A single one is ``view c1, image a.png``.
     """

@@ -1,8 +1,8 @@
-"""Tables of what images show: rows chosen, joined, put in order, and brought to other images.
+"""Tables of observations in images: select, join and reorder rows, and map them to other images.
 
-A table (outlines, axes, corners) has one entry a row in each of its fields, and names in ``row``
-the image that shows it, a row of the measurements. Jobs put datasets into canonical order before
-they begin, so that results do not depend on the order of files.
+A table (outlines, axes, corners) has one entry a row in each of its fields; ``row`` is the index of
+the image in the measurements. Jobs put datasets into canonical order before they begin, so that
+results do not depend on the order of files.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class ImageTable:
         return len(self.row)
 
     def row_keys(self) -> list[tuple[Any, ...]]:
-        """Return the identity of each row, the key by which tables are sorted."""
+        """Return the key that identifies each row and sorts tables."""
         raise NotImplementedError
 
     def choose(self, chosen: BoolArray | IntArray) -> Self:
-        """Return some rows: those of a mask, or those of indices in a new order."""
+        """Return the rows of a mask, or of indices in a new order."""
         index = np.arange(len(self))[chosen]
         some: dict[str, Any] = {
             name: tuple(map(values.__getitem__, index.tolist()))
@@ -43,8 +43,8 @@ class ImageTable:
         return replace(self, **some)
 
     def join(self, others: Iterable[Self]) -> Self:
-        """Return the rows of this table and of others, one after the other."""
-        parts = [self._fields(), *(other._fields() for other in others)]
+        """Return the rows of this table and of others, concatenated."""
+        parts = [self._fields(), *(table._fields() for table in others)]
         all_of_them: dict[str, Any] = {
             name: tuple(entry for part in parts for entry in part[name])
             if isinstance(values, tuple)
@@ -59,16 +59,16 @@ class ImageTable:
         return self.choose(np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp))
 
     def at(self, rows: IntArray) -> Self:
-        """Return what some images show, as a table of :func:`measurements_at` them."""
+        """Return the observations in some images, as a table for :func:`measurements_at` them."""
         place = np.full(max(rows.max(initial=-1), self.row.max(initial=-1)) + 1, -1, dtype=np.intp)
         place[rows] = np.arange(len(rows))
         place = place[self.row]
         return replace(self.choose(place >= 0), row=place[place >= 0])
 
     def reject(self, wrong: BoolArray, why: Reason | Sequence[Rejection]) -> Self:
-        """Return a table of observations with some of those that were used rejected.
+        """Return the table with some of its used observations rejected.
 
-        For one reason, or each for its own.
+        *why* is one reason for all, or a rejection for each.
         """
         table = self._fields()
         out = table["used"] & wrong
@@ -83,7 +83,7 @@ class ImageTable:
         return replace(self, **changed)
 
     def rejected_for(self, *reasons: Reason) -> BoolArray:
-        """Return which observations are rejected for one of some reasons, (n,)."""
+        """Return a mask (n,) of the observations rejected for any of some reasons."""
         return have_reason(self._fields()["reason"], *reasons)
 
     def _fields(self) -> dict[str, Any]:
@@ -102,11 +102,11 @@ class Order:
     legs: IntArray
 
     def reorder(self, table: _Table) -> _Table:
-        """Return a table of the original measurements as one of the reordered ones, sorted."""
+        """Map a table of the original measurements to the reordered measurements, sorted."""
         return self._renamed(table, inverse(self.rows), inverse(self.legs))
 
     def restore(self, table: _Table) -> _Table:
-        """Return a table of reordered measurements as one of the original ones, sorted."""
+        """Map a table of the reordered measurements to the original measurements, sorted."""
         return self._renamed(table, self.rows, self.legs)
 
     def _renamed(self, table: _Table, rows: IntArray, legs: IntArray) -> _Table:
@@ -168,5 +168,5 @@ def measurements_at(measurements: Measurements, rows: IntArray) -> Measurements:
 
 
 def inverse(permutation: IntArray) -> IntArray:
-    """Return where each original element went: ``inverse(p)[p[k]] == k``."""
+    """Return the inverse of a permutation: ``inverse(p)[p[k]] == k``."""
     return np.argsort(permutation)

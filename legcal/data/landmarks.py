@@ -1,9 +1,9 @@
-"""The table ``landmarks.csv``: joints that a person clicked in photographs, and cameras by them.
+"""The table ``landmarks.csv``: joints that a person clicked in photographs, and cameras from them.
 
 One row a click: view and image, named as in ``observations.csv``; the joint, ``leg1.base`` or
-``leg1.platform``; its pixel in the photograph as it lies there; the standard deviation of that
-[px], 3 where the cell is empty. The nominal model says where the joints are at the readings of the
-image, so that four of them place the camera of the view: roughly, as a ``T_base_camera`` does.
+``leg1.platform``; its pixel in the stored photograph; the standard deviation of that [px], 3 where
+the cell is empty. The nominal model gives the joints at the readings of the image, so that four of
+them place the camera of the view: roughly, like a ``T_base_camera`` in the dataset.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from legcal.vision.point_pose import (
 )
 
 LANDMARKS_NAME = "landmarks.csv"
-SIGMA_PX = 3.0  # of a click, unless the table says otherwise
-SIGMA_RANGE = (0.01, 200.0)  # [px]: no click is better, and worse says nothing
+SIGMA_PX = 3.0  # [px] default standard deviation of a click
+SIGMA_RANGE = (0.01, 200.0)  # [px] plausible standard deviations of a click
 ENDS = ("base", "platform")
 COLUMNS = ("view", "image", "joint", "u", "v", "sigma")
-GOOD_NUMBER = 6  # of clicks in a view, which show that one is wrong
-# How far the nominal model may have a joint from where it is, one standard deviation [mean leg
-# lengths]: clicks need not fit it better
+GOOD_NUMBER = 6  # clicks in a view, enough to identify a wrong click
+# Standard deviation of joints of the nominal model [mean leg lengths]: clicks need not fit better
 MODEL_ERROR = 0.015
-# Of one pose over another one that shows the clicks alike: half a squared standard deviation
+# Minimum lead in cost of a camera pose over the next one: half a squared standard deviation
 MIN_LEAD = 4.5
-# What a rough pose may be off, three times over: angle, and part of the distance
+# Maximum standard deviations of a rough pose, whose errors may be three times as large: angle, and
+# fraction of the distance
 MAX_ANGLE, MAX_SHIFT = np.deg2rad(6.0), 0.06
 
 
@@ -69,12 +69,12 @@ class Landmarks(ImageTable):
 
 
 def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """Return leg and end of each joint, by the name that the table has for it."""
+    """Return leg and end of each joint, by its name in the table."""
     return {joint_name(leg, end): (j, end) for end in (0, 1) for j, leg in enumerate(leg_names)}
 
 
 def joint_name(leg: str, end: int) -> str:
-    """Return what the table calls a joint."""
+    """Return the name of a joint in the table."""
     return f"{leg}.{ENDS[end]}"
 
 
@@ -100,7 +100,7 @@ def format_landmarks(
 def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measurements) -> Landmarks:
     """Return the table ``landmarks.csv`` in the order of the file.
 
-    Raises DatasetError with one sentence for each thing that is wrong.
+    Raises DatasetError with one sentence for each problem.
     """
     least, most = SIGMA_RANGE
     needed = f"a standard deviation from {least:g} to {most:g} px"
@@ -151,23 +151,25 @@ def place_by_landmarks(
     *,
     may_be_wrong: bool = False,
 ) -> tuple[Measurements, list[str]]:
-    """Return measurements whose views with clicks start from these, and notes on such views.
+    """Place the views with clicks by these, and return the measurements and notes on such views.
 
-    The clicks of a view win over its ``T_base_camera``. Where they *may_be_wrong*, what is wrong is
-    a note, and the view is left as it is.
+    The clicks of a view take precedence over its ``T_base_camera``. If they *may_be_wrong*, a
+    problem is a note, and the view stays as it is.
 
     Raises
     ------
     DatasetError
-        If a view has too few clicks to place its camera, or clicks contradict the others of their
+        If a view has too few clicks to place its camera, or a click contradicts the others of its
         view: with one sentence for each view or click.
     """
     views, problems, notes = list(measurements.views), list[str](), list[str]()
-    for v, found in cameras_by_landmarks(path, machine, measurements, landmarks).items():
-        problems += found.problems
-        notes += found.notes
-        if found.T_base_camera is not None and not found.problems:
-            views[v] = replace(views[v], T_base_camera=found.T_base_camera, by_landmarks=True)
+    for v, clicked_camera in cameras_by_landmarks(path, machine, measurements, landmarks).items():
+        problems += clicked_camera.problems
+        notes += clicked_camera.notes
+        if clicked_camera.T_base_camera is not None and not clicked_camera.problems:
+            views[v] = replace(
+                views[v], T_base_camera=clicked_camera.T_base_camera, by_landmarks=True
+            )
     if problems and not may_be_wrong:
         raise DatasetError(problems)
     return replace(measurements, views=tuple(views)), [*problems, *notes]
@@ -177,10 +179,10 @@ def place_by_landmarks(
 class ClickedCamera:
     """The camera of a view by its clicks."""
 
-    # By all clicks, or, where some are wrong, by the others; None where they do not place it
+    # From all clicks that are not wrong; None where they do not place the camera
     T_base_camera: RigidTransform | None
-    problems: list[str]  # what is wrong with them
-    notes: list[str]  # what they leave open
+    problems: list[str]  # wrong or missing clicks
+    notes: list[str]  # ambiguity or uncertainty of the pose
 
 
 def cameras_by_landmarks(
@@ -188,14 +190,14 @@ def cameras_by_landmarks(
 ) -> dict[int, ClickedCamera]:
     """Return the cameras of the views that have clicks, by their index."""
     joints, has_place = joints_at_readings(machine, measurements, landmarks.row)
-    view_of, found = measurements.view[landmarks.row], dict[int, ClickedCamera]()
+    view_of, cameras = measurements.view[landmarks.row], dict[int, ClickedCamera]()
     for v in np.unique(view_of).tolist():
-        own = landmarks.choose(view_of == v)
-        clicks = _Clicks(path, machine, measurements, v, own, joints, has_place)
+        view_clicks = landmarks.choose(view_of == v)
+        clicks = _Clicks(path, machine, measurements, v, view_clicks, joints, has_place)
         pose, problems, notes = clicks.camera()
         T = None if pose is None else pose.T_camera_base.inv()
-        found[v] = ClickedCamera(T, problems, notes)
-    return found
+        cameras[v] = ClickedCamera(T, problems, notes)
+    return cameras
 
 
 def platforms_by_landmarks(
@@ -203,34 +205,37 @@ def platforms_by_landmarks(
 ) -> dict[int, tuple[RigidTransform, ...]]:
     """Return T_base_platform of poses whose images have clicks on the platform, likeliest first.
 
-    They are before the rough cameras of their views; images with fewer than four such clicks give
+    They rely on the rough cameras of their views; images with fewer than four such clicks give
     none.
     """
-    found = dict[int, list[tuple[float, RigidTransform]]]()
+    candidates = dict[int, list[tuple[float, RigidTransform]]]()
     B, on_platform = machine.B_platform, landmarks.end == 1
     for row in np.unique(landmarks.row).tolist():
         view = measurements.views[int(measurements.view[row])]
-        own = landmarks.choose((landmarks.row == row) & on_platform)
-        points = B[own.leg]
-        if view.T_base_camera is None or len(own) < MIN_POINTS or on_a_line(points):
+        image_clicks = landmarks.choose((landmarks.row == row) & on_platform)
+        points = B[image_clicks.leg]
+        if view.T_base_camera is None or len(image_clicks) < MIN_POINTS or on_a_line(points):
             continue
-        of_pose = found.setdefault(int(measurements.pose[row]), [])
-        for one in camera_poses_by_points(view.camera, points, own.px, own.sigma_px)[:2]:
-            of_pose.append((one.cost, view.T_base_camera * one.T_camera_base))
+        of_pose = candidates.setdefault(int(measurements.pose[row]), [])
+        for camera_pose in camera_poses_by_points(
+            view.camera, points, image_clicks.px, image_clicks.sigma_px
+        )[:2]:
+            of_pose.append((camera_pose.cost, view.T_base_camera * camera_pose.T_camera_base))
     return {
-        pose: tuple(T for _, T in sorted(every, key=lambda one: one[0]))
-        for pose, every in found.items()
-        if every
+        pose: tuple(T for _, T in sorted(of_one_pose, key=lambda camera_pose: camera_pose[0]))
+        for pose, of_one_pose in candidates.items()
+        if of_one_pose
     }
 
 
 def joints_at_readings(
     machine: Machine, measurements: Measurements, rows: IntArray
 ) -> tuple[Mapping[int, Array], Mapping[int, BoolArray]]:
-    """Return the joints (n_legs, 2, 3) at the readings of rows in the base link [m].
+    """Return by row the joints (n_legs, 2, 3) in the base link [m], and which have a place.
 
-    And which of them (n_legs, 2) the readings place: those of the base alone where the motors do
-    not determine the pose of the platform, or the nominal model does not reach it.
+    The mask (n_legs, 2) is true for the joints that the readings place: only the joints at the base
+    where the motors do not determine the pose of the platform, or the nominal model does not reach
+    it.
     """
     joints, has_place = dict[int, Array](), dict[int, BoolArray]()
     wanted = np.unique(measurements.pose[rows])
@@ -253,7 +258,7 @@ def joints_at_readings(
 
 @dataclass(frozen=True, eq=False)
 class _Clicks:
-    """The clicks of one view, and where the nominal model has their joints."""
+    """The clicks of one view, and their joints according to the nominal model."""
 
     path: Path
     machine: Machine
@@ -269,7 +274,7 @@ class _Clicks:
         return self.measurements.views[self.view].name
 
     def camera(self) -> tuple[PointPose | None, list[str], list[str]]:
-        """Return the likeliest pose of the camera, what is wrong with clicks, and notes."""
+        """Return the likeliest pose of the camera, problems of clicks, and notes."""
         usable = np.array([self.has_place[r][j, e] for r, j, e in self.landmarks.row_keys()])
         some = replace(self, landmarks=self.landmarks.choose(usable))
         n, left_out = len(some.landmarks), len(usable) - int(usable.sum())
@@ -292,14 +297,14 @@ class _Clicks:
     @property
     def points(self) -> Array:
         """The joints by the nominal model, (n, 3) in the base link [m]."""
-        every = [self.joints[row][leg, end] for row, leg, end in self.landmarks.row_keys()]
-        return np.array(every).reshape(-1, 3)
+        joints = [self.joints[row][leg, end] for row, leg, end in self.landmarks.row_keys()]
+        return np.array(joints).reshape(-1, 3)
 
     def sigma(self, points: Array) -> Array:
-        """Return how far clicks may be from where the model has their joints, (n,) [px].
+        """Return the standard deviation of clicks from the joints of the model, (n,) [px].
 
-        Pixels a metre are those between most clicks that are far apart, as far as they are not seen
-        end on.
+        The scale in pixels a metre is the third quartile over pairs of clicks far apart, since some
+        pairs are foreshortened.
         """
         px = self.landmarks.px
         i, j = np.triu_indices(len(points), 1)
@@ -310,18 +315,18 @@ class _Clicks:
         return np.hypot(self.landmarks.sigma_px, of_model)
 
     def _too_few(self, n: int, left_out: int) -> str:
-        """Say that clicks do not place the camera."""
-        found = f"{n} click{'s' * (n != 1)}" + " on one line" * (n >= MIN_POINTS)
+        """Return the problem of too few clicks to place the camera."""
+        actual = f"{n} click{'s' * (n != 1)}" + " on one line" * (n >= MIN_POINTS)
         if left_out:
-            found += f" on joints that the readings place, and {left_out} on others"
+            actual += f" on joints that the readings place, and {left_out} on others"
         return (
-            f"{self.path}: view {self.name}: its camera could not be placed: found {found}, needed "
-            f"{MIN_POINTS} or more, better {GOOD_NUMBER}, that are not on one line; click more "
-            "joints in its pictures, or remove those of this view."
+            f"{self.path}: view {self.name}: its camera could not be placed: found {actual}, "
+            f"needed {MIN_POINTS} or more, better {GOOD_NUMBER}, that are not on one line; click "
+            "more joints in its pictures, or remove those of this view."
         )
 
     def disagreement(self, pose: PointPose) -> str:
-        """Say that clicks contradict each other, and not which of them are wrong."""
+        """Return the problem of contradictory clicks, none of which is identified as wrong."""
         return (
             f"{self.path}: view {self.name}: its camera could not be placed: found "
             f"{len(self.landmarks)} clicks that no camera shows where they are (up to "
@@ -331,22 +336,22 @@ class _Clicks:
         )
 
     def contradictions(self, pose: PointPose, wrong: IntArray, sigma: Array) -> list[str]:
-        """Return what to say of clicks that are far from where the others have them."""
-        names, said = row_names(self.measurements), list[str]()
+        """Return the problems of clicks that contradict the other clicks."""
+        names, sentences = row_names(self.measurements), list[str]()
         for i in wrong.tolist():
             row, leg, end = self.landmarks.row_keys()[i]
             name = joint_name(self.machine.leg_names[leg], end)
-            other = self._other_joint(pose, i, TRUNCATION * float(sigma[i]))
-            perhaps = f"perhaps it shows {other}; " if other else ""
-            said.append(
+            other_joint = self._other_joint(pose, i, TRUNCATION * float(sigma[i]))
+            perhaps = f"perhaps it shows {other_joint}; " if other_joint else ""
+            sentences.append(
                 f"{self.path}: the click on {name} in {names[row]} (view {self.name}) is "
                 f"{pose.off_px[i]:.0f} px from where the other clicks have it, needed at most "
                 f"{TRUNCATION * sigma[i]:.0f} px; {perhaps}correct or remove it."
             )
-        return said
+        return sentences
 
     def _other_joint(self, pose: PointPose, i: int, most: float) -> str:
-        """Return the joint that a click shows by the other clicks; "" if it shows none."""
+        """Return the joint that a click fits according to the other clicks; "" for none."""
         row = int(self.landmarks.row[i])
         camera = self.measurements.views[self.view].camera
         keys = [(j, e) for j, e in np.argwhere(self.has_place[row]).tolist()]
@@ -360,16 +365,17 @@ class _Clicks:
         return joint_name(self.machine.leg_names[keys[k][0]], keys[k][1])
 
     def doubts(self, poses: Sequence[PointPose]) -> list[str]:
-        """Return notes on what the clicks leave open of the camera."""
+        """Return notes on an ambiguous or uncertain camera pose."""
         best = poses[0]
         start = f"{self.path}: view {self.name}: its {len(self.landmarks)} clicks"
         distance = float(np.linalg.norm(best.T_camera_base.translation))
         if len(poses) > 1 and poses[1].cost - best.cost < MIN_LEAD:
-            other = best.T_camera_base * poses[1].T_camera_base.inv()
+            difference = best.T_camera_base * poses[1].T_camera_base.inv()
             return [
-                f"{start} leave two cameras open, {1e3 * np.linalg.norm(other.translation):.0f} mm "
-                f"and {np.degrees(other.rotation.magnitude()):.0f} deg apart, and the likelier one "
-                "is where the search begins; click joints that are nearer or farther as well."
+                f"{start} leave two cameras open, "
+                f"{1e3 * np.linalg.norm(difference.translation):.0f} mm and "
+                f"{np.degrees(difference.rotation.magnitude()):.0f} deg apart, and the likelier "
+                "one is where the search begins; click joints that are nearer or farther as well."
             ]
         turn, shift = (float(np.sqrt(np.trace(best.covariance[s, s])))
                        for s in (slice(3), slice(3, 6)))  # fmt: skip

@@ -2,8 +2,8 @@
 
 The header is ``view,image,<actuated joint>,...`` with an optional ``pose``, in any order.
 Readings are in metres. Rows with the same pose label, in any view, share one platform pose
-and one reading (their mean); a row without a label is a pose of its own. Tables of what images
-show name their rows by view and image, see :func:`row_names`.
+and one reading (their mean); a row without a label is a separate pose. Tables of observations
+name their rows by view and image, see :func:`row_names`.
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import TRAVEL_MARGIN, Leg
 from legcal.vision.camera import Camera
 
-MAX_NAMED = 5  # views or other things, in one sentence
-# Of the travel, and in standard deviations: readings outside by less are within it but for rounding
-# and noise.
+MAX_NAMED = 5  # maximum number of names in one sentence
+# Fraction of the travel, and standard deviations: readings outside by less are within the travel
+# but for rounding and noise.
 ROUNDED, NOISY = 1e-3, 3.0
-MANY, FEWEST = 0.25, 2  # of the rows: where so many are outside, it may be for one cause
-MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
+# Minimum fraction and number of rows outside the travel for a search of a common cause
+MANY, FEWEST = 0.25, 2
+MAX_READING_SPREAD = 10.0  # maximum difference [sigma] between rows of one pose
 INCH = 0.0254  # [m]
-# Parts of the travel: in the unit that is stated, and in another that may be, or surely is, meant
+# Fractions of the travel in use: in the stated unit, and in another possible, or certain, unit
 HARDLY_MOVES, MAY_MOVE, SURELY_MOVES = 0.02, 0.2, 0.5
-WOULD_MOVE = 0.05  # what readings outside the travel would use of it in what they are taken for
-MIN_POSES = 5  # different ones, as an arm needs (6'): fewer are a check, and may be near each other
-USUAL_PULSES = (400.0, 2700.0)  # [us], of hobby servos
+WOULD_MOVE = 0.05  # minimum fraction of the travel that corrected readings would use
+MIN_POSES = 5  # different poses, as an arm needs (6'): fewer are a check, perhaps close together
+USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 _TEXTS = ("view", "image", "pose")  # columns
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
@@ -59,11 +60,11 @@ class View:
     camera: Camera
     T_base_camera: RigidTransform | None = None  # rough: good to 2 cm and 2 degrees
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
-    hand_held: bool = False  # one image of a camera in the hand, which only the board can place
-    by_landmarks: bool = False  # whether the rough pose is that of clicks on joints
+    hand_held: bool = False  # one image of a hand-held camera, which only the board can place
+    by_landmarks: bool = False  # whether the rough pose comes from clicks on joints
 
     def uses(self, leg: str) -> bool:
-        """Say whether a leg, by its name, is to be used in this view."""
+        """Return whether a leg, by its name, is used in this view."""
         return self.legs is None or leg in self.legs
 
 
@@ -79,11 +80,11 @@ class Measurements:
     image: tuple[str, ...]  # relative to the dataset; "" where only outlines are given
     view: IntArray  # (n_rows,) index into views
     pose: IntArray  # (n_rows,) 0 to n_poses - 1, numbered as they first appear
-    # (n_rows, n_legs) readings [m], of rods on actuators those of the actuator [m or rad]; zero for
-    # other constant-length legs, NaN for passive ones
+    # (n_rows, n_legs) readings [m]; for rods on actuators the reading of the actuator [m or rad];
+    # zero for other constant-length legs, NaN for passive ones
     q: Array
     sigma_q: float  # of a reading [m]
-    pose_labels: tuple[str, ...] = ()  # of each pose, "" without; empty without that column
+    pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @property
@@ -93,7 +94,7 @@ class Measurements:
 
     @property
     def first_rows(self) -> IntArray:
-        """The first row of every pose, (n_poses,): its reading is that of the pose."""
+        """The first row of every pose, (n_poses,), with the reading of the pose."""
         return np.asarray(np.unique(self.pose, return_index=True)[1])
 
     @property
@@ -108,7 +109,7 @@ class Measurements:
 
     @property
     def clicked_views(self) -> tuple[str, ...]:
-        """The views whose rough poses are those of clicks on joints."""
+        """The views with a rough pose from clicks on joints."""
         return tuple(view.name for view in self.views if view.by_landmarks)
 
     def sigma_of(self, legs: Sequence[Leg]) -> Array:
@@ -117,7 +118,7 @@ class Measurements:
 
 
 def row_names(measurements: Measurements) -> tuple[str, ...]:
-    """Return what the image column of other tables calls each row of the measurements."""
+    """Return the name of each row of the measurements in the image column of other tables."""
     names = list(measurements.image)
     for v in range(len(measurements.views)):
         rows = np.flatnonzero(measurements.view == v).tolist()
@@ -141,19 +142,19 @@ def places(measurements: Measurements) -> list[tuple[str, str]]:
 
 
 def find_rows(table: Table, measurements: Measurements) -> IntArray:
-    """Return the row of the measurements that each row of a table names, -1 where unknown."""
+    """Return for each row of a table the row of the measurements, -1 where unknown."""
     index = {place: row for row, place in enumerate(places(measurements))}
-    found = zip(table.text("view"), table.text("image"), strict=True)
-    return np.array([index.get(place, -1) for place in found], dtype=np.intp)
+    named = zip(table.text("view"), table.text("image"), strict=True)
+    return np.array([index.get(place, -1) for place in named], dtype=np.intp)
 
 
 def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements) -> None:
-    """Refuse rows of a table of which :func:`find_rows` knew none."""
+    """Refuse rows of a table with an image unknown to :func:`find_rows`."""
     names = places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
-    found = list(zip(table.text("view"), table.text("image"), strict=True))
+    named = list(zip(table.text("view"), table.text("image"), strict=True))
     for i in np.flatnonzero(row < 0).tolist():
-        view, image = found[i]
+        view, image = named[i]
         if view not in views:
             unknown, remedy = f"the unknown view {describe(view)}", closest(view, views)
             table.refuse(i, unknown, "a view with measurements", "view", remedy=remedy)
@@ -170,21 +171,21 @@ def find_legs(table: Table, leg_names: Sequence[str]) -> IntArray:
 
 
 def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -> None:
-    """Refuse rows of a table of which :func:`find_legs` knew none."""
+    """Refuse rows of a table with a leg unknown to :func:`find_legs`."""
     names = table.text("leg")
     for i in np.flatnonzero(leg < 0).tolist():
-        found, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
-        table.refuse(i, found, "a leg of the mechanism", "leg", remedy=remedy)
+        unknown, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
+        table.refuse(i, unknown, "a leg of the mechanism", "leg", remedy=remedy)
 
 
 def few(names: Sequence[str]) -> str:
-    """Return names one after the other, not more than a few: ``c1, c2 and 3 more``."""
+    """Return a list of at most a few names: ``c1, c2 and 3 more``."""
     more = len(names) - MAX_NAMED
     return ", ".join(names[:MAX_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def few_views(names: Sequence[str]) -> str:
-    """Return views as a sentence names them: ``views c1, c2``, not more than a few."""
+    """Return views in words, at most a few names: ``views c1, c2``."""
     return f"view{'s' * (len(names) > 1)} {few(names)}"
 
 
@@ -203,9 +204,9 @@ def reading_columns(
 
 
 def unread_motors(path: Path, legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Return the motors whose readings a table leaves empty in all of its rows.
+    """Return the motors with empty readings in all rows of a table.
 
-    What else is wrong with the table is no concern of this.
+    Other problems of the table are ignored here.
     """
     motors = [str(leg.prismatic) for leg in legs_with_readings(legs)]
     others = [Column(name, "text", blank=True, required=False) for name in _TEXTS]
@@ -227,39 +228,39 @@ def readings_in(
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
-    Readings outside their travel by more than 5 % of it are refused, others are noted if it is more
-    than rounding and noise. Refused is as well what hardly moves in its unit and makes use of the
-    travel in a larger one; where that is not sure, as of few poses, it is noted. *units* and
-    standard deviations *sigma* (n_motors,) are those of a dataset; without units, tables are in m
+    Readings outside their travel by more than 5 % of it are refused; smaller excesses are noted if
+    they exceed rounding and noise. Readings that hardly move in their unit but use the travel in a
+    larger unit are refused as well, or noted where that is uncertain, as with few poses. *units*
+    and standard deviations *sigma* (n_motors,) come from a dataset; without units, tables are in m
     and rad.
     """
     actuated = legs_with_readings(legs)
     noise = np.zeros(len(actuated)) if sigma is None else NOISY * sigma
-    given = table.numbers(str(leg.prismatic) for leg in actuated)
+    values = table.numbers(str(leg.prismatic) for leg in actuated)
     stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in actuated]
-    readings = np.empty_like(given)
+    readings = np.empty_like(values)
     for j, unit in enumerate(stated):
-        readings[:, j] = unit.values(given[:, j])
+        readings[:, j] = unit.values(values[:, j])
     notes = []
-    beyond: list[tuple[str, str, bool]] = []  # column, what was found of it, whether of many rows
-    each = zip(actuated, stated, given.T, readings.T, noise.tolist(), strict=True)
-    for leg, one, numbers, column, of_noise in each:
+    beyond: list[tuple[str, str, bool]] = []  # column, its values in words, whether in many rows
+    motor_columns = zip(actuated, stated, values.T, readings.T, noise.tolist(), strict=True)
+    for leg, unit_of_motor, numbers, column, of_noise in motor_columns:
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
         beyond_travel = np.maximum(lower - column, column - upper)
         outside = beyond_travel > max(ROUNDED * (upper - lower), of_noise)
         far = (beyond_travel > 0.0) & ~leg.in_travel(column)
-        unit_name, ends = one.name, sorted(map(one.reading, leg.travel))
+        unit_name, ends = unit_of_motor.name, sorted(map(unit_of_motor.reading, leg.travel))
         travel = f"{ends[0]:g} to {ends[1]:g} {unit_name} (the joint limits of the model)"
         if np.any(far):
-            found = (
+            actual = (
                 f"found {_some(table, numbers, far, unit_name)}, needed {travel} with a margin of "
             )
-            found += f"{TRAVEL_MARGIN:.0%}"
+            actual += f"{TRAVEL_MARGIN:.0%}"
             n = len(column)
             many = np.count_nonzero(far) >= max(MANY * n, min(FEWEST, n))
-            beyond.append((str(leg.prismatic), found, bool(many)))
+            beyond.append((str(leg.prismatic), actual, bool(many)))
         elif np.any(outside):
             notes.append(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
@@ -268,37 +269,37 @@ def readings_in(
     often = [name for name, _, most in beyond if most]
     cause = ""
     if often:
-        # whatever is outside lies inside once divided by enough: there it has to move, too
+        # A large divisor brings any readings into the travel: they must also move there.
         wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in often]
-        every = list(range(len(actuated)))
-        tries = (every, WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0), (every, 0.0)
+        all_motors = list(range(len(actuated)))
+        tries = (all_motors, WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0), (all_motors, 0.0)
         for some, least in tries:
             cause = cause or _likely_cause(
-                given[:, some],
+                values[:, some],
                 [actuated[j] for j in some],
                 [stated[j] for j in some],
                 in_dataset=units is not None,
                 least=least,
             )
     alike = often if cause else []
-    for name, found, _ in beyond:
+    for name, actual, _ in beyond:
         if name in alike[1:]:
             continue
         of_this, remedy = [name], "correct the readings or the limits"
         if name in alike:
             remedy = cause
             if len(alike) > 1:
-                of_this, found = alike, f"in {name} {found}"
+                of_this, actual = alike, f"in {name} {actual}"
         table.refuse_file(
             Problem(
-                f"readings are outside the travel: {found}",
+                f"readings are outside the travel: {actual}",
                 remedy=remedy,
                 file=str(table.path),
                 columns=tuple(of_this),
             )
         )
     if not beyond:
-        for doubt in doubted_units(given, readings, actuated, stated):
+        for doubt in doubted_units(values, readings, actuated, stated):
             if doubt.is_sure:
                 remedy = (
                     f"write readings: {doubt.other} in the dataset file, and convert them first "
@@ -312,16 +313,16 @@ def readings_in(
 
 
 class DoubtedUnit(NamedTuple):
-    """A unit in which readings hardly move, and a larger one in which they use the travel."""
+    """A unit in which readings hardly move, and a larger unit in which they use the travel."""
 
     columns: tuple[str, ...]
-    uses: str  # which part of the travel they use in either unit, in words
+    uses: str  # fraction of the travel in use in either unit, in words
     stated: str  # the unit
-    other: str  # the larger one
+    other: str  # the larger unit
     is_sure: bool
 
     def problem(self, path: Path, remedy: str) -> Problem:
-        """Return what refuses it."""
+        """Return the problem of a table with these readings."""
         return Problem(
             "the unit of the readings could not be decided",
             f"that they {self.uses}",
@@ -333,14 +334,14 @@ class DoubtedUnit(NamedTuple):
 
 
 def doubted_units(
-    given: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
+    values: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
 ) -> list[DoubtedUnit]:
-    """Return which columns hardly move in their unit and do in a larger one, and whether surely.
+    """Return the columns that hardly move in their unit but would in a larger unit.
 
     The largest units are never doubted, so that small motions can always be written in them.
     """
-    found = list[DoubtedUnit]()
-    n_poses = len(np.unique(given, axis=0))
+    doubts = list[DoubtedUnit]()
+    n_poses = len(np.unique(values, axis=0))
     for name in dict.fromkeys(unit.name for unit in units):
         some = [j for j, unit in enumerate(units) if unit.name == name]
         width = np.ptp([legs[j].travel for j in some], axis=1)
@@ -348,8 +349,8 @@ def doubted_units(
         if not n_poses or name not in sizes or not np.all((width > 0.0) & np.isfinite(width)):
             continue
         used = float(np.max(np.ptp(readings[:, some], axis=0) / width))
-        for other, size in sizes.items():
-            meant = size * given[:, some]
+        for other_unit, size in sizes.items():
+            meant = size * values[:, some]
             moved = float(np.mean(np.ptp(meant, axis=0) / width))
             if used >= HARDLY_MOVES or moved <= MAY_MOVE or size <= sizes[name]:
                 continue
@@ -358,26 +359,26 @@ def doubted_units(
             columns = tuple(str(legs[j].prismatic) for j in some)
             uses = (
                 f"use {100 * used:.2g} % of the travel in {name}, which is stated, and "
-                f"{100 * moved:.2g} % in {other}"
+                f"{100 * moved:.2g} % in {other_unit}"
             )
             is_sure = n_poses >= MIN_POSES and moved > SURELY_MOVES
-            found.append(DoubtedUnit(columns, uses, name, other, is_sure))
+            doubts.append(DoubtedUnit(columns, uses, name, other_unit, is_sure))
             break
-    return found
+    return doubts
 
 
 def _likely_cause(
-    given: Array,
+    values: Array,
     legs: Sequence[Leg],
     units: Sequence[ReadingUnit],
     *,
     in_dataset: bool,
     least: float = 0.0,
 ) -> str:
-    """Return what readings (n_rows, n_legs) look like, and the remedy; "" where it is not clear.
+    """Return the likely mistake in *values* (n_rows, n_legs) and the remedy; "" if unclear.
 
-    Of what would bring all of them into their travel, that with which they move in it most, and
-    more than a part of it. They are as the table has them, in *units*.
+    Among the corrections that bring all readings into their travel, it is the one with the largest
+    motion there, which must exceed the fraction *least*. The values are in *units*.
     """
     groups = dict.fromkeys(
         (leg.reads_angle, unit.name) for leg, unit in zip(legs, units, strict=True)
@@ -385,9 +386,9 @@ def _likely_cause(
     if len(groups) > 1:
         for group in sorted(groups, reverse=True):
             some = [j for j, unit in enumerate(units) if (legs[j].reads_angle, unit.name) == group]
-            chosen = [[of[j] for j in some] for of in (legs, units)]
+            chosen = [[sequence[j] for j in some] for sequence in (legs, units)]
             cause = _likely_cause(
-                given[:, some],
+                values[:, some],
                 *chosen,  # type: ignore[arg-type]
                 in_dataset=in_dataset,
                 least=least,
@@ -397,71 +398,71 @@ def _likely_cause(
         return ""
     name = units[0].name
     if legs[0].reads_angle:
-        tried = _as_angles(given, legs, units, in_dataset)
+        tried = _as_angles(values, legs, units, in_dataset)
     elif name == "m":
-        tried = _as_lengths(given, legs)
+        tried = _as_lengths(values, legs)
     else:
         tried = tuple(
-            (size * given, f"{other}: write readings: {other}")
+            (size * values, f"{other}: write readings: {other}")
             for other, size in LENGTH.items()
             if other != name
         )
     width = np.ptp([leg.travel for leg in legs], axis=1)
-    found, most = "", least
-    for meant, what in tried:
+    likely, most = "", least
+    for meant, meaning in tried:
         moved = float(np.mean(np.ptp(meant, axis=0) / width))
         if moved > most and np.all(in_travel(meant, legs)):
-            found, most = f"these look like {what}", moved
+            likely, most = f"these look like {meaning}", moved
     low, high = USUAL_PULSES
     if (
-        not found
+        not likely
         and legs[0].reads_angle
         and name != PULSES
-        and np.all((given > low) & (given < high))
+        and np.all((values > low) & (values < high))
     ):
-        found = "these look like pulses of servos in us: "
-        found += (
+        likely = "these look like pulses of servos in us: "
+        likely += (
             f"write readings: {{{legs[0].prismatic}: {{unit: us, centre_us: 1500, us_per_deg: "
             "11.1}, ...} in the dataset file, with the numbers of your servos"
             if in_dataset
             else "convert them to radians"
         )
-    return found
+    return likely
 
 
 def _as_angles(
-    given: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], in_dataset: bool
+    values: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], in_dataset: bool
 ) -> tuple[tuple[Array, str], ...]:
-    """Return what readings of motors that turn may be meant as, and how that is said."""
+    """Return possible corrections of readings of motors that turn [rad], with words for each."""
     name, degrees = units[0].name, np.degrees(1.0)
 
     def write(unit: str) -> str:
         return f"write readings: {unit} in the dataset file"
 
-    angles = np.column_stack([u.values(x) for u, x in zip(units, given.T, strict=True)])
+    angles = np.column_stack([u.values(x) for u, x in zip(units, values.T, strict=True)])
     pulses = [leg.actuator.pulses if leg.actuator is not None else None for leg in legs]
-    found: list[tuple[Array, str]] = []
+    meanings: list[tuple[Array, str]] = []
     if name == "rad":
         or_write = f", or {write('deg')}" if in_dataset else ""
-        found += [
-            (given / degrees, f"degrees: multiply them by pi/180{or_write}"),
-            (-given / degrees, "degrees with the opposite sign: multiply them by -pi/180"),
-            (given * degrees, "radians divided by 180/pi once too often: multiply by 180/pi"),
+        meanings += [
+            (values / degrees, f"degrees: multiply them by pi/180{or_write}"),
+            (-values / degrees, "degrees with the opposite sign: multiply them by -pi/180"),
+            (values * degrees, "radians divided by 180/pi once too often: multiply by 180/pi"),
         ]
     else:
-        found.append((given, f"radians: {write('rad')}"))
+        meanings.append((values, f"radians: {write('rad')}"))
         if name == PULSES:
-            found.append((given / degrees, f"degrees: {write('deg')}"))
+            meanings.append((values / degrees, f"degrees: {write('deg')}"))
     if name != PULSES and all(pulses):
-        meant = [p.angles(x) for p, x in zip(pulses, given.T, strict=True) if p is not None]
+        meant = [p.angles(x) for p, x in zip(pulses, values.T, strict=True) if p is not None]
         remedy = write(PULSES) if in_dataset else "convert them to radians"
-        found.append((np.column_stack(meant), f"pulses of servos in us: {remedy}"))
+        meanings.append((np.column_stack(meant), f"pulses of servos in us: {remedy}"))
     reverse = "reverse them" if name != PULSES else "give us_per_deg the other sign"
-    return (*found, (-angles, f"readings with the opposite sign: {reverse}"))
+    return (*meanings, (-angles, f"readings with the opposite sign: {reverse}"))
 
 
 def _as_lengths(readings: Array, legs: Sequence[Leg]) -> tuple[tuple[Array, str], ...]:
-    """Return what readings in metres may be meant as, and how that is said."""
+    """Return possible corrections of readings in metres, with words for each."""
     whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
     return (
         (LENGTH["mm"] * readings, "millimetres: divide them by 1000"),
@@ -478,18 +479,18 @@ def _as_lengths(readings: Array, legs: Sequence[Leg]) -> tuple[tuple[Array, str]
 
 def readings_of_lengths(lengths: Array, legs: Sequence[Leg]) -> Array:
     """Return the readings (n_rows, n_legs) of whole leg lengths (n_rows, n_legs) [m]."""
-    each = zip(legs, lengths.T, strict=True)
-    return np.array([leg.readings_at(column) for leg, column in each]).T
+    columns = zip(legs, lengths.T, strict=True)
+    return np.array([leg.readings_at(column) for leg, column in columns]).T
 
 
 def in_travel(readings: Array, legs: Sequence[Leg]) -> BoolArray:
-    """Return which readings (n_rows, n_legs) [m] are in the travel of their legs, or nearly."""
-    each = zip(legs, readings.T, strict=True)
-    return np.array([leg.in_travel(column) for leg, column in each], dtype=np.bool_).T
+    """Return a mask of the readings (n_rows, n_legs) [m] in the travel of their legs, or nearly."""
+    columns = zip(legs, readings.T, strict=True)
+    return np.array([leg.in_travel(column) for leg, column in columns], dtype=np.bool_).T
 
 
 def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
-    """Return the first of some readings with their rows, and how many more there are."""
+    """Return the first of some readings with their rows, and the number of further ones."""
     index = np.flatnonzero(chosen).tolist()
     places = table.places
     shown = ", ".join(f"{column[i]:g} {unit} in {places[i]}" for i in index[:_MAX_SHOWN])
@@ -508,9 +509,9 @@ def read_measurements(
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
 
-    Images are relative to ``folder``; whether they exist is not looked at. Columns of *unread*
-    motors, which are empty, are not those of a leg with a reading. Raises DatasetError with one
-    sentence for each thing that is wrong.
+    Images are relative to ``folder``; their existence is not checked. Columns of *unread* motors
+    are empty: *legs* have no readings of these. Raises DatasetError with one sentence for each
+    problem.
     """
     texts = [
         *(Column(name, "text", required=name != "pose") for name in _TEXTS),
@@ -527,8 +528,8 @@ def read_measurements(
     view_names, images = table.text("view"), table.text("image")
     for row, name in enumerate(view_names):
         if name not in view_index:
-            found, remedy = f"the unknown view {describe(name)}", closest(name, view_index)
-            table.refuse(row, found, "a view of the dataset file", "view", remedy=remedy)
+            unknown, remedy = f"the unknown view {describe(name)}", closest(name, view_index)
+            table.refuse(row, unknown, "a view of the dataset file", "view", remedy=remedy)
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
     sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
@@ -558,7 +559,7 @@ def read_measurements(
 def _refuse_images(table: Table, images: Sequence[str], folder: Path) -> None:
     """Refuse images that are named twice or lie outside the dataset folder."""
     first: dict[Path, int] = {}
-    targets: dict[str, Path | str] = {}  # of each image, or what is wrong with it
+    targets: dict[str, Path | str] = {}  # path of each image, or its problem in words
     for row, image in enumerate(images):
         if not image:
             continue
@@ -572,9 +573,9 @@ def _refuse_images(table: Table, images: Sequence[str], folder: Path) -> None:
             continue
         earlier = first.setdefault(target, row)
         if earlier != row:
-            found = f"it also in {table.places[earlier]}"
+            actual = f"it also in {table.places[earlier]}"
             needed, remedy = "one row an image", "remove one of them"
-            table.refuse(row, found, needed, "image", remedy=remedy, what=f"image {image}")
+            table.refuse(row, actual, needed, "image", remedy=remedy, what=f"image {image}")
 
 
 def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
@@ -593,7 +594,7 @@ def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
 def _shared_readings(
     table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: Array
 ) -> Array:
-    """Return the readings with those of one pose replaced by their mean."""
+    """Replace the readings of each pose by their mean."""
     joints = [column.name for column in reading_columns(legs)]
     units = [leg.reading_unit for leg in legs_with_readings(legs)]
     labels = table.text("pose")

@@ -1,10 +1,9 @@
 """A dataset made from a folder of photographs and a table as its owner keeps it.
 
-Columns are found by their headings, the unit by the heading or by the travel of the machine, and
-photographs by :mod:`legcal.data.photograph_matching`. All is checked before anything is written,
-and what is found is a :class:`NewDataset` that can be shown first. Photographs that lie in the
-dataset's folder already are named where they are; others are linked, or copied where the file
-system has no links.
+Columns are identified by their headings, the unit by the heading or by the travel of the machine,
+and photographs by :mod:`legcal.data.photograph_matching`. Everything is checked before anything is
+written; the result is a :class:`NewDataset` that can be shown first. Photographs in the dataset's
+folder stay where they are; others are linked, or copied where the file system has no links.
 """
 
 from __future__ import annotations
@@ -50,10 +49,10 @@ from legcal.vision.exif_camera import FOCAL_SIGMA, camera_of_photographs, rough_
 from legcal.vision.image_facts import read_facts
 from legcal.vision.image_file import BadImage, image_size, inspect_image
 
-DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # other files may stand beside it
+DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
-MIN_SIGMA = 2.5e-6  # mean leg lengths, of readings whose noise nobody stated
+MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
 
 
@@ -74,7 +73,7 @@ class MatchedImage(Document):
 
 
 class NewDatasetDocument(Document):
-    """What ``legcal init --json`` prints."""
+    """The document of ``legcal init --json``."""
 
     dataset: str
     mechanism: str
@@ -83,7 +82,7 @@ class NewDatasetDocument(Document):
     unit_from: str
     lengths: bool  # whether the table has lengths of legs, not readings
     matched: str
-    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] where one turns
+    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] if any motor turns
     views: dict[str, ViewToWrite]
     images: list[MatchedImage]
     notes: list[str]
@@ -99,15 +98,15 @@ class NewDataset:
     machine : Machine
         The nominal model.
     model : str
-        How ``dataset.yaml`` names it.
+        Its name in ``dataset.yaml``.
     folder, table, destination : Path
         Photographs, readings, and the dataset's folder.
     columns : dict
-        What each heading of the table is taken for: a joint, view, image, pose or time.
+        Meaning of each heading of the table: a joint, view, image, pose or time.
     are_lengths : bool
         Whether the table holds whole lengths of legs.
     rows : tuple of Row
-        What each row of the table says of its photograph.
+        The entries of each row of the table about its photograph.
     poses : tuple of str
         The pose of each row; empty where the table does not name them.
     matching : Matching
@@ -115,15 +114,15 @@ class NewDataset:
     views : tuple of str
         The view of each pair.
     readings : SheetReadings
-        Of the motors, in the order of their legs, and their unit in the table.
+        Readings of the motors, in the order of their legs, and their unit in the table.
     cameras : dict
         The camera file of each view.
     encoder_sigma : float or mapping
         One standard deviation of a reading [m], by joint [m or rad] where a motor turns.
     notes : tuple of str
-        What is odd, or was chosen.
+        Oddities, and choices that were made.
     made_cameras : mapping
-        Contents of camera files that are to be made, of what photographs say of their cameras.
+        Contents of camera files to write, from the metadata of photographs.
     """
 
     machine: Machine
@@ -149,7 +148,7 @@ class NewDataset:
         return [column.name for column in reading_columns(self.machine.legs)]
 
     def document(self, written: Sequence[Path]) -> dict[str, Any]:
-        """Return what ``legcal init --json`` prints, with the files that were written."""
+        """Return the document of ``legcal init --json``, with the files that were written."""
         return NewDatasetDocument(
             dataset=str(self.destination),
             mechanism=self.model,
@@ -176,15 +175,15 @@ class NewDataset:
 
     def place(self, photograph: Photograph) -> str:
         """Return the path of a photograph relative to the dataset's folder."""
-        real, here = photograph.path.resolve(), self.destination.resolve()
-        if real.is_relative_to(here):
-            return real.relative_to(here).as_posix()
+        real, destination = photograph.path.resolve(), self.destination.resolve()
+        if real.is_relative_to(destination):
+            return real.relative_to(destination).as_posix()
         return (PurePosixPath("images") / photograph.name).as_posix()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SheetOptions:
-    """What the owner of photographs and a table states beside them.
+    """Options of the user besides photographs and table.
 
     Attributes
     ----------
@@ -192,9 +191,9 @@ class SheetOptions:
         Camera files: one for all views, or ``VIEW=FILE`` for each; by default those beside the
         photographs.
     unit : str, optional
-        Of the readings: m, cm, mm, um, of motors that turn rad, mrad, deg or us (pulses of hobby
-        servos that the model describes); by default that of the headings, else found from the
-        travel.
+        Unit of the readings: m, cm, mm, um; for motors that turn rad, mrad, deg or us (pulses of
+        hobby servos that the model describes). By default the unit of the headings, else chosen by
+        the travel.
     lengths : bool
         Whether the table holds whole lengths of legs in place of readings.
     encoder_sigma : float, str or mapping, optional
@@ -228,12 +227,12 @@ def plan_new_dataset(
     destination : path
         The folder of the dataset.
     options : SheetOptions
-        What else is known.
+        Cameras, unit and noise.
 
     Raises
     ------
     DatasetError, ModelError, UsageError
-        With one sentence for each thing that is wrong.
+        With one sentence for each problem.
     """
     folder, path, destination = Path(folder), Path(readings), Path(destination)
     machine = load_mechanism(model)
@@ -242,18 +241,18 @@ def plan_new_dataset(
     by_names, pattern = with_likely_views(photographs)
     sheet = ReadingsSheet(path, machine, "photograph", columns_by_content(by_names))
     named = {view.casefold() for view in sheet.text("view") if view}
-    if named <= {one.folder.casefold() for one in by_names}:
+    if named <= {photograph.folder.casefold() for photograph in by_names}:
         photographs = by_names
     else:
         pattern = None  # the table names other views
-    found = sheet.readings(options.unit, lengths=options.lengths)
+    sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
     texts = (sheet.text(name) for name in ("image", "view", "time"))
     rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
     cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
     sigma, sigma_notes = _sigmas(
-        options.encoder_sigma, sheet.motors, found, MIN_SIGMA * machine.size
+        options.encoder_sigma, sheet.motors, sheet_readings, MIN_SIGMA * machine.size
     )
     views_stated = any(row.view for row in rows)
     return NewDataset(
@@ -268,7 +267,7 @@ def plan_new_dataset(
         poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,
         views=view_of,
-        readings=found,
+        readings=sheet_readings,
         cameras=cameras,
         encoder_sigma=sigma,
         notes=(
@@ -285,9 +284,9 @@ def plan_new_dataset(
 def _made_notes(
     cameras: Mapping[str, Path], made: Mapping[Path, tuple[Camera, str]]
 ) -> Iterator[str]:
-    """Yield that cameras are known by their focal length alone."""
+    """Yield notes on cameras with nothing but a focal length from photographs."""
     for path, (camera, _) in made.items():
-        views = [view for view, own in cameras.items() if own == path]
+        views = [view for view, camera_path in cameras.items() if camera_path == path]
         yield (
             f"The camera of {few_views(views)} is only known by the focal length in the EXIF data "
             f"of its photographs, {camera.K[0, 0]:.0f} px, taken as good to "
@@ -297,7 +296,7 @@ def _made_notes(
 
 
 def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str]) -> Iterator[str]:
-    """Yield how views were told apart that no column names, or how they may be."""
+    """Yield a note on the views where no column names them, and on alternatives."""
     if pattern is not None:
         yield (
             f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
@@ -319,30 +318,32 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
     Raises
     ------
     UsageError
-        If a file is there already and *force* is not given.
+        If a file exists already and *force* is not set.
     OutOfResources
-        If the folder does not take it.
+        If the folder cannot be written.
     """
     check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
     names |= {camera: camera.name for camera in new.made_cameras}
-    own = [DATASET_YAML, MEASUREMENTS, *names.values()]
+    dataset_files = [DATASET_YAML, MEASUREMENTS, *names.values()]
     linked = {
         new.place(photograph): photograph.path.resolve()
         for _, photograph in new.matching.pairs
         if not photograph.path.resolve().is_relative_to(new.destination.resolve())
     }
-    there = [name for name in [*own, *linked] if os.path.lexists(new.destination / name)]
+    existing = [
+        name for name in [*dataset_files, *linked] if os.path.lexists(new.destination / name)
+    ]
     contents = {
         names[camera]: new.made_cameras[camera].encode()
         if camera in new.made_cameras
         else camera.read_bytes()
         for camera in cameras
     }
-    if there and not force:
+    if existing and not force:
         raise UsageError(
-            f"{new.destination}: the dataset could not be written: found {few(there)} already "
+            f"{new.destination}: the dataset could not be written: found {few(existing)} already "
             "there, needed new files; give another folder with -o, or --force to replace them."
         )
     header = ["view", "image", *(["pose"] if new.poses else []), *new.joints]
@@ -366,7 +367,7 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         (folder / MEASUREMENTS).write_text(format_table(header, rows), encoding="utf-8")
         text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
         (folder / DATASET_YAML).write_text(with_schema("dataset", text), encoding="utf-8")
-    return [new.destination / name for name in own]
+    return [new.destination / name for name in dataset_files]
 
 
 def _link(path: Path, place: Path) -> None:
@@ -388,62 +389,62 @@ def _check_place(folder: Path, destination: Path) -> None:
 
 
 def _sigmas(
-    given: float | str | Mapping[str, float] | None,
+    stated: float | str | Mapping[str, float] | None,
     motors: Sequence[Leg],
     readings: SheetReadings,
-    least: float,  # where nobody states one [m]
+    least: float,  # minimum default [m]
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
     if not any(leg.reads_angle for leg in motors):
-        if isinstance(given, str):
-            given = parse_quantity(given, LENGTH, "--encoder-sigma")
-        if not isinstance(given, Mapping):
-            return _sigma(given, max(float(readings.digits.min()), least), least, motors)
-    if isinstance(given, Mapping):
+        if isinstance(stated, str):
+            stated = parse_quantity(stated, LENGTH, "--encoder-sigma")
+        if not isinstance(stated, Mapping):
+            return _sigma(stated, max(float(readings.digits.min()), least), least, motors)
+    if isinstance(stated, Mapping):
         for leg in motors:
-            _check_sigma(given.get(str(leg.prismatic), 0.0), leg)
-        return dict(given), []
-    found, notes = dict[str, float](), list[str]()
+            _check_sigma(stated.get(str(leg.prismatic), 0.0), leg)
+        return dict(stated), []
+    sigmas, notes = dict[str, float](), list[str]()
     for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
         name = str(leg.prismatic)
-        if given is not None:
+        if stated is not None:
             try:
-                found[name] = sigma_in(given, unit, leg)
+                sigmas[name] = sigma_in(stated, unit, leg)
             except ValueError as error:
                 raise UsageError(
                     "The standard deviation of a reading could not be used: " + str(error)
                 ) from None
         else:
-            found[name] = max(digit, usual_sigma(leg, least, unit))
-    if given is None:
-        said = [
+            sigmas[name] = max(digit, usual_sigma(leg, least, unit))
+    if stated is None:
+        shown = [
             f"{name} {sigma:.2g} {leg.reading_unit}"
-            for leg, (name, sigma) in zip(motors, found.items(), strict=True)
+            for leg, (name, sigma) in zip(motors, sigmas.items(), strict=True)
         ]
         why = "the last digit of the table, at least that of a good encoder"
         if any(map(are_commands, motors, readings.units)):
             why = "half a degree of what a hobby servo makes of its command"
         notes.append(
-            f"encoder_sigma is {few(said)}, {why}: give --encoder-sigma if readings are known "
+            f"encoder_sigma is {few(shown)}, {why}: give --encoder-sigma if readings are known "
             "better or worse."
         )
-    return found, notes
+    return sigmas, notes
 
 
 def _sigma(
-    given: float | None, usual: float, encoder: float, motors: Sequence[Leg]
+    stated: float | None, usual: float, encoder: float, motors: Sequence[Leg]
 ) -> tuple[float, list[str]]:
-    """Return the standard deviation of a reading [m], and a note where nobody stated it."""
-    if given is not None:
+    """Return the standard deviation of a reading [m], and a note if it is a default."""
+    if stated is not None:
         least, most = ENCODER_SIGMAS
-        if not least <= given <= most:
+        if not least <= stated <= most:
             raise UsageError(
-                f"The standard deviation of a reading could not be used: found {given:g} m, needed "
-                f"{least:g} to {most:g} m; correct --encoder-sigma."
+                f"The standard deviation of a reading could not be used: found {stated:g} m, "
+                f"needed {least:g} to {most:g} m; correct --encoder-sigma."
             )
         for leg in motors:
-            _check_sigma(given, leg)
-        return given, []
+            _check_sigma(stated, leg)
+        return stated, []
     why = "the last digit of the table" if usual > encoder else "that of a good encoder"
     return usual, [
         f"encoder_sigma is {1e6 * usual:.3g} um, {why}: give --encoder-sigma if "
@@ -451,9 +452,9 @@ def _sigma(
     ]
 
 
-def _check_sigma(given: float, leg: Leg) -> None:
+def _check_sigma(sigma: float, leg: Leg) -> None:
     """Refuse a standard deviation [m or rad] that no encoder has."""
-    if too_large := sigma_too_large(given, leg):
+    if too_large := sigma_too_large(sigma, leg):
         raise UsageError(
             f"The standard deviation of a reading could not be used: found {too_large[0]}, needed "
             f"{too_large[1]}; correct --encoder-sigma."
@@ -461,7 +462,7 @@ def _check_sigma(given: float, leg: Leg) -> None:
 
 
 def _view(row: Row, photograph: Photograph) -> str:
-    """Return the view of a pair: as the table says, else its folder."""
+    """Return the view of a pair: the entry of the table, else the folder."""
     return row.view or (photograph.folder if photograph.folder != "." else ONE_VIEW)
 
 
@@ -470,12 +471,12 @@ def _cameras(
     destination: Path,
     matching: Matching,
     view_of: Sequence[str],
-    given: Sequence[str],
+    options: Sequence[str],
 ) -> tuple[dict[str, Path], dict[Path, tuple[Camera, str]]]:
-    """Return the camera file of each view: as given, else beside its photographs or above them.
+    """Return the camera file of each view, and the cameras to make with contents of their files.
 
-    Where there is none, one is made of what photographs say of their focal length: such cameras
-    with the contents of their files come second. Photographs that do not fit theirs are refused.
+    It is an option, else a file beside the photographs or above them, else a camera made from the
+    focal length in the metadata of the photographs. Photographs of another size are refused.
     """
     views = list(dict.fromkeys(view_of))
     bad = sorted(view for view in views if not is_name(view))
@@ -484,8 +485,8 @@ def _cameras(
             f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
-    for_all = [text for text in given if "=" not in text or os.path.isfile(text)]
-    named = [text.split("=", 1) for text in given if text not in for_all]
+    for_all = [text for text in options if "=" not in text or os.path.isfile(text)]
+    named = [text.split("=", 1) for text in options if text not in for_all]
     of_one, problems = dict[str, str](), list[str]()
     for name, file in named:
         if of_one.setdefault(name, file) != file:
@@ -505,7 +506,7 @@ def _cameras(
         for name, path in of_one.items()
         if name not in views
     ]
-    found: dict[str, Path] = {}
+    path_of_view: dict[str, Path] = {}
     for view in views:
         beside = [p.path.parent for (_, p), name in zip(matching.pairs, view_of, strict=True)
                   if name == view]  # fmt: skip
@@ -515,19 +516,23 @@ def _cameras(
         text = of_one.get(view, for_all[0] if for_all else None)
         path = Path(text) if text else next((path for path in near if path.is_file()), None)
         if path is not None:
-            found[view] = path
+            path_of_view[view] = path
     made = dict[Path, tuple[Camera, str]]()
     for view in views:
-        own = [p.path for (_, p), name in zip(matching.pairs, view_of, strict=True) if name == view]
-        camera = None if view in found else _camera_by_exif(own)
+        view_images = [
+            p.path for (_, p), name in zip(matching.pairs, view_of, strict=True) if name == view
+        ]
+        camera = None if view in path_of_view else _camera_by_exif(view_images)
         if camera is not None:
             text = rough_camera_info(camera, "exif")
-            path = next((path for path, (_, other) in made.items() if other == text), None)
+            path = next(
+                (path for path, (_, other_text) in made.items() if other_text == text), None
+            )
             if path is None:
                 path = destination / f"camera_exif{f'_{len(made) + 1}' * bool(made)}.yaml"
                 made[path] = camera, text
-            found[view] = path
-    missing = [view for view in views if view not in found]
+            path_of_view[view] = path
+    missing = [view for view in views if view not in path_of_view]
     if missing:
         problems.append(
             f"{folder}: the camera of view{'s' * (len(missing) > 1)} {few(missing)} could not be "
@@ -540,30 +545,32 @@ def _cameras(
         raise DatasetError(problems)
     read = {
         path: made[path][0] if path in made else read_camera(path)
-        for path in dict.fromkeys(found.values())
+        for path in dict.fromkeys(path_of_view.values())
     }
     unusable = [
         problem
         for (_, photograph), view in zip(matching.pairs, view_of, strict=True)
-        if (problem := inspect_image(photograph.path, read[found[view]])[1]) is not None
+        if (problem := inspect_image(photograph.path, read[path_of_view[view]])[1]) is not None
     ]
     if unusable:
         raise DatasetError(unusable)
-    return found, made
+    return path_of_view, made
 
 
 def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:
-    """Return the camera of photographs by what they say of it; None where they say too little."""
+    """Return the camera from the metadata of photographs; None if these are insufficient."""
     contents = [read_bytes(path, MAX_IMAGE) for path in paths]
     try:
         size = image_size(contents[0])
     except BadImage:
         return None
-    return camera_of_photographs([read_facts(one) for one in contents], size.width, size.height)
+    return camera_of_photographs(
+        [read_facts(content) for content in contents], size.width, size.height
+    )
 
 
 def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
-    """Return how a dataset names its model: a path relative to it, or the name of a shipped one."""
+    """Return the name of a model in a dataset: a relative path, or the name of a shipped model."""
     if str(model) in shipped_names() and not os.path.isfile(model):
         return str(model)
     return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()

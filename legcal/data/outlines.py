@@ -37,25 +37,25 @@ from legcal.vision.camera import Camera
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera
 MEASURED = (*QUALITY, *ENCODING, "polish")
-MAX_OFF = 0.5  # of the outlines off their lines, from which on the table is wrong, not they
-MIN_NEAR = 0.9  # of the outlines near their lines, if the table is taken otherwise
+MAX_OFF = 0.5  # fraction of outlines off their lines from which on the whole table is wrong
+MIN_NEAR = 0.9  # minimum fraction of outlines near their lines for another reading of the table
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
 
-MAX_POLISH = 4.0  # log likelihood ratio by which one outline speaks for or against polish at most
-UNIT_EXACT = 1e-12  # |h| as computed; it is kept as it stands
-UNIT_TOLERANCE = 1e-3  # |h| as written with few digits; it is normalised
+MAX_POLISH = 4.0  # maximum log likelihood ratio of one outline for or against polish
+UNIT_EXACT = 1e-12  # tolerance of |h| = 1 up to which h is kept as it is
+UNIT_TOLERANCE = 1e-3  # tolerance of |h| = 1 written with few digits; h is normalised
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it
-MIN_PIECE = 0.1  # [px] between the ends: the direction of a shorter one is only rounding
-SIGMA_RANGE = (1e-5, 100.0)  # [px] of offsets: none is known better, and worse says nothing
+MIN_PIECE = 0.1  # [px] between the ends: the direction of a shorter piece is only rounding
+SIGMA_RANGE = (1e-5, 100.0)  # [px] plausible standard deviations of offsets
 
 VERDICT_COLUMNS = (
     Column("verdict", "text", choices=VERDICTS, remedy="correct it"),
     Column("reason", "text"),
     Column("source", "text", choices=SOURCES, remedy="correct it"),
 )
-DETAIL_COLUMN = Column("detail", "text", required=False)  # of the reason
+DETAIL_COLUMN = Column("detail", "text", required=False)  # detail of the reason
 UNLESS_REJECTED = "correct it or set the verdict to rejected with an empty cell"
 _LEAVE = "correct it or leave it empty"
 OUTLINE_COLUMNS = (
@@ -81,23 +81,23 @@ OUTLINE_COLUMNS = (
 class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
 
-    How well an outline was seen and how it depends on the gamma are NaN where nothing was found
+    The quality of an outline and its dependence on the gamma are NaN where detection failed
     and for outlines that were given or edited (:func:`unmeasured`).
     """
 
     leg: IntArray  # (n,) of the mechanism
     part: tuple[str, ...]  # the URDF link of the cylinder
     edge: IntArray  # (n,) 1 where epsilon of eq (5) is +1, 2 where it is -1
-    h: Array  # (n, 3) unit normal in the camera, h . M = epsilon R (3); NaN where not found
+    h: Array  # (n, 3) unit normal in the camera, h . M = epsilon R (3); NaN where detection failed
     ends: Array  # (n, 2, 2) of the used piece [px], the first nearer to the base joint
     covariance: Array  # (n, 2, 2) of the offsets of the line, normal to itself, there [px^2]
     used: BoolArray  # (n,)
-    reason: tuple[Rejection, ...]  # why an outline was rejected; false for used ones
+    reason: tuple[Rejection, ...]  # reasons of rejections; false for used outlines
     source: tuple[str, ...]  # detected or edited
     contrast: Array  # (n,) median step to the leg [grey levels]
     length: Array  # (n,) seen on the line, without gaps [px]
     residual: Array  # (n,) robust standard deviation of the edge about it [px]
-    gamma: Array  # (n,) of the camera, with which it was measured
+    gamma: Array  # (n,) gamma of the camera in the measurement
     by_gamma: Array  # (n,) shift inwards with log gamma [px]
     polish: Array  # (n,) log likelihood ratio of a polished surface over a matte one
 
@@ -113,14 +113,15 @@ class Outlines(ImageTable):
 
 
 def unmeasured(n: int) -> dict[str, Array]:
-    """Return what is known of how well n outlines were seen that nobody measured: nothing."""
+    """Return the columns of quality (n,) of outlines without a measurement: NaN."""
     return {name: np.full(n, np.nan) for name in MEASURED}
 
 
 def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
-    """Return the legs and parts whose used outlines are those of polished surfaces.
+    """Return the legs and parts with a polished surface.
 
-    By the likelihood ratios of all together, no one of which counts for more than so much.
+    Decided by the sum of the log likelihood ratios of their used outlines, each clipped to
+    ``MAX_POLISH``.
     """
     evidence: dict[tuple[int, str], float] = {}
     used = np.flatnonzero(outlines.used & np.isfinite(outlines.polish)).tolist()
@@ -134,24 +135,25 @@ def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
 def through_cameras(
     outlines: Outlines, view: IntArray, measured: Sequence[Camera], wanted: Sequence[Camera]
 ) -> Outlines:
-    """Return outlines that were measured with some cameras as other cameras have them.
+    """Return outlines that were measured with some cameras, recomputed for other cameras.
 
-    The ends stay where they are in the image, and the planes go through them. *view* is that of
-    each outline, and has a camera in either sequence.
+    The ends keep their pixels, and the planes go through them. *view* is the view of each outline,
+    and has a camera in either sequence.
     """
     h = outlines.h.copy()
     for v in np.unique(view).tolist():
-        at = np.flatnonzero((view == v) & np.isfinite(outlines.h).all(axis=1))
-        one, two = ((camera[v].K, camera[v].distortion) for camera in (measured, wanted))
-        if len(at) == 0 or all(map(np.array_equal, one, two)):
+        indices = np.flatnonzero((view == v) & np.isfinite(outlines.h).all(axis=1))
+        old_lens, new_lens = ((camera[v].K, camera[v].distortion) for camera in (measured, wanted))
+        if len(indices) == 0 or all(map(np.array_equal, old_lens, new_lens)):
             continue
         before, after = (
-            _plane_through(camera[v].undistort(outlines.ends[at])) for camera in (measured, wanted)
+            _plane_through(camera[v].undistort(outlines.ends[indices]))
+            for camera in (measured, wanted)
         )
         size = np.linalg.norm(after, axis=1)
-        size *= np.sign(np.sum(before * outlines.h[at], axis=1))
-        there = size != 0.0
-        h[at[there]] = after[there] / size[there, None]
+        size *= np.sign(np.sum(before * outlines.h[indices], axis=1))
+        has_plane = size != 0.0
+        h[indices[has_plane]] = after[has_plane] / size[has_plane, None]
     return replace(outlines, h=h)
 
 
@@ -185,7 +187,7 @@ def join_outlines(tables: Sequence[Outlines]) -> Outlines:
 
 
 def is_edited(outlines: Outlines) -> BoolArray:
-    """Return which outlines were corrected by hand."""
+    """Return a mask (n,) of the outlines that were corrected by hand."""
     return np.array([source == "edited" for source in outlines.source], dtype=np.bool_)
 
 
@@ -202,13 +204,13 @@ def merge_edited(detected: Outlines, table: Outlines) -> Outlines:
 
 
 def along_legs(outlines: Outlines, legs: Sequence[Leg]) -> Outlines:
-    """Return the outlines of what lies along legs: without those of arms."""
+    """Return the outlines of cylinders along legs, without outlines of arms."""
     arms = are_of_arms(outlines, legs)
     return outlines.choose(~arms) if arms.any() else outlines
 
 
 def are_of_arms(outlines: Outlines, legs: Sequence[Leg]) -> BoolArray:
-    """Return which outlines are of arms, (n,)."""
+    """Return a mask (n,) of the outlines of arms."""
     parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
     return np.array([legs[j].is_arm(part) for j, part in parts], dtype=np.bool_)
 
@@ -216,7 +218,7 @@ def are_of_arms(outlines: Outlines, legs: Sequence[Leg]) -> BoolArray:
 def reject_unused_legs(
     outlines: Outlines, measurements: Measurements, leg_names: Sequence[str]
 ) -> Outlines:
-    """Return outlines with those rejected whose leg the dataset leaves out of their view."""
+    """Reject outlines of legs that the dataset excludes from their view."""
     views = [measurements.views[v] for v in measurements.view[outlines.row].tolist()]
     names = [leg_names[leg] for leg in outlines.leg.tolist()]
     used = [view.uses(name) for view, name in zip(views, names, strict=True)]
@@ -275,10 +277,10 @@ def read_observations(
 ) -> Outlines:
     """Return the table ``observations.csv`` in the order of the file.
 
-    (a, b, c) is normalised; the ends are put in order, nearer to the base joint first, as the
-    sign of eq (3) has it. With ``skip_stale``, detected outlines of images, legs or parts that
-    are no longer there are left out, as in a table that legcal wrote for an earlier state of the
-    dataset. Raises DatasetError with one sentence for each thing that is wrong.
+    (a, b, c) is normalised; the ends are put in order, nearer to the base joint first, according to
+    the sign of eq (3). With ``skip_stale``, detected outlines of images, legs or parts that no
+    longer exist are left out, as in a table that legcal wrote for an earlier state of the dataset.
+    Raises DatasetError with one sentence for each problem.
     """
     leg_names = [leg.name for leg in legs]
     parts = [list(leg.radius_of_part) for leg in legs]
@@ -286,21 +288,21 @@ def read_observations(
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:
         row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-        known = np.array(
+        exists = np.array(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
         )
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
-        table.keep((known & (row >= 0)) | ~detected)
+        table.keep((exists & (row >= 0)) | ~detected)
     row, leg = find_rows(table, measurements), find_legs(table, leg_names)
     refuse_unknown_rows(table, row, measurements)
     refuse_unknown_legs(table, leg, leg_names)
     part = table.text("part")
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]]:
-            found = f"the unknown part {describe(part[i])}"
+            unknown_part = f"the unknown part {describe(part[i])}"
             needed = f"a link with a cylinder of {leg_names[leg[i]]}"
-            table.refuse(i, found, needed, "part", remedy=closest(part[i], parts[leg[i]]))
+            table.refuse(i, unknown_part, needed, "part", remedy=closest(part[i], parts[leg[i]]))
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     edited = np.array([source == "edited" for source in table.text("source")], dtype=np.bool_)
     table.need(NUMBERS, used)
@@ -325,7 +327,7 @@ def read_observations(
         used,
         tuple(map(read_rejection, table.text("reason"), table.text("detail"))),
         table.text("source"),
-        *measured,  # what detection found, which an edited row no longer is
+        *measured,  # results of detection, which do not apply to edited rows
     )
     outlines = _order_ends(outlines, measurements)
     _refuse_ends_off_line(table, outlines, measurements)
@@ -339,36 +341,36 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
         a, b, c, u0, v0, u1, v1, s00, s01, s11 = numbers[i].tolist()
         norm = math.hypot(a, b, c)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
-            found, remedy = f"a vector of norm {norm:.6g}", "divide the three by their norm"
-            table.refuse(i, found, "a unit vector", "a", "b", "c", remedy=remedy)
+            actual, remedy = f"a vector of norm {norm:.6g}", "divide the three by their norm"
+            table.refuse(i, actual, "a unit vector", "a", "b", "c", remedy=remedy)
         length = math.hypot(u1 - u0, v1 - v0)
         if length < MIN_PIECE:
-            found = f"ends {length:.3g} px apart" if length else "both ends at the same pixel"
+            actual = f"ends {length:.3g} px apart" if length else "both ends at the same pixel"
             needed = "two ends of a piece of the edge"
-            table.refuse(i, found, needed, "u0", "v0", "u1", "v1", remedy="correct them")
+            table.refuse(i, actual, needed, "u0", "v0", "u1", "v1", remedy="correct them")
         if not (s00 > 0.0 and s11 > 0.0 and s00 * s11 > s01 * s01):
-            found = f"a covariance that is not positive definite ({s00:g}, {s01:g}, {s11:g})"
+            actual = f"a covariance that is not positive definite ({s00:g}, {s01:g}, {s11:g})"
             needed = "variances of the offsets at both ends [px^2]"
-            table.refuse(i, found, needed, "s00", "s01", "s11", remedy="correct them")
+            table.refuse(i, actual, needed, "s00", "s01", "s11", remedy="correct them")
             continue
         largest = 0.5 * (s00 + s11 + math.hypot(s00 - s11, 2.0 * s01))
         least = s00 * (s11 / largest) - s01 * (s01 / largest)  # the determinant is their product
         fewest, most = SIGMA_RANGE[0], min(SIGMA_RANGE[1], max(length, MIN_PIECE))
         if not (least >= fewest**2 and largest <= most**2):
             sigmas = math.sqrt(max(least, 0.0)), math.sqrt(largest)
-            found = f"offsets known to between {sigmas[0]:.3g} and {sigmas[1]:.3g} px"
+            actual = f"offsets known to between {sigmas[0]:.3g} and {sigmas[1]:.3g} px"
             needed = f"standard deviations from {fewest:g} to {most:.3g} px"
             remedy = "write px^2, or set the verdict to rejected"
-            table.refuse(i, found, needed, "s00", "s01", "s11", remedy=remedy)
+            table.refuse(i, actual, needed, "s00", "s01", "s11", remedy=remedy)
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:
     """Return the ends of outlines on the sensor plane, (n, 2, 2)."""
     xy = np.full(outlines.ends.shape, np.nan)
     view = measurements.view[outlines.row]
-    known = np.all(np.isfinite(outlines.ends), axis=(1, 2))
+    has_ends = np.all(np.isfinite(outlines.ends), axis=(1, 2))
     for v in np.unique(view):
-        chosen = (view == v) & known
+        chosen = (view == v) & has_ends
         if np.any(chosen):
             xy[chosen] = measurements.views[v].camera.undistort(outlines.ends[chosen])
     return xy
@@ -414,28 +416,28 @@ def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measur
         )
         return
     for i in np.flatnonzero(off).tolist():
-        found = f"ends {offset[i]:.3g} px from the line (a, b, c)"
+        actual = f"ends {offset[i]:.3g} px from the line (a, b, c)"
         needed, remedy = f"at most {LINE_TOLERANCE_PX:g} px", "correct the line or its ends"
-        table.refuse(i, found, needed, *NUMBERS[:7], remedy=remedy)
+        table.refuse(i, actual, needed, *NUMBERS[:7], remedy=remedy)
 
 
 def _likely_form(outlines: Outlines, measurements: Measurements) -> str:
-    """Return what outlines look like whose ends are off their lines; "" where it is not clear."""
+    """Return the likely mistake in a table of outlines off their lines, in words; "" if unclear."""
     near: dict[str, int] = {}
     for v in np.unique(measurements.view[outlines.row]):
-        own = outlines.choose(measurements.view[outlines.row] == v)
+        view_rows = outlines.choose(measurements.view[outlines.row] == v)
         camera = measurements.views[v].camera
-        for what, h, xy in _forms(camera, own.h, own.ends):
+        for form, h, xy in _forms(camera, view_rows.h, view_rows.ends):
             offset = np.abs(camera.line_offset(h[:, None], xy)).max(axis=1)
-            near[what] = near.get(what, 0) + int(np.sum(offset <= LINE_TOLERANCE_PX))
-    best = max(near, key=lambda what: near[what], default="")
+            near[form] = near.get(form, 0) + int(np.sum(offset <= LINE_TOLERANCE_PX))
+    best = max(near, key=lambda form: near[form], default="")
     return best if near.get(best, 0) >= MIN_NEAR * len(outlines) else ""
 
 
 def _forms(camera: Camera, h: Array, ends: Array) -> Iterator[tuple[str, Array, Array]]:
-    """Yield what people write in place of lines (n, 3) and ends (n, 2, 2) [px], and what it means.
+    """Yield common mistakes in writing lines (n, 3) and ends (n, 2, 2) [px], with corrected values.
 
-    Ends are on the sensor plane then.
+    Corrected ends are on the sensor plane.
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     xy = camera.undistort(ends)

@@ -23,10 +23,10 @@ class Override:
     """An override of one parameter, or of all that a pattern matches."""
 
     name: str  # or a pattern
-    action: Action  # what to do with it
+    action: Action
     where: str  # its place, as the start of a sentence about it
     stated: Quantity | None = None  # the prior, or the value that it is fixed at
-    in_file: bool = False  # given in ``dataset.yaml``, over which those of a run take precedence
+    in_file: bool = False  # stated in ``dataset.yaml``; overrides of a run take precedence
 
 
 def overrides_of_call(
@@ -34,7 +34,7 @@ def overrides_of_call(
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
 ) -> tuple[Override, ...]:
-    """Return what the arguments of a call or the options of a command ask for."""
+    """Return the overrides in the arguments of a call or the options of a command."""
     entries: list[tuple[Action, str, object]] = []
     if isinstance(priors, Mapping):
         entries += [("prior", str(name), value) for name, value in priors.items()]
@@ -42,18 +42,18 @@ def overrides_of_call(
         entries += [("prior", text, None) for text in _listed(priors)]
     entries += [("fixed", text, None) for text in _listed(fixed)]
     entries += [("free", text, None) for text in _listed(free)]
-    found: list[Override] = []
+    overrides: list[Override] = []
     problems: list[str] = []
     for action, text, value in entries:
         word = "length" if action == "prior" and ":" in text else _WORDS[action]
-        where = f"The {word} {describe(text)}"
+        start = f"The {word} {describe(text)}"
         try:
-            found.append(read_override(action, text, where, value))
+            overrides.append(read_override(action, text, start, value))
         except ValueError as error:
-            problems.append(f"{where} could not be used: {error}")
+            problems.append(f"{start} could not be used: {error}")
     if problems:
         raise UsageError(problems)
-    return tuple(found)
+    return tuple(overrides)
 
 
 def overrides_of_settings(texts: Iterable[str]) -> dict[str, list[str]]:
@@ -62,22 +62,22 @@ def overrides_of_settings(texts: Iterable[str]) -> dict[str, list[str]]:
     ``NAME`` and ``NAME=VALUE`` fix a parameter, ``NAME=VALUE±SIGMA`` is a prior, and ``NAME=free``
     estimates the parameter without one.
     """
-    found: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
+    arguments: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
     for text in texts:
         name, _, value = text.rpartition("=")
         if name and value.strip().casefold() == "free":
-            found["free"].append(name)
+            arguments["free"].append(name)
         elif name and any(sign in value for sign in ("±", "+-", "+/-")):
-            found["priors"].append(text)
+            arguments["priors"].append(text)
         else:
-            found["fixed"].append(text)
-    return found
+            arguments["fixed"].append(text)
+    return arguments
 
 
 def read_override(
     action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
 ) -> Override:
-    """Return an override as it was written."""
+    """Parse an override."""
     name, stated = text, None
     if value is not None:
         stated = read_prior(value)
@@ -92,5 +92,5 @@ def read_override(
 
 
 def _listed(texts: Iterable[str]) -> list[str]:
-    """Return texts as a list; a single text is one of them."""
+    """Return texts as a list; a single text counts as one element."""
     return [texts] if isinstance(texts, str) else [str(text) for text in texts]

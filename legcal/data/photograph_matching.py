@@ -1,9 +1,9 @@
-"""Which photograph belongs to which row of a table, as people name, order or time them.
+"""Match photographs to the rows of a table by name, time or order.
 
-Names are compared the strictest way that finds every row: the file name, the name without its
-extension, the last number of the name; their case does not count unless it decides, and of files
-named alike those count whose folders are named alike too. Without names the times are compared, or
-the rows are those of the photographs in order (numbers in names count as numbers).
+Names are compared in the strictest way that matches every row: the file name, the name without its
+extension, the last number of the name. Their case only breaks ties, and among files of equal name
+the folders decide. Without names, times are compared; without times, rows and photographs are
+matched in order (numbers in names count as numbers).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from legcal.vision.image_facts import read_facts
 from legcal.vision.image_file import CONVERT, CONVERT_HEIC, FOREIGN_SUFFIXES, image_suffixes
 
 MAX_PHOTOGRAPHS = 50_000
-MAX_VIEWS = 12  # that names of photographs are taken for
+MAX_VIEWS = 12  # maximum number of views guessed from names of photographs
 _SEPARATORS = " _-."
 _NUMBERS = re.compile(r"(\d+)", re.ASCII)
 _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
@@ -33,25 +33,25 @@ _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image file, and where it stands in the folder that was given."""
+    """An image file and its place in the folder of photographs."""
 
     path: Path
     name: str  # relative to that folder, with "/"
-    view: str = ""  # by a pattern of names
-    label: str = ""  # what the pattern leaves of the name without the view
+    view: str = ""  # from a pattern of names
+    label: str = ""  # rest of the name without the view
 
     @property
     def folder(self) -> str:
-        """What has the photographs of a view: the view by a pattern of names, else the folder.
+        """The group of photographs of one view: the view in the name, else the folder.
 
-        That folder is relative to the given one; "." for it.
+        The folder is relative to the folder of photographs, "." for that folder itself.
         """
         return self.view or PurePosixPath(self.name).parent.as_posix()
 
 
 @dataclass(frozen=True)
 class Row:
-    """What a row of the table says of its photograph; "" for nothing."""
+    """The entries of a row of the table about its photograph; "" for none."""
 
     where: Place
     image: str
@@ -61,15 +61,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Matching:
-    """The photographs of rows: a row has one in each view, or one in all."""
+    """The photographs of rows: one for each row and view, or one for each row."""
 
     pairs: tuple[tuple[int, Photograph], ...]  # in the order of views and rows
-    how: str  # in words
+    how: str  # method of matching, in words
     notes: tuple[str, ...] = ()
 
 
 class ViewPattern:
-    """Which part of a file name is the view: ``{view}_*`` of ``left_012.jpg``."""
+    """A pattern of file names with their view: ``{view}_*`` for ``left_012.jpg``."""
 
     def __init__(self, pattern: str) -> None:
         before, after = (
@@ -79,35 +79,40 @@ class ViewPattern:
 
     def of(self, photograph: Photograph) -> Photograph | None:
         """Return a photograph with its view, or None if its name has another form."""
-        found = self._form.fullmatch(PurePosixPath(photograph.name).stem)
-        if found is None:
+        parts = self._form.fullmatch(PurePosixPath(photograph.name).stem)
+        if parts is None:
             return None
-        label = found["before"] + found["after"]
-        return replace(photograph, view=found["view"], label=label.strip(_SEPARATORS))
+        label = parts["before"] + parts["after"]
+        return replace(photograph, view=parts["view"], label=label.strip(_SEPARATORS))
 
 
 def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
-    """Return photographs with the views that their names have, and the pattern of these.
+    """Return photographs with the views in their names, and the pattern of names.
 
-    They are as given and the pattern is None where names do not look so, or where folders name the
-    views. Numbers may be anything and name no views here.
+    They are unchanged and the pattern is None where names do not follow a pattern or where folders
+    name the views. Numbers are not accepted as names of views.
     """
     pattern = likely_pattern(photographs)
-    if pattern is None or any(one.folder != "." for one in photographs):
+    if pattern is None or any(photograph.folder != "." for photograph in photographs):
         return list(photographs), None
     form = ViewPattern(pattern)
-    found = [one for photograph in photographs if (one := form.of(photograph)) is not None]
-    if all(one.view.isdecimal() for one in found):
+    with_views = [named for photograph in photographs if (named := form.of(photograph)) is not None]
+    if all(photograph.view.isdecimal() for photograph in with_views):
         return list(photographs), None
-    return found, pattern
+    return with_views, pattern
 
 
 def columns_by_content(
     photographs: Sequence[Photograph],
 ) -> dict[str, Callable[[Sequence[str]], bool]]:
-    """Return what tells by the cells of a column that it names photographs, or their views."""
-    stems = {_stem(text) for one in photographs for text in (one.name, one.label) if text}
-    views = {one.folder.casefold() for one in photographs} - {"."}
+    """Return predicates on the cells of a column: whether it names photographs, or views."""
+    stems = {
+        _stem(text)
+        for photograph in photographs
+        for text in (photograph.name, photograph.label)
+        if text
+    }
+    views = {photograph.folder.casefold() for photograph in photographs} - {"."}
 
     def are_photographs(cells: Sequence[str]) -> bool:
         named = [_stem(cell) for cell in cells if cell]
@@ -121,16 +126,20 @@ def columns_by_content(
 
 
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
-    """Return a pattern by which names in one folder are those of several views, as many of each.
+    """Return a pattern that splits names in one folder into several views of equal size.
 
-    Names of views are words rather than numbers, and few.
+    Patterns with words as views are preferred to numbers, and then patterns with few views.
     """
     likely: list[tuple[bool, int, int, str]] = []
     for pattern in ("{view}_*", "{view}-*", "*_{view}", "*-{view}"):
         form, labels = ViewPattern(pattern), dict[str, set[str]]()
-        named = [one for photograph in photographs if (one := form.of(photograph)) is not None]
-        for one in named:
-            labels.setdefault(one.view, set()).add(one.label)
+        named = [
+            named_photograph
+            for photograph in photographs
+            if (named_photograph := form.of(photograph)) is not None
+        ]
+        for named_photograph in named:
+            labels.setdefault(named_photograph.view, set()).add(named_photograph.label)
         sizes = {len(of_view) for of_view in labels.values()}
         if len(named) == len(photographs) and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1:
             are_numbers = all(view.isdecimal() for view in labels)
@@ -142,9 +151,9 @@ def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
 def find_photographs(folder: Path) -> list[Photograph]:
     """Return the images in a folder and in the folders in it, in the order of their names."""
     if not os.path.isdir(folder):
-        found = "a file" if os.path.exists(folder) else "no such folder"
+        actual = "a file" if os.path.exists(folder) else "no such folder"
         raise DatasetError(
-            f"{folder}: the photographs could not be found: found {found}, needed the folder that "
+            f"{folder}: the photographs could not be found: found {actual}, needed the folder that "
             "holds them; check the path."
         )
     suffixes = image_suffixes()
@@ -152,10 +161,10 @@ def find_photographs(folder: Path) -> list[Photograph]:
     foreign: list[str] = []
     for above, inside, files in os.walk(folder):
         inside[:] = sorted(name for name in inside if not name.startswith("."))
-        here = Path(above).relative_to(folder)
+        relative_folder = Path(above).relative_to(folder)
         for name in (name for name in files if not name.startswith(".")):
             suffix = Path(name).suffix.lower()
-            file = Photograph(Path(above) / name, (here / name).as_posix())
+            file = Photograph(Path(above) / name, (relative_folder / name).as_posix())
             if suffix in suffixes:
                 photographs.append(file)
             elif suffix in FOREIGN_SUFFIXES:
@@ -166,13 +175,13 @@ def find_photographs(folder: Path) -> list[Photograph]:
                 "needed fewer; give the folder of one calibration."
             )
     if not photographs:
-        found, remedy = "none", "check the path"
+        actual, remedy = "none", "check the path"
         if foreign:
-            found = f"{len(foreign)} of another format ({few(foreign)})"
+            actual = f"{len(foreign)} of another format ({few(foreign)})"
             are_heic = any(name.lower().endswith(HEIC_SUFFIXES) for name in foreign)
             remedy = CONVERT_HEIC if are_heic else CONVERT
         raise DatasetError(
-            f"{folder}: the photographs could not be found: found {found}, needed PNG, JPEG or "
+            f"{folder}: the photographs could not be found: found {actual}, needed PNG, JPEG or "
             f"TIFF files there or in folders in it; {remedy}."
         )
     return sorted(photographs, key=lambda photograph: in_order(photograph.name))
@@ -187,7 +196,7 @@ def in_order(name: str) -> tuple[object, ...]:
 
 
 def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
-    """Return which photograph belongs to which row: by name, else by time, else in order.
+    """Match photographs to rows: by name, else by time, else in order.
 
     Parameters
     ----------
@@ -203,12 +212,12 @@ def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) ->
         If rows have no photograph, or more than one in a view.
     """
     if any(row.image for row in rows):
-        found = _by_name(rows, photographs, table)
+        matching = _by_name(rows, photographs, table)
     elif any(row.time for row in rows):
-        found = _by_time(rows, photographs, table)
+        matching = _by_time(rows, photographs, table)
     else:
-        found = _in_order(rows, photographs, table)
-    used = {photograph.name for _, photograph in found.pairs}
+        matching = _in_order(rows, photographs, table)
+    used = {photograph.name for _, photograph in matching.pairs}
     bad = sorted(name for name in used if not is_name(name))
     if bad:
         raise DatasetError(
@@ -216,14 +225,14 @@ def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) ->
             f"tables cannot show, needed {NAME_NEEDED}; rename the file."
         )
     spare = [photograph.name for photograph in photographs if photograph.name not in used]
-    notes = found.notes
+    notes = matching.notes
     if spare:
-        one = len(spare) == 1
+        is_single = len(spare) == 1
         notes += (
-            f"{len(spare)} photograph{'' if one else 's'} {'has' if one else 'have'} no row and "
-            f"{'is' if one else 'are'} left out: {few(spare)}.",
+            f"{len(spare)} photograph{'' if is_single else 's'} {'has' if is_single else 'have'} "
+            f"no row and {'is' if is_single else 'are'} left out: {few(spare)}.",
         )
-    return Matching(found.pairs, found.how, notes)
+    return Matching(matching.pairs, matching.how, notes)
 
 
 def _path(text: str) -> str:
@@ -241,8 +250,8 @@ def _stem(text: str) -> str:
 
 
 def _number(text: str) -> str:
-    found = _NUMBERS.findall(_stem(text))
-    return str(int(found[-1])) if found else ""
+    numbers = _NUMBERS.findall(_stem(text))
+    return str(int(numbers[-1])) if numbers else ""
 
 
 _KEYS: tuple[tuple[str, Callable[[str], str]], ...] = (
@@ -253,14 +262,16 @@ _KEYS: tuple[tuple[str, Callable[[str], str]], ...] = (
 
 
 def _alike(photograph: Photograph, text: str) -> tuple[int, bool]:
-    """Return how many folders above the file are named alike, and whether the case is too."""
-    one, two = (_path(name).casefold().split("/")[-2::-1] for name in (photograph.name, text))
-    same = [a == b for a, b in zip(one, two, strict=False)]
-    return [*same, False].index(False), photograph.name.endswith(_path(text))
+    """Return the number of equal folders above the file, and whether the case is equal."""
+    folders, folders_in_table = (
+        _path(name).casefold().split("/")[-2::-1] for name in (photograph.name, text)
+    )
+    are_equal = [a == b for a, b in zip(folders, folders_in_table, strict=False)]
+    return [*are_equal, False].index(False), photograph.name.endswith(_path(text))
 
 
 def _candidates(row: Row, photographs: Sequence[Photograph]) -> list[Photograph]:
-    """Return the photographs in the folder of the view of a row, all if there is no such folder."""
+    """Return the photographs in the folder of a row's view, or all if there is no such folder."""
     of_view = [p for p in photographs if row.view and _in_folder(p, row.view)]
     return of_view or list(photographs)
 
@@ -274,27 +285,27 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
     """Compare names, the strictest way first."""
     named = [k for k, row in enumerate(rows) if row.image]
     best: dict[int, list[Photograph]] = {}
-    for how, key in _KEYS:
+    for method, key in _KEYS:
         if key is _number and not all(rows[k].image.isdigit() for k in named):
             continue
         by_key: dict[str, list[Photograph]] = {}
         for photograph in photographs:
             for text in {key(photograph.name), *([key(photograph.label)] * bool(photograph.view))}:
                 by_key.setdefault(text, []).append(photograph)
-        found = {}
+        matches = {}
         for k in named:
-            same = by_key.get(key(rows[k].image), [])
-            if same and rows[k].view:
-                same = _candidates(rows[k], same)
-            if same and key(rows[k].image):
-                most = max(_alike(photograph, rows[k].image) for photograph in same)
-                found[k] = [p for p in same if _alike(p, rows[k].image) == most]
-        if len(found) == len(named):
-            return _named_once(rows, found, how, table)
-        if len(found) > len(best):
-            best = found
+            same_key = by_key.get(key(rows[k].image), [])
+            if same_key and rows[k].view:
+                same_key = _candidates(rows[k], same_key)
+            if same_key and key(rows[k].image):
+                most = max(_alike(photograph, rows[k].image) for photograph in same_key)
+                matches[k] = [p for p in same_key if _alike(p, rows[k].image) == most]
+        if len(matches) == len(named):
+            return _named_once(rows, matches, method, table)
+        if len(matches) > len(best):
+            best = matches
     problems = []
-    taken = {photograph.name for same in best.values() for photograph in same}
+    taken = {photograph.name for same_key in best.values() for photograph in same_key}
     for k in named:
         if k not in best:
             near = closest(rows[k].image, [p.name for p in photographs if p.name not in taken])
@@ -324,18 +335,18 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
 
 
 def _named_once(
-    rows: Sequence[Row], found: dict[int, list[Photograph]], how: str, table: str
+    rows: Sequence[Row], matches: dict[int, list[Photograph]], method: str, table: str
 ) -> Matching:
-    """Return the pairs if every photograph has one row, and every row one photograph a view."""
+    """Return the pairs if each photograph has one row, and each row one photograph a view."""
     row_of: dict[str, int] = {}
     problems, undecided = [], "the photograph could not be decided"
-    for k, same in found.items():
-        folders = [photograph.folder for photograph in same]
-        if len(set(folders)) < len(folders) or (rows[k].view and len(same) > 1):
+    for k, photographs in matches.items():
+        folders = [photograph.folder for photograph in photographs]
+        if len(set(folders)) < len(folders) or (rows[k].view and len(photographs) > 1):
             problems.append(
                 Problem(
                     undecided,
-                    f"{describe(rows[k].image)} for {few([p.name for p in same])}",
+                    f"{describe(rows[k].image)} for {few([p.name for p in photographs])}",
                     "one",
                     "write the name with its folder and extension",
                     *rows[k].where,
@@ -343,12 +354,12 @@ def _named_once(
                     code=Code.BAD_CELL,
                 )
             )
-        for photograph in same:
-            if (other := row_of.setdefault(photograph.name, k)) != k:
+        for photograph in photographs:
+            if (other_row := row_of.setdefault(photograph.name, k)) != k:
                 problems.append(
                     Problem(
                         undecided,
-                        f"{describe(photograph.name)} also for {rows[other].where}",
+                        f"{describe(photograph.name)} also for {rows[other_row].where}",
                         "one row a photograph",
                         "add a column view, or write names with folders",
                         *rows[k].where,
@@ -358,19 +369,19 @@ def _named_once(
                 )
     if problems:
         raise DatasetError(problems)
-    blank = [row.where for k, row in enumerate(rows) if k not in found]
+    blank = [row.where for k, row in enumerate(rows) if k not in matches]
     notes = (
         f"{len(blank)} row{'s' * (len(blank) > 1)} of {table} without the name of a photograph "
         f"{'are' if len(blank) > 1 else 'is'} left out.",
     )
-    return Matching(_sorted(rows, found.items()), how, notes if blank else ())
+    return Matching(_sorted(rows, matches.items()), method, notes if blank else ())
 
 
 def _sorted(
-    rows: Sequence[Row], found: Iterable[tuple[int, Sequence[Photograph]]]
+    rows: Sequence[Row], matches: Iterable[tuple[int, Sequence[Photograph]]]
 ) -> tuple[tuple[int, Photograph], ...]:
     """Return pairs in the order of views and, in each, of rows."""
-    pairs = [(k, photograph) for k, same in found for photograph in same]
+    pairs = [(k, photograph) for k, photographs in matches for photograph in photographs]
     folders: dict[str, int] = {}
     for k, photograph in pairs:
         folders.setdefault(rows[k].view or photograph.folder, len(folders))
@@ -391,16 +402,16 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
             (f"view {view}", members, [p for p in photographs if _in_folder(p, view)])
             for view, members in views.items()
         ]
-        how = "in the order of rows and of names, view by view"
+        method = "in the order of rows and of names, view by view"
     elif len(photographs) == len(rows):
         groups = [("all folders", list(range(len(rows))), list(photographs))]
-        how = "in the order of rows and of names"
+        method = "in the order of rows and of names"
     else:
         groups = [
             (f"folder {folder}", list(range(len(rows))), inside)
             for folder, inside in folders.items()
         ]
-        how = "in the order of rows and of names: every view shows the poses of all rows"
+        method = "in the order of rows and of names: every view shows the poses of all rows"
     problems = [
         f"{table}: the photographs of {name} could not be matched in order: found {len(inside)} "
         f"photographs for {len(members)} rows, needed as many; remove what has no partner, or add "
@@ -414,19 +425,19 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
     pairs: list[tuple[int, Photograph]] = []
     for name, members, inside in groups:
         times = [photograph_time(photograph) for photograph in inside]
-        known = [when for when in times if when is not None]
-        if len(known) == len(times) and known != sorted(known):
+        known_times = [when for when in times if when is not None]
+        if len(known_times) == len(times) and known_times != sorted(known_times):
             notes.append(
                 f"The photographs of {name} were not taken in the order of their names, as their "
                 "EXIF times say; see that the rows are in the order of the names, or add a column "
                 "image or time."
             )
         pairs += zip(members, inside, strict=True)
-    return Matching(tuple(pairs), how, tuple(notes))
+    return Matching(tuple(pairs), method, tuple(notes))
 
 
 def photograph_time(photograph: Photograph) -> datetime | None:
-    """Return when a photograph was taken, as its file says."""
+    """Return the time of a photograph in its metadata, None if there is none."""
     try:
         return _moment(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
     except OSError:
@@ -490,5 +501,5 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             "difference of the clocks shows, or add a column image."
         )
     about = f", clocks {shift.total_seconds():+.0f} s apart" if shift else ""
-    found = [(k, [p]) for k, p in sorted(pairs.items())]
-    return Matching(_sorted(rows, found), f"by time, within {worst.total_seconds():.0f} s{about}")
+    matches = [(k, [p]) for k, p in sorted(pairs.items())]
+    return Matching(_sorted(rows, matches), f"by time, within {worst.total_seconds():.0f} s{about}")

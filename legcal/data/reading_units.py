@@ -1,4 +1,4 @@
-"""Units of readings: what a number in a table is as the joint value of a motor.
+"""Units of readings: from a number in a table to the joint value of a motor.
 
 Tables have readings in m, of motors that turn in rad, unless ``readings`` in ``dataset.yaml`` says
 otherwise: another unit of length or angle, or pulses of hobby servos, of which the model or the
@@ -24,9 +24,9 @@ from legcal.machine.actuator import Pulses
 from legcal.machine.leg import Leg
 
 PULSES = "us"
-SERVO_SIGMA = math.radians(0.5)  # [rad], of what a hobby servo makes of its command
-SIGMA_ANGLE = 1e-4  # [rad], of a reading of a motor that turns, where none is stated
-MOST_SIGMA = 0.2  # of the travel: no encoder is worse, so that the unit is most likely another
+SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
+SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
+MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
 ReadingUnitName = Literal["m", "cm", "mm", "um", "rad", "mrad", "deg", "us"]
 _WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
 
@@ -54,16 +54,16 @@ class ReadingUnit:
 
 
 def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
-    """Return the legs of which a table has readings: of rods on one actuator the first."""
-    found: dict[str, Leg] = {}
+    """Return the legs that a table has readings of: the first of several rods on one actuator."""
+    first_legs: dict[str, Leg] = {}
     for leg in legs:
         if leg.is_motor:
-            found.setdefault(str(leg.prismatic), leg)
-    return list(found.values())
+            first_legs.setdefault(str(leg.prismatic), leg)
+    return list(first_legs.values())
 
 
 def default_unit(leg: Leg) -> ReadingUnit:
-    """Return the unit of readings of which nothing is said."""
+    """Return the unit of readings of a leg where none is stated."""
     return ReadingUnit(leg.reading_unit)
 
 
@@ -78,7 +78,8 @@ def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit
     Raises
     ------
     ValueError
-        If the leg cannot have readings in it; the text goes on after what could not be used.
+        If the leg cannot have readings in this unit. The text continues a sentence that names the
+        entry.
     """
     motor = leg.prismatic
     of_kind = ANGLE if leg.reads_angle else LENGTH
@@ -86,19 +87,19 @@ def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit
         return ReadingUnit(name, of_kind[name])
     if name != PULSES or not leg.reads_angle:
         does = "turns" if leg.reads_angle else "slides"
-        known = [*of_kind, PULSES] if leg.reads_angle else [*of_kind]
+        unit_names = [*of_kind, PULSES] if leg.reads_angle else [*of_kind]
         raise ValueError(
-            f"found {name} for '{motor}', which {does}, needed one of {', '.join(known)}; correct "
-            "it."
+            f"found {name} for '{motor}', which {does}, needed one of {', '.join(unit_names)}; "
+            "correct it."
         )
-    found = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
-    if found is None:
+    described = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
+    if described is None:
         raise ValueError(
             f"found pulses of '{motor}' and neither centre nor us for one degree, needed both: "
             f"{{{motor}: {{unit: us, centre_us: 1500, us_per_deg: 11.1}}}}, or centre_us and "
             "us_per_deg of it in legcal.motors of the model; add them."
         )
-    return unit_of_pulses(found)
+    return unit_of_pulses(described)
 
 
 class ReadingsEntry(FileSchema):
@@ -112,7 +113,7 @@ class ReadingsEntry(FileSchema):
     def __get_pydantic_json_schema__(
         cls, core_schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return its schema, or that of a unit alone."""
+        """Return the schema of an entry, or of a unit alone."""
         return {"anyOf": [handler(core_schema), {"enum": [*get_args(ReadingUnitName)]}]}
 
     @model_validator(mode="before")
@@ -126,7 +127,7 @@ def reading_units(
 ) -> dict[str, ReadingUnit]:
     """Return the unit of the readings of each motor, by its joint.
 
-    One unit for all is that of the motors of its kind: those that slide, or those that turn.
+    A single unit applies to the motors of its kind, sliding or turning.
 
     Raises
     ------
@@ -140,7 +141,7 @@ def reading_units(
     problems = []
     if isinstance(stated, str):
         alike = [name for name, leg in motors.items() if leg.reads_angle is (stated not in LENGTH)]
-        given = {name: ReadingsEntry(unit=stated) for name in alike}  # type: ignore[arg-type]
+        entries = {name: ReadingsEntry(unit=stated) for name in alike}  # type: ignore[arg-type]
         if not alike:
             does = "slides" if stated in LENGTH else "turns"
             problems.append(
@@ -148,12 +149,12 @@ def reading_units(
                 f"needed {'an angle or us' if does == 'slides' else 'a length'}; correct it."
             )
     else:
-        given = dict(stated)
-    for name, entry in given.items():
-        where = f"{path}: readings.{name} could not be used"
+        entries = dict(stated)
+    for name, entry in entries.items():
+        start = f"{path}: readings.{name} could not be used"
         if name not in motors:
             problems.append(
-                f"{where}: found no motor of that name, needed one of {', '.join(motors)}; "
+                f"{start}: found no motor of that name, needed one of {', '.join(motors)}; "
                 f"{closest(name, [*motors])}"
             )
             continue
@@ -163,7 +164,7 @@ def reading_units(
             )
             units[name] = unit_named(entry.unit, motors[name], pulses)
         except ValueError as error:
-            problems.append(f"{where}: {error}")
+            problems.append(f"{start}: {error}")
     if problems:
         raise DatasetError(problems)
     return units
@@ -172,15 +173,15 @@ def reading_units(
 def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, float]) -> Array:
     """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad].
 
-    It is what is stated of its motor, or the usual one: *sigma_q* [m] of motors that slide.
+    It is the stated value of its motor, or else the usual one: *sigma_q* [m] for a sliding motor.
     """
     return np.array([stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs])
 
 
 def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
-    """Say whether readings are what a hobby servo was told, and not where it is.
+    """Return whether readings are commands to a hobby servo, and not measured positions.
 
-    They are if their *unit* is that of pulses, or the model knows the pulses of the servo: it has
+    They are if their *unit* is pulses, or if the model describes the pulses of the servo: it has
     no other readings, whatever their unit.
     """
     is_servo = leg.actuator is not None and leg.actuator.pulses is not None
@@ -188,17 +189,17 @@ def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
 
 
 def usual_sigma(leg: Leg, sigma_q: float, unit: ReadingUnit | None = None) -> float:
-    """Return the standard deviation [m or rad] of readings of which none is stated."""
+    """Return the default standard deviation [m or rad] of readings of a leg."""
     if not leg.reads_angle:
         return sigma_q
     return SERVO_SIGMA if are_commands(leg, unit) else SIGMA_ANGLE
 
 
 def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
-    """Return the standard deviations of readings [m or rad] that one statement gives, by motor.
+    """Return the standard deviations of readings [m or rad] from one statement, by motor.
 
-    A number is that of every motor in its own unit [m or rad], a text with a unit that of the
-    motors that slide, or turn.
+    A number applies to every motor in its own unit [m or rad], a text with a unit to the motors
+    of that kind, sliding or turning.
 
     Raises
     ------
@@ -216,27 +217,27 @@ def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
 
 
 def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:
-    """Return a standard deviation [m or rad] of a motor's readings and what is needed, in words.
+    """Return a standard deviation [m or rad] that no encoder has and the limit, both in words.
 
-    None if no encoder would have to be worse than any is.
+    None if it is plausible.
     """
-    width, what = leg.travel[1] - leg.travel[0], f"the travel of '{leg.prismatic}'"
+    width, range_name = leg.travel[1] - leg.travel[0], f"the travel of '{leg.prismatic}'"
     if not 0.0 < width < math.inf:
-        width, what = (math.tau, "a turn") if leg.reads_angle else (math.inf, what)
+        width, range_name = (math.tau, "a turn") if leg.reads_angle else (math.inf, range_name)
     if sigma <= MOST_SIGMA * width:
         return None
     size, unit = SHOWN_IN[leg.reading_unit]
-    needed = f"at most {MOST_SIGMA:.0%} of {what}, {MOST_SIGMA * size * width:.4g} {unit}"
+    needed = f"at most {MOST_SIGMA:.0%} of {range_name}, {MOST_SIGMA * size * width:.4g} {unit}"
     return f"{float(f'{size * sigma:.3g}'):g} {unit}", needed
 
 
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
-    """Return a standard deviation of readings [m or rad]: a number in their unit, or with its own.
+    """Return a standard deviation [m or rad] from a number in the unit of readings, or with a unit.
 
     Raises
     ------
     ValueError
-        If it is none; the text goes on after what could not be used.
+        If it is invalid. The text continues a sentence that names the entry.
     """
     sizes = {PULSES: unit.size} if unit.name == PULSES else {}
     sizes |= ANGLE if leg.reads_angle else LENGTH
@@ -255,12 +256,13 @@ def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
         )
     sigma = number * abs(sizes[name])
     if too_large := sigma_too_large(sigma, leg):
-        found, (shown, needed) = f"{number:g} {name}", too_large
+        shown_as_stated, (shown, needed) = f"{number:g} {name}", too_large
         remedy = "correct it"
         if stated == number:
             other, words = ("deg", "degrees") if leg.reads_angle else ("um", "micrometres")
             remedy = f"write its unit behind it ('{number:g}{other}' if it is in {words})"
         raise ValueError(
-            f"found {found}{f', which is {shown}' * (found != shown)}, needed {needed}; {remedy}."
+            f"found {shown_as_stated}{f', which is {shown}' * (shown_as_stated != shown)}, needed "
+            f"{needed}; {remedy}."
         )
     return sigma

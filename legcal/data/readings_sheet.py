@@ -1,8 +1,8 @@
 """A table of readings as its owner keeps it: headings, units, readings or whole lengths.
 
-Columns are found by their headings: an encoder by the name of its leg or joint, or by a number; a
-column of photographs or views by its cells as well. The unit is that of the headings, else the one
-in which the readings lie in the travel of the legs.
+Columns are identified by their headings: an encoder by the name of its leg or joint, or by a
+number; a column of photographs or views by its cells as well. The unit comes from the headings,
+else it is the unit in which the readings lie in the travel of the legs.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 
-LEAST_USED = 0.01  # of the travel: less is the use that is made of it in a larger unit
-# units that are tried where none is stated, of motors that slide and that turn
+LEAST_USED = 0.01  # minimum fraction of the travel in use: with less, the unit is a larger one
+# Units tried where none is stated, of motors that slide and that turn
 GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
 READING_ANGLES = (*ANGLE, PULSES)
 _HEADINGS = {
@@ -58,7 +58,7 @@ class SheetReadings:
     q: Array  # (n_rows, n_motors) [m or rad]
     digits: Array  # (n_motors,) the size of the last digit [m or rad]
     units: tuple[ReadingUnit, ...]  # of each motor
-    unit_from: str  # where they were found, in words
+    unit_from: str  # origin of the units, in words
 
     @property
     def unit(self) -> str:
@@ -67,19 +67,19 @@ class SheetReadings:
 
 
 class ReadingsSheet:
-    """A table of readings, one row for each of what *each* names (a photograph, a time).
+    """A table of readings, one row for each photograph or time (*row_noun*).
 
-    *by_content* says for image and view whether the cells of a column are that, whatever its
-    heading.
+    *by_content* has, for image and view, a predicate that recognises such a column by its cells,
+    whatever its heading.
 
     Attributes
     ----------
     motors : list of Leg
         The legs whose readings it holds.
     taken : dict
-        What each heading that is used is taken for: a joint, view, image, pose or time.
+        Meaning of each heading in use: a joint, view, image, pose or time.
     notes : list of str
-        What is odd, or was left out.
+        Oddities, and columns that were left out.
 
     Raises
     ------
@@ -88,15 +88,23 @@ class ReadingsSheet:
     """
 
     def __init__(
-        self, path: Path, machine: Machine, each: str, by_content: ByContent = MappingProxyType({})
+        self,
+        path: Path,
+        machine: Machine,
+        row_noun: str,
+        by_content: ByContent = MappingProxyType({}),
     ) -> None:
         self.path = path
         self.motors = [machine.legs[j] for j in machine.motors]
         headings = _Headings(path, self.motors, by_content)
         self._table = read_table(
-            path, "table of readings", "row", headings.columns(), needed=f"one row for each {each}",
+            path,
+            "table of readings",
+            "row",
+            headings.columns(),
+            needed=f"one row for each {row_noun}",
             reshape=headings.reshape,
-        )  # fmt: skip
+        )
         self._table.check()
         self._joints, self._heading_units = headings.joints, headings.units
         self.taken, self.notes = headings.taken, headings.notes
@@ -105,7 +113,7 @@ class ReadingsSheet:
         return name in self._table
 
     def text(self, name: str) -> tuple[str, ...]:
-        """Return the cells of a column of texts, one a row, empty where there is no such column."""
+        """Return the cells of a column of texts by row, empty where there is no such column."""
         return self._table.text(name)
 
     @property
@@ -114,20 +122,20 @@ class ReadingsSheet:
         return self._table.where
 
     def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:
-        """Return the readings in m and rad, lengths by their decimal digits.
+        """Return the readings [m, rad], with the precision of their decimal digits.
 
         Parameters
         ----------
         unit : str, optional
-            Of the motors of its kind, those that slide or turn; by default that of the headings,
-            else the one in which readings lie in the travel.
+            Unit of the motors of its kind, sliding or turning; by default the unit of the headings,
+            else the unit in which readings lie in the travel.
         lengths : bool
             Whether the columns are whole lengths of legs.
 
         Raises
         ------
         DatasetError, UsageError
-            If the unit cannot be decided or surely is another one, or with a sentence for each
+            If the unit cannot be decided or is certainly wrong, or with a sentence for each
             reading outside its travel.
         """
         units, unit_from = self._units(unit, lengths)
@@ -169,10 +177,10 @@ class ReadingsSheet:
         ]
         return SheetReadings(q, np.array(last), units, unit_from)
 
-    def _units(self, given: str | None, lengths: bool) -> tuple[tuple[ReadingUnit, ...], str]:
-        """Return the unit of the readings of each motor, and where they were found."""
-        self._refuse_options(given, lengths)
-        found, where = dict[int, ReadingUnit](), list[str]()
+    def _units(self, option: str | None, lengths: bool) -> tuple[tuple[ReadingUnit, ...], str]:
+        """Return the unit of the readings of each motor, and the origin of the units in words."""
+        self._refuse_options(option, lengths)
+        unit_of_motor, origins = dict[int, ReadingUnit](), list[str]()
         for turning in (False, True):
             some = [j for j, leg in enumerate(self.motors) if leg.reads_angle is turning]
             if not some:
@@ -187,28 +195,31 @@ class ReadingsSheet:
                 sorted(stated),
                 lengths,
             )
-            own = given if given is not None and (given in LENGTH) is not turning else None
-            unit, how = of_kind.unit(own)
-            found |= dict(zip(some, of_kind.units(unit), strict=True))
-            where.append(how)
-        units = tuple(found[j] for j in range(len(self.motors)))
-        return units, " and ".join(dict.fromkeys(where))
-
-    def _refuse_options(self, given: str | None, lengths: bool) -> None:
-        """Refuse a unit that no motor has, and lengths of legs that have none."""
-        known = [*LENGTH, *READING_ANGLES]
-        if given is not None and given not in known:
-            raise UsageError(
-                f"The unit could not be used: found '{given}', needed one of {', '.join(known)}; "
-                "correct --unit."
+            option_of_kind = (
+                option if option is not None and (option in LENGTH) is not turning else None
             )
-        if given is not None and not any(
-            leg.reads_angle is (given not in LENGTH) for leg in self.motors
-        ):
-            does = "slides" if given in LENGTH else "turns"
+            unit, origin = of_kind.unit(option_of_kind)
+            unit_of_motor |= dict(zip(some, of_kind.units(unit), strict=True))
+            origins.append(origin)
+        units = tuple(unit_of_motor[j] for j in range(len(self.motors)))
+        return units, " and ".join(dict.fromkeys(origins))
+
+    def _refuse_options(self, option: str | None, lengths: bool) -> None:
+        """Refuse a unit that no motor has, and lengths of legs that have none."""
+        unit_names = [*LENGTH, *READING_ANGLES]
+        if option is not None and option not in unit_names:
             raise UsageError(
-                f"The unit could not be used: found '{given}' and no motor that {does}, needed one "
-                f"of {', '.join(READING_ANGLES if given in LENGTH else LENGTH)}; correct --unit."
+                f"The unit could not be used: found '{option}', needed one of "
+                f"{', '.join(unit_names)}; correct --unit."
+            )
+        if option is not None and not any(
+            leg.reads_angle is (option not in LENGTH) for leg in self.motors
+        ):
+            does = "slides" if option in LENGTH else "turns"
+            raise UsageError(
+                f"The unit could not be used: found '{option}' and no motor that {does}, needed "
+                f"one of {', '.join(READING_ANGLES if option in LENGTH else LENGTH)}; correct "
+                "--unit."
             )
         if lengths and any(leg.actuator is not None for leg in self.motors):
             raise UsageError(
@@ -218,7 +229,7 @@ class ReadingsSheet:
 
 
 class _Headings:
-    """What the headings of a table of readings mean."""
+    """The meaning of the headings of a table of readings."""
 
     def __init__(self, path: Path, motors: Sequence[Leg], by_content: ByContent) -> None:
         self.path = path
@@ -226,7 +237,7 @@ class _Headings:
         self.by_content = by_content
         self.joints = [column.name for column in reading_columns(motors)]
         self.taken: dict[str, str] = {}  # meaning of each heading that is used
-        self.units: dict[str, str] = {}  # of each joint, as its heading says
+        self.units: dict[str, str] = {}  # unit in the heading of each joint
         self.notes: list[str] = []
 
     def columns(self) -> list[Column]:
@@ -235,7 +246,7 @@ class _Headings:
         return [*texts, *(Column(joint, what="reading") for joint in self.joints)]
 
     def reshape(self, lines: Lines) -> Lines:
-        """Return lines under the names that their columns have here; others are left out."""
+        """Return the lines with columns renamed to our names; unknown columns are left out."""
         number, header = lines[0]
         if sum(is_number(text) and not text.isdecimal() for text in header) > 1:
             raise DatasetError(
@@ -246,7 +257,7 @@ class _Headings:
         split = [split_heading(text) for text in header]
         readings = [split_heading(text, (*LENGTH, *READING_ANGLES)) for text in header]
         meaning: dict[int, str] = {}
-        clock: dict[int, float] = {}  # what one is in seconds, of a column of times with a unit
+        clock: dict[int, float] = {}  # seconds in a unit of a column of times
         for i, (key, _) in enumerate(split):
             for name, words in _HEADINGS.items():
                 timed = _TIME.fullmatch(key) if name == "time" else None
@@ -267,10 +278,10 @@ class _Headings:
                 self.units[name] = readings[i][1]
         unused = [text for i, text in enumerate(header) if i not in meaning and text]
         if unused:
-            one = len(unused) == 1
+            is_single = len(unused) == 1
             self.notes.append(
-                f"Column{'' if one else 's'} {few([describe(text) for text in unused])} of "
-                f"{self.path} {'is' if one else 'are'} not used."
+                f"Column{'' if is_single else 's'} {few([describe(text) for text in unused])} of "
+                f"{self.path} {'is' if is_single else 'are'} not used."
             )
         kept = sorted(meaning)
         below = [
@@ -285,19 +296,20 @@ class _Headings:
         self, free: Sequence[int], split: Sequence[tuple[str, str]], header: Sequence[str]
     ) -> dict[int, str]:
         """Return the joint of each column of readings, by names or else by numbers."""
-        found: dict[int, str] = {}
+        joint_of_column: dict[int, str] = {}
         for joint, leg in zip(self.joints, self.motors, strict=True):
             words = {split_heading(joint)[0], split_heading(leg.name)[0]}
-            same = [i for i in free if split[i][0] in words]
-            if len(same) > 1:
+            columns_of_leg = [i for i in free if split[i][0] in words]
+            if len(columns_of_leg) > 1:
                 raise DatasetError(
                     f"{self.path}, header: the readings of leg '{leg.name}' could not be decided: "
-                    f"found the columns {' and '.join(describe(header[i]) for i in same)}, needed "
-                    "one; remove the others."
+                    "found the columns "
+                    f"{' and '.join(describe(header[i]) for i in columns_of_leg)}, needed one; "
+                    "remove the others."
                 )
-            found |= dict.fromkeys(same, joint)
-        if len(found) == len(self.joints):
-            return found
+            joint_of_column |= dict.fromkeys(columns_of_leg, joint)
+        if len(joint_of_column) == len(self.joints):
+            return joint_of_column
         numbered = {i: m for i in free if (m := _NUMBERED.fullmatch(split[i][0]))}
         families: dict[tuple[str, str], dict[int, int]] = {}
         for i, m in numbered.items():
@@ -311,7 +323,7 @@ class _Headings:
         if len(fits) == 1:
             return dict(zip(fits[0], self.joints, strict=True))
         missing = [leg.name for leg, joint in zip(self.motors, self.joints, strict=True)
-                   if joint not in found.values()]  # fmt: skip
+                   if joint not in joint_of_column.values()]  # fmt: skip
         columns = few([describe(header[i]) for i in free]) or "none"
         raise DatasetError(
             f"{self.path}, header: the readings of {few(missing)} could not be found: found the "
@@ -349,7 +361,7 @@ class _MotorsOfKind:
 
     @property
     def has_pulses(self) -> bool:
-        """Whether the pulses of all of them are known."""
+        """Whether the model describes the pulses of all these motors."""
         return all(
             leg.actuator is not None and leg.actuator.pulses is not None for leg in self.legs
         )
@@ -362,86 +374,91 @@ class _MotorsOfKind:
         return [unit for unit in READING_ANGLES if unit != PULSES or self.has_pulses]
 
     def units(self, name: str) -> list[ReadingUnit]:
-        """Return the unit of each of them by its name."""
+        """Return the unit of that name for each motor."""
         return [unit_named(name, leg) for leg in self.legs]
 
     def fits(self, unit: str, lengths: bool, *, moving: bool = True) -> bool:
-        """Say whether most values lie in the travel, and where *moving* use a part of it."""
+        """Return whether most values lie in the travel and, if *moving*, use a part of it."""
         columns = zip(self.units(unit), self.values.T, strict=True)
-        q = np.column_stack([one.values(column) for one, column in columns])
+        q = np.column_stack([unit_of_motor.values(column) for unit_of_motor, column in columns])
         q = readings_of_lengths(q, self.legs) if lengths else q
         travel = np.ptp([leg.travel for leg in self.legs], axis=1)
         moves = np.ptp(q, axis=0) > LEAST_USED * travel
         return bool(2 * in_travel(q, self.legs).mean() >= 1.0 and (not moving or moves.any()))
 
-    def unit(self, given: str | None) -> tuple[str, str]:
-        """Return their unit, and where it was found: as given or stated, or by the travel."""
-        known = self._known(given)
-        tried = (known,) if known else tuple(x for x in GUESSED[self.turning] if x in self.possible)
-        where = "as the heading says" if self.stated else "as given"
-        if known is None:
-            where = "the unit in which the readings lie in the travel of the legs"
+    def unit(self, option: str | None) -> tuple[str, str]:
+        """Return the unit and its origin in words: an option, the headings, or the travel."""
+        stated = self._stated_unit(option)
+        tried = (
+            (stated,) if stated else tuple(x for x in GUESSED[self.turning] if x in self.possible)
+        )
+        origin = "as the heading says" if self.stated else "as given"
+        if stated is None:
+            origin = "the unit in which the readings lie in the travel of the legs"
         for unit in tried:
             if self.fits(unit, self.lengths):
-                return unit, where
+                return unit, origin
         self._refuse_other(tried)
         for unit in tried:
             if self.fits(unit, self.lengths, moving=False):
-                return unit, where
+                return unit, origin
         raise DatasetError(
             f"{self._start}, needed {_needed(self.legs[0], has_pulses=self.has_pulses)}; correct "
             "the travel of the model, or the table."
         )
 
-    def _known(self, given: str | None) -> str | None:
-        """Return the unit that a heading states or that is given; refuse one they cannot have."""
-        if len(self.stated) > 1 or (given and self.stated and self.stated != [given]):
+    def _stated_unit(self, option: str | None) -> str | None:
+        """Return the unit stated in headings or the option, if any; refuse an impossible unit."""
+        if len(self.stated) > 1 or (option and self.stated and self.stated != [option]):
             raise DatasetError(
                 f"{self.path}: the unit could not be decided: found "
-                f"{' and '.join(dict.fromkeys([*([given] if given else []), *self.stated]))}, "
+                f"{' and '.join(dict.fromkeys([*([option] if option else []), *self.stated]))}, "
                 "needed the same for all readings; correct the headings."
             )
-        known = self.stated[0] if self.stated else given
-        if known is not None and known not in self.possible and known != PULSES:
+        unit = self.stated[0] if self.stated else option
+        if unit is not None and unit not in self.possible and unit != PULSES:
             does = "turns" if self.turning else "slides"
             raise DatasetError(
-                f"{self.path}: the unit could not be used: found {known} of '{self.joints[0]}', "
+                f"{self.path}: the unit could not be used: found {unit} of '{self.joints[0]}', "
                 f"which {does}, needed one of {', '.join(self.possible)}; correct the heading."
             )
-        if known == PULSES and not self.has_pulses:
+        if unit == PULSES and not self.has_pulses:
             raise DatasetError(
                 f"{self.path}: the readings could not be used: found pulses of servos of which "
                 "neither centre nor us for one degree is known, needed both; write centre_us and "
                 f"us_per_deg of '{self.joints[0]}' and the others into legcal.motors of the model."
             )
-        return known
+        return unit
 
     @property
     def _start(self) -> str:
-        """How a refusal of what was found begins."""
+        """The beginning of a refusal, with the range of the values."""
         low, high = float(self.values.min()), float(self.values.max())
-        what = "lengths of legs" if self.lengths else "readings"
-        return f"{self.path}: the {what} could not be used: found {low:g} to {high:g}"
+        quantity = "lengths of legs" if self.lengths else "readings"
+        return f"{self.path}: the {quantity} could not be used: found {low:g} to {high:g}"
 
     def _refuse_other(self, tried: Sequence[str]) -> None:
-        """Refuse values that fit in a unit that was not *tried*, or as lengths or as readings."""
+        """Refuse values that fit in a unit outside *tried*, or as lengths instead of readings."""
         for unit in (*tried, *(unit for unit in self.possible if unit not in tried)):
-            for other in (self.lengths, not self.lengths):
-                if (other and self.legs[0].actuator is not None) or not self.fits(unit, other):
+            for as_lengths in (self.lengths, not self.lengths):
+                if (as_lengths and self.legs[0].actuator is not None) or not self.fits(
+                    unit, as_lengths
+                ):
                     continue
                 remedies = []
-                if other is not self.lengths:
+                if as_lengths is not self.lengths:
                     remedies.append("leave out --lengths" if self.lengths else "add --lengths")
                 if unit not in tried:
                     remedies.append(f"state the unit {unit} in the headings")
                 raise DatasetError(
-                    f"{self._start}, which look like {'lengths of legs' if other else 'readings'} "
-                    f"in {unit}; {' and '.join(remedies)}."
+                    f"{self._start}, which look like "
+                    f"{'lengths of legs' if as_lengths else 'readings'} in {unit}; "
+                    f"{' and '.join(remedies)}."
                 )
 
 
 def _needed(leg: Leg, *, has_pulses: bool) -> str:
-    """Return what readings of a leg lie in, in words."""
+    """Return the ranges for readings of a leg, in words."""
     if leg.reads_angle:
         low, high = (math.degrees(x) for x in leg.travel)
         servo = "" if has_pulses else ", or pulses of servos that legcal.motors of it describes"
@@ -452,10 +469,10 @@ def _needed(leg: Leg, *, has_pulses: bool) -> str:
     travel = f"{1e3 * leg.travel[0]:g} to {1e3 * leg.travel[1]:g} mm for leg '{leg.name}'"
     if leg.actuator is not None:
         return f"readings in the travel of the model ({travel})"
-    at = [1e3 * leg.length_at(q) for q in leg.travel]
+    lengths = [1e3 * leg.length_at(q) for q in leg.travel]
     return (
-        f"readings in the travel of the model ({travel}) or lengths ({min(at):g} to {max(at):g} "
-        "mm, with --lengths)"
+        f"readings in the travel of the model ({travel}) or lengths ({min(lengths):g} to "
+        f"{max(lengths):g} mm, with --lengths)"
     )
 
 

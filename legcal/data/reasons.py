@@ -1,4 +1,4 @@
-"""Why an outline, a corner or an image is not used: a code, and a detail for the reader.
+"""Reasons for not using an outline, a corner or an image: a code, and a detail for the reader.
 
 Programs compare codes (:class:`Reason`); tables store code and detail in two columns; sentences are
 made where people read them. Tables of earlier versions hold sentences, which are read as well.
@@ -18,17 +18,17 @@ from legcal.geometry.types import BoolArray
 
 
 class Reason(StrEnum):
-    """Why an outline, a corner or an image is not used."""
+    """A reason for not using an outline, a corner or an image."""
 
     NONE = ""
-    # What the camera cannot see
+    # Out of sight of the camera
     OUTSIDE = "outside"
     HIDDEN = "hidden"
     NARROW = "narrow"
     SHORT = "short"
     NOT_PLACED = "not_placed"
     UNUSED_LEG = "unused_leg"
-    # What was not measured well enough
+    # Not measured well enough
     NO_PAIR = "no_pair"
     NO_EDGE = "no_edge"
     FAINT = "faint"
@@ -39,7 +39,7 @@ class Reason(StrEnum):
     UNCERTAIN = "uncertain"
     WIDTH = "width"
     PARTNER = "partner"
-    # What contradicts other measurements
+    # Contradicting other measurements
     VIEW_DISAGREES = "view_disagrees"
     DISAGREES = "disagrees"
     ARM_LEFT_OUT = "arm_left_out"
@@ -47,7 +47,7 @@ class Reason(StrEnum):
     NO_BOARD_POSE = "no_board_pose"
     CORNER_OFF = "corner_off"
     NOT_BEFORE = "not_before"
-    # What is wrong with a whole image
+    # Problems of a whole image
     BLACK = "black"
     OVEREXPOSED_IMAGE = "overexposed_image"
     EMPTY = "empty"
@@ -58,12 +58,12 @@ class Reason(StrEnum):
     OTHER_READING = "other_reading"
     OTHER_VIEW = "other_view"
     OTHER_SCENE = "other_scene"
-    # What people decide
+    # Decisions of people
     BY_HAND = "by_hand"
     OTHER = "other"
 
 
-# In words: without a detail, and with one.
+# In words: without a detail, and with a detail.
 WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.NONE: ("", ""),
     Reason.OUTSIDE: ("outside the image", ""),
@@ -74,7 +74,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.UNUSED_LEG: ("its view does not use this leg", "view {} does not use this leg"),
     Reason.NO_PAIR: ("no convincing pair of edges", ""),
     Reason.NO_EDGE: ("no convincing edge", ""),
-    Reason.FAINT: ("edge hardly visible", "edge hardly visible, found on {} % of it"),
+    Reason.FAINT: ("edge barely visible", "edge barely visible, detected on {} % of it"),
     Reason.OVEREXPOSED: (
         "the background is overexposed",
         "the background is overexposed, {} px of the step are left",
@@ -87,7 +87,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
         "width inconsistent with the radius",
         "width inconsistent with the radius, {}",
     ),
-    Reason.PARTNER: ("other outline fails", "its other outline: {}"),
+    Reason.PARTNER: ("partner outline rejected", "its other outline: {}"),
     Reason.VIEW_DISAGREES: ("disagrees with the other legs of its view", ""),
     Reason.DISAGREES: ("disagrees with the fit", "disagrees with the fit by {}"),
     Reason.ARM_LEFT_OUT: ("the arm is left out as a whole", ""),
@@ -100,7 +100,7 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
         "far from where the other corners put it",
         "{} px from where the other corners put it",
     ),
-    Reason.NOT_BEFORE: ("not used before", ""),
+    Reason.NOT_BEFORE: ("not used in the previous measurement", ""),
     Reason.BLACK: ("the image is black", "the image is black, at most {} of 255 grey levels"),
     Reason.OVEREXPOSED_IMAGE: (
         "the image is overexposed",
@@ -114,21 +114,33 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
     Reason.MIRRORED: ("the image is mirrored", ""),
     Reason.UPSIDE_DOWN: ("the image is upside down", ""),
     Reason.ZOOMED: (
-        "it shows the legs in another size: zoom, or a crop scaled",
-        "it shows the legs about {} times as large as the others: zoom, or a crop scaled",
+        "it shows the legs in another size: zoomed, or cropped and rescaled",
+        "it shows the legs about {} times as large as the others: zoomed, or cropped and rescaled",
     ),
     Reason.OTHER_READING: ("it shows another reading", "{}"),
     Reason.OTHER_VIEW: ("it was taken by another camera", "{}"),
-    Reason.OTHER_SCENE: ("it does not show the legs where its reading has them", ""),
+    Reason.OTHER_SCENE: ("its legs are not where its readings predict them", ""),
     Reason.BY_HAND: ("rejected by hand", ""),
     Reason.OTHER: ("no reason given", "{}"),
 }
 _PARTNER = "its other outline: "
+# Sentences of earlier versions with other words
+_EARLIER_WORDS = {
+    "edge hardly visible, found on {} % of it": Reason.FAINT,
+    "edge hardly visible": Reason.FAINT,
+    "other outline fails": Reason.PARTNER,
+    "not used before": Reason.NOT_BEFORE,
+    "it shows the legs about {} times as large as the others: zoom, or a crop scaled": (
+        Reason.ZOOMED
+    ),
+    "it shows the legs in another size: zoom, or a crop scaled": Reason.ZOOMED,
+    "it does not show the legs where its reading has them": Reason.OTHER_SCENE,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Why something is not used; false for what is used.
+    """The reason why an observation is not used; false for a used one.
 
     Attributes
     ----------
@@ -161,7 +173,7 @@ class Rejection:
 
     @property
     def as_stored(self) -> Rejection:
-        """The same with the detail as tables have it: in words."""
+        """The same rejection with its detail in words, as stored in tables."""
         return replace(self, detail=str(self.detail))
 
     def __str__(self) -> str:
@@ -172,7 +184,7 @@ USED = Rejection()  # not rejected
 
 
 def have_reason(rejections: Sequence[Rejection], *reasons: Reason) -> BoolArray:
-    """Return a mask (n,) of the rejections for one of some reasons."""
+    """Return a mask (n,) of the rejections for any of some reasons."""
     return np.array([rejection.reason in reasons for rejection in rejections], dtype=np.bool_)
 
 
@@ -182,19 +194,23 @@ def reason_in_words(code: str) -> str:
 
 
 _CODES = frozenset(map(str, Reason))
-_SENTENCES = [  # of versions that stored sentences; the ones with a detail first
-    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), Reason(code))
-    for k in (1, 0)
-    for code, both in WORDS_BY_CODE.items()
-    if (words := both[k]) not in ("", "{}")
+_WORDS = [
+    (forms[k], Reason(code))
+    for k in (1, 0)  # first the sentences with a detail
+    for code, forms in WORDS_BY_CODE.items()
+]
+_SENTENCES = [  # patterns of tables with sentences in place of codes
+    (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), reason)
+    for words, reason in (*_WORDS, *_EARLIER_WORDS.items())
+    if words not in ("", "{}")
 ]
 
 
 def read_rejection(code: str, detail: str) -> Rejection:
     """Return the rejection of the columns ``reason`` and ``detail`` of a table.
 
-    A sentence in place of a code, as earlier versions wrote, is recognised; another text is what
-    somebody noted (``OTHER``).
+    A sentence in place of a code, as earlier versions wrote, is recognised; any other text is a
+    remark of a person (``OTHER``).
     """
     if code in _CODES:
         return Rejection(Reason(code), detail)

@@ -85,10 +85,10 @@ class GaussianPrior:
         return over_sigma if self.whitening is None else self.whitening @ over_sigma
 
     def __add__(self, other: GaussianPrior) -> GaussianPrior:
-        both, whitening = (self, other), None
+        priors, whitening = (self, other), None
         if self.whitening is not None or other.whitening is not None:
             whitening = block_diag(
-                *(np.eye(len(p.mean)) if p.whitening is None else p.whitening for p in both)
+                *(np.eye(len(p.mean)) if p.whitening is None else p.whitening for p in priors)
             )
         return GaussianPrior(
             np.concatenate([self.unknown, other.unknown]),
@@ -128,7 +128,7 @@ class Variables:
         return int(self.unknown.max(initial=-1)) + 1
 
     def read(self, value: Any) -> Array:
-        """Return the coordinates (n_unknowns,) of the block's value."""
+        """Return the coordinates (n_unknowns,) of a value of the block."""
         if self.coordinates is not None:
             return self.coordinates(value)
         unknown, first = np.unique(self.unknown, return_index=True)
@@ -359,7 +359,7 @@ class Constraint(Protocol[S]):
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Columns of the unknowns in x, for the variables and touches that it was built from."""
+    """Columns of the unknowns in x, for given variables and touches."""
 
     variables: tuple[Variables, ...]
     eliminated: Variables | None
@@ -374,7 +374,7 @@ class _Layout:
         eliminated: Variables | None,
         touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...],
     ) -> bool:
-        """Whether the layout was built from these very objects."""
+        """Whether the layout was built from these objects."""
         return (
             self.eliminated is eliminated
             and len(self.variables) == len(variables)
@@ -424,14 +424,14 @@ class EstimationProblem(Generic[S]):
     held_directions: Array = field(
         default_factory=lambda: np.zeros((0, 0))
     )  # (w, m <= n_kept) fixed gauge
-    name: str = "fit"  # and the remedy where it fails, for messages
+    name: str = "fit"  # for messages, with the remedy if it fails
     remedy: str = "check the starting values and the measurements"
-    # Of the problem that this one was made from: what has not changed is not built again
+    # Layout of the original problem; its unchanged parts are reused.
     earlier: _Layout | None = field(default=None, repr=False)
 
     @cached_property
     def layout(self) -> _Layout:
-        """Columns of the unknowns, and which of them each factor touches."""
+        """Columns of the unknowns, and columns of each factor."""
         old = self.earlier
         touches = tuple((factor.touches, factor.element) for factor in self.factors)
         if old is not None and old.is_of(self.variables, self.eliminated, touches):
@@ -543,7 +543,7 @@ class EstimationProblem(Generic[S]):
         return next(factor for factor in self.factors if factor.name == name)
 
     def changed(self, **parts: Any) -> Self:
-        """Return the problem with other fields, and with what they leave of its layout."""
+        """Return the problem with other fields, reusing unchanged parts of its layout."""
         return replace(self, earlier=self.layout, **parts)
 
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
@@ -595,7 +595,7 @@ class EstimationProblem(Generic[S]):
 
     @property
     def is_read_directly(self) -> bool:
-        """Whether coordinates change as x does: :meth:`jacobian` is the identity."""
+        """Whether coordinates change like x: :meth:`jacobian` is the identity."""
         return all(not block.labels or block.jacobian is None for block in self.variables)
 
     def jacobian(self, state: S) -> Array:

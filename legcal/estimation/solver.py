@@ -2,7 +2,7 @@
 
 N x = -g with N = [[U, W], [W^T, V]]: kept unknowns first, then one block for each eliminated
 element. V is block diagonal, so that only the Schur complement U - W V^-1 W^T has to be solved.
-Where exact constraints bind the elements, V, W and their gradient are in coordinates y of the
+If exact constraints apply to the elements, V, W and their gradient are in coordinates y of the
 tangent space of the constraints (:class:`Tangent`), and every step ends with a projection.
 """
 
@@ -44,9 +44,9 @@ _MAX_ELEMENT_STEPS = 3
 _NEARLY_LINEAR = 0.99  # gain ratio, above which damping is dropped
 _NEARLY_LINEAR_DECAY = 1e-3
 _DAMPING_MARGIN = 3.0  # least damping after a failure, over the damping that failed
-_DAMPING_DECAY = 0.3  # of the damping that failed, by step
-_MIN_ITERATIONS = 30  # before the relative tolerance applies
-_RANK_TOLERANCE = 1e-13  # eigenvalues below this part of the largest are rounding
+_DAMPING_DECAY = 0.3  # decay of the failed damping per step
+_MIN_ITERATIONS = 30  # iterations before the relative tolerance applies
+_RANK_TOLERANCE = 1e-13  # eigenvalue that is rounding, relative to the largest
 _MIN_PIVOT = 1e-9  # a scaled block with a pivot below may be singular
 _MIN_SIZE_FOR_FACTOR = 16  # larger matrices are inverted by their Cholesky factor
 
@@ -77,7 +77,10 @@ def minimise(
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
 
-    A pseudo-Huber loss starts wide enough for most residuals and is narrowed while converging.
+    A pseudo-Huber loss starts wide enough for most residuals and is narrowed while converging. At
+    its final width the first of three criteria stops the iteration: the predicted decrease of the
+    cost is at rounding, it is below *tolerance*, or, after the first 30 steps, it is below
+    *relative_tolerance* times the cost.
 
     Parameters
     ----------

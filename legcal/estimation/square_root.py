@@ -48,27 +48,27 @@ def marginal_rows(rows: Array, which: IntArray) -> Array:
 
 
 def eliminate(
-    # (k, r, n_own + n_shared): rows of each group, one over the unit of the unknowns
+    # (k, r, n_nuisance + n_shared): rows of each group, one over the unit of the unknowns
     rows: Array,
-    n_own: int,  # number of leading columns: nuisance unknowns of each group
+    n_nuisance: int,  # number of leading columns: nuisance unknowns of each group
 ) -> Array:
     """Marginalise out the nuisance unknowns of each group of rows; return rows (m, n_shared).
 
     A QR decomposition and an SVD rotate the rows until as few as possible contain nuisance
     unknowns, and these rows are dropped: exact also where the nuisance unknowns are not determined.
     """
-    n_shared = rows.shape[2] - n_own
+    n_shared = rows.shape[2] - n_nuisance
     if rows.shape[0] == 0 or rows.shape[1] == 0:
         return np.zeros((0, n_shared))
-    if n_own == 0:
+    if n_nuisance == 0:
         return rows.reshape(-1, n_shared)
-    if rows.shape[1] < n_own:
-        missing = n_own - rows.shape[1]
+    if rows.shape[1] < n_nuisance:
+        missing = n_nuisance - rows.shape[1]
         rows = np.concatenate([rows, np.zeros((len(rows), missing, rows.shape[2]))], axis=1)
     upper = np.asarray(np.linalg.qr(rows, mode="r"))
-    left, singular, _ = np.linalg.svd(upper[:, :n_own, :n_own])
-    rotated = np.swapaxes(left, 1, 2) @ upper[:, :n_own, n_own:]
-    lower = upper[:, n_own:, n_own:]
+    left, singular, _ = np.linalg.svd(upper[:, :n_nuisance, :n_nuisance])
+    rotated = np.swapaxes(left, 1, 2) @ upper[:, :n_nuisance, n_nuisance:]
+    lower = upper[:, n_nuisance:, n_nuisance:]
     return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(-1, n_shared)])
 
 

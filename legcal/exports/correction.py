@@ -1,10 +1,10 @@
-"""A table from commands to corrected commands, for controllers whose model cannot be changed.
+"""A table from commands to corrected commands, for controllers with a fixed model.
 
-A controller with the nominal model that is asked for the pose X' = FK_nominal(IK_calibrated(X))
-gives its motors the readings at which the calibrated machine stands at X. Poses are those of the
-platform link in the base link, in the machine's own coordinates: as many of x, y, z [mm] and roll,
-pitch, yaw [deg] about fixed axes as it has freedoms, positions before angles; the others follow.
-Between nodes a table is interpolated linearly; what that leaves is measured:
+If a controller with the nominal model is commanded to the pose X' = FK_nominal(IK_calibrated(X)),
+it moves the motors to the readings at which the calibrated machine is at X. Poses are of the
+platform link in the base link, in independent coordinates of the machine: as many of x, y, z [mm]
+and roll, pitch, yaw [deg] about fixed axes as it has freedoms, positions before angles; the others
+follow. Between nodes a table is interpolated linearly; the residual is computed,
 FK_calibrated(IK_nominal(X')) against X.
 """
 
@@ -25,7 +25,7 @@ from legcal.machine.configurations import workspace
 from legcal.machine.coordinates import (
     COORDINATES,
     coordinates_of,
-    own_coordinates,
+    independent_coordinates,
     poses_at_coordinates,
     turned_back,
 )
@@ -36,16 +36,23 @@ from legcal.version import __version__
 
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
-DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}  # by freedoms: at most 4,096 nodes in all
+DEFAULT_NODES = {
+    1: 21,
+    2: 21,
+    3: 11,
+    4: 7,
+    5: 5,
+    6: 4,
+}  # nodes per coordinate by number of freedoms, at most 4,096 in total
 MAX_ROWS = 300_000
-TESTED = 1000  # cells at most in whose middle the table is tried
-SHRINKING, ATTEMPTS = 0.8, 20  # of the grid, until all nodes lie in the travel
-REACHED = 1e-9  # of a leg length
+TESTED = 1000  # largest number of cells in whose middle the table is tested
+SHRINKING, ATTEMPTS = 0.8, 20  # factor of the grid size until all nodes are in the travel, attempts
+REACHED = 1e-9  # residual of a reached pose, in leg lengths
 _SEED = 2002
 
 
 def correction_refusal(subject: Subject) -> str | None:
-    """Return why there is no correction, or None."""
+    """Return the reason for refusing a correction, or None."""
     if subject.nominal is None:
         return "found a model, needed a result, which has a nominal and a calibrated model"
     if not subject.machine.is_determined:
@@ -55,14 +62,14 @@ def correction_refusal(subject: Subject) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """A machine, as the table needs it: poses from coordinates, readings from poses and back."""
+    """A machine for the table: poses from coordinates, readings from poses and back."""
 
     machine: Machine
-    own: IntArray  # which of COORDINATES are the machine's own
+    columns: IntArray  # independent coordinates, as indices into COORDINATES
 
     def poses(self, coordinates: Array, near: Array) -> tuple[Array, BoolArray]:
-        """Return poses (k, 3, 4) with these coordinates (k, m), and where there is one."""
-        return poses_at_coordinates(self.machine, self.own, coordinates, near)
+        """Return poses (k, 3, 4) at coordinates (k, m), and which were reached."""
+        return poses_at_coordinates(self.machine, self.columns, coordinates, near)
 
     def readings(self, poses: Array) -> Array:
         """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
@@ -71,56 +78,56 @@ class _Model:
         return np.where(moved, readings_at_poses(machine, poses), 0.0)
 
     def in_travel(self, q: Array) -> BoolArray:
-        """Say where readings lie in the travel."""
+        """Return which readings are within the travel."""
         ends = np.array([leg.travel for leg in self.machine.legs]).reshape(-1, 2)
         motors = list(self.machine.motors)
         inside = (q >= ends[:, 0]) & (q <= ends[:, 1])
         return np.asarray(inside[:, motors].all(axis=1))
 
     def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
-        """Return the poses (k, 3, 4) near others at readings, and where there is one."""
+        """Return the poses (k, 3, 4) at readings, near others, and which were reached."""
         machine, scale = self.machine, self.machine.size
         motors = list(machine.motors)
-        found = solve(
+        solution = solve(
             equations_of_readings(machine, q[:, motors]),
             poses_after,
             near,
             tolerance=1e-14 * scale,
             unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
         )
-        return found.points, found.worst <= REACHED * scale
+        return solution.points, solution.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the table."""
+    """Return the CSV of the correction table."""
     nominal = subject.nominal
     if nominal is None:
         raise ValueError("a model without a result has no correction")
     calibrated = subject.machine
-    own = own_coordinates(calibrated)
-    n_nodes = _number_of_nodes(options.nodes, len(own))
-    models = _Model(calibrated, own), _Model(nominal, own)
+    columns = independent_coordinates(calibrated)
+    n_nodes = _number_of_nodes(options.nodes, len(columns))
+    models = _Model(calibrated, columns), _Model(nominal, columns)
     ticks, nodes, corrected = _grid(models, n_nodes)
-    shape = (n_nodes,) * len(own)
-    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(own)))
+    shape = (n_nodes,) * len(columns)
+    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(columns)))
     figures = {
-        "coordinates": [COORDINATES[k] for k in own],
+        "coordinates": [COORDINATES[k] for k in columns],
         "nodes": len(nodes),
         "residual": _figures(left),
         "uncorrected": _figures(raw),
         "tested": len(left),
     }
     sentences = _sentences(figures)
-    names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in own]
+    names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in columns]
     lines = [
         f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
-        "# Command the columns corrected_* to a controller with the nominal model: the calibrated",
-        "# platform then stands at the others. Pose of the platform link in the base link; roll,",
-        "# pitch, yaw about fixed x, y, z. Nodes of a grid, the last coordinate changes fastest.",
+        "# Command the columns corrected_* to a controller with the nominal model, to move the",
+        "# calibrated platform to the other columns. Poses are of the platform link in the base",
+        "# link; roll, pitch, yaw are about fixed x, y, z. The last coordinate changes fastest.",
         *(f"# {sentence}" for sentence in sentences),
         ",".join([*names, *(f"corrected_{name}" for name in names)]),
     ]
-    scale = TO_FILE[own]
+    scale = TO_FILE[columns]
     rows = np.concatenate([nodes * scale, corrected * scale], axis=1)
     lines += [",".join(f"{x:.9f}" for x in row) for row in rows.tolist()]
     content = ("\n".join(lines) + "\n").encode()
@@ -128,7 +135,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
 
 
 def _number_of_nodes(given: int | None, m: int) -> int:
-    """Return the nodes along each coordinate."""
+    """Return the number of nodes along each coordinate."""
     n = DEFAULT_NODES[m] if given is None else given
     if n < 2 or n**m > MAX_ROWS:
         most = int(MAX_ROWS ** (1.0 / m) + 1e-9)
@@ -142,16 +149,16 @@ def _number_of_nodes(given: int | None, m: int) -> int:
 def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Array, Array]:
     """Return ticks, nodes (k, m) and corrected nodes (k, m) of the largest grid in the travel.
 
-    It stands about the middle of the workspace and has its proportions.
+    The grid is about the middle of the workspace and has its proportions.
     """
     calibrated, _ = models
-    machine, own = calibrated.machine, calibrated.own
-    centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, own]
-    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, own]
-    there = centre + turned_back(there - centre, own)
+    machine, columns = calibrated.machine, calibrated.columns
+    centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, columns]
+    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, columns]
+    there = centre + turned_back(there - centre, columns)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
     for part in SHRINKING ** np.arange(ATTEMPTS):
-        for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: they leave it first
+        for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: most likely outside
             ticks = list(np.linspace(middle - part * reach, middle + part * reach, n).T)
             nodes = np.array(list(product(*ticks)))
             corrected, reached = _corrected(models, nodes)
@@ -163,9 +170,9 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
 
 
 def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, BoolArray]:
-    """Return corrected coordinates (k, m) of commands, and where both machines reach them.
+    """Return corrected coordinates (k, m) of commands, and which both machines reach.
 
-    Where the calibrated one does not reach all of them they are not corrected.
+    If the calibrated machine does not reach all commands, they are not corrected.
     """
     calibrated, nominal = models
     home = calibrated.machine.home.as_matrix()[:3]
@@ -175,9 +182,9 @@ def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, B
     if not reached.all():
         return commands, reached
     moved, there = nominal.forward(q, X)
-    own = calibrated.own
-    found = coordinates_of(moved)[0][:, own]
-    return commands + turned_back(found - commands, own), reached & there
+    columns = calibrated.columns
+    reached_coordinates = coordinates_of(moved)[0][:, columns]
+    return commands + turned_back(reached_coordinates - commands, columns), reached & there
 
 
 def _residuals(
@@ -194,16 +201,16 @@ def _residuals(
     corners = [corrected[tuple((cells + corner).T)] for corner in product((0, 1), repeat=m)]
     home = calibrated.machine.home.as_matrix()[:3]
     X, _ = calibrated.poses(commands, home)
-    found = []
+    residuals = []
     for asked in (np.mean(corners, axis=0), commands):
         asked_poses, _ = nominal.poses(asked, home)
         reached, _ = calibrated.forward(nominal.readings(asked_poses), X)
-        found.append(_apart(calibrated.machine, reached, X))
-    return found[0], found[1]
+        residuals.append(_pose_errors(calibrated.machine, reached, X))
+    return residuals[0], residuals[1]
 
 
-def _apart(machine: Machine, poses: Array, references: Array) -> Array:
-    """Return the displacement of the first frame leg's platform joint and the rotation, (k, 2)."""
+def _pose_errors(machine: Machine, poses: Array, references: Array) -> Array:
+    """Return the displacement of the origin of R_e, and the rotation, (k, 2) [m, rad]."""
     point = machine.T_platform_Re.as_matrix()[:3, 3]
     off = (poses[:, :, :3] - references[:, :, :3]) @ point + poses[:, :, 3] - references[:, :, 3]
     between = np.swapaxes(references[:, :, :3], 1, 2) @ poses[:, :, :3]
@@ -216,7 +223,7 @@ def _apart(machine: Machine, poses: Array, references: Array) -> Array:
 
 
 def _figures(apart: Array) -> dict[str, float]:
-    """Return root mean squares and maxima."""
+    """Return root mean squares and maxima of displacements and rotations."""
     rms, most = np.sqrt((apart**2).mean(axis=0)), apart.max(axis=0)
     return {
         "rms_dX_m": float(rms[0]),
@@ -227,24 +234,24 @@ def _figures(apart: Array) -> dict[str, float]:
 
 
 def _sentences(figures: dict[str, object]) -> list[str]:
-    """Return what the table leaves, in words."""
-    found = []
-    for key, what in (
+    """Return the residuals of the table in words."""
+    sentences = []
+    for key, label in (
         ("residual", "Between nodes the interpolated table leaves"),
         ("uncorrected", "Without it the platform is off by"),
     ):
         f = figures[key]
         if isinstance(f, dict):
-            found.append(
-                f"{what} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
+            sentences.append(
+                f"{label} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
                 f"rms, {1e3 * f['max_dX_m']:.3g} mm and {np.degrees(f['max_dE_rad']):.3g} deg "
                 f"at most (middles of {figures['tested']} cells)."
             )
-    return found
+    return sentences
 
 
 def _no_grid(machine: Machine) -> str:
-    """Return why there is no grid."""
+    """Return the error of a machine without a grid."""
     return (
         f"{machine.yaml_path}: the correction could not be tabulated: found no box of poses about "
         "the middle of the workspace that both models reach inside the travel, needed one; check "

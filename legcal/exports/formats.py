@@ -1,4 +1,4 @@
-"""The table of formats, and their files written all of them or none."""
+"""The table of formats, and writing their files completely or not at all."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from legcal.files.schema import Document, Number, SparseDocument
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
 
-def _every_machine(subject: Subject) -> str | None:
-    """Refuse none."""
+def _accept_all(subject: Subject) -> str | None:
+    """Accept every machine."""
     return None
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format."""
+    """A format: its renderer, its restrictions and its options."""
 
-    render: Render  # its files, of a subject, options and the path that was asked for
-    refusal: Callable[[Subject], str | None] = _every_machine  # why a machine's class has it not
+    render: Render  # files from a subject, options and the requested path
+    refusal: Callable[[Subject], str | None] = _accept_all  # reason for refusing a machine
     is_folder: bool = False
-    options: tuple[str, ...] = ()  # of ExportOptions that it takes
+    options: tuple[str, ...] = ()  # supported fields of ExportOptions
 
 
 FORMATS: dict[str, Format] = {
@@ -56,7 +56,7 @@ _FOLDER = OutputKind("export", "", "")
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """The written files."""
 
     format: str
     paths: tuple[Path, ...]
@@ -64,7 +64,7 @@ class Exported:
     figures: dict[str, Any]
 
     def document(self) -> dict[str, Any]:
-        """Return what ``legcal export --json`` prints."""
+        """Return the document of ``legcal export --json``."""
         written = [str(path) for path in self.paths]
         return ExportDocument(
             format=self.format, written=written, **self.figures, notes=list(self.notes)
@@ -72,7 +72,7 @@ class Exported:
 
 
 class Residual(Document):
-    """How far the platform is from where it should be between the nodes of a table."""
+    """Errors of the platform between the nodes of a table."""
 
     rms_dX_m: Number
     max_dX_m: Number
@@ -81,7 +81,7 @@ class Residual(Document):
 
 
 class ExportDocument(SparseDocument):
-    """What ``legcal export --json`` prints; beside the files figures of a table of corrections."""
+    """The document of ``legcal export --json``: files, and figures of a correction table."""
 
     format: str
     written: list[str]
@@ -89,7 +89,7 @@ class ExportDocument(SparseDocument):
     nodes: int | None = None
     residual: Residual | None = None  # with the corrected commands
     uncorrected: Residual | None = None
-    tested: int | None = None  # middles of cells
+    tested: int | None = None  # number of tested middles of cells
     notes: list[str]
 
 
@@ -112,16 +112,16 @@ def export(
     path : path
         The file to write, or the folder for ``ros``.
     options : ExportOptions, optional
-        What only some formats ask for.
+        Options of some formats.
     force : bool
-        Replace what is there.
+        Replace existing files.
 
     Raises
     ------
     UsageError
-        If the format or an option is unknown to it, or the path cannot be written.
+        If the format is unknown, does not have an option, or the path cannot be written.
     OutOfClass
-        If the machine's class does not have the format.
+        If the format does not support the type of machine.
     """
     given = ExportOptions() if options is None else options
     format = _format(to)
@@ -151,12 +151,12 @@ def export(
 
 
 def formats_of(subject: Subject) -> tuple[str, ...]:
-    """Return the formats that a machine's class has."""
+    """Return the formats that support the type of machine."""
     return tuple(name for name, format in FORMATS.items() if format.refusal(subject) is None)
 
 
 def _format(to: str) -> Format:
-    """Return a format by its name."""
+    """Return a format by name."""
     if to not in FORMATS:
         raise UsageError(
             f"The export could not be written: found the format '{to}', needed one of "
@@ -166,11 +166,13 @@ def _format(to: str) -> Format:
 
 
 def _check_options(to: str, format: Format, given: ExportOptions) -> None:
-    """Refuse an option that the format does not take."""
+    """Refuse options that the format does not support."""
     nothing = ExportOptions()
     for name in vars(nothing):
         if getattr(given, name) != getattr(nothing, name) and name not in format.options:
-            takes = [other for other, one in FORMATS.items() if name in one.options]
+            takes = [
+                other for other, other_format in FORMATS.items() if name in other_format.options
+            ]
             raise UsageError(
                 f"--{name} could not be used: found it with --to {to}, needed "
                 f"{' or '.join(takes)}; leave it out."
@@ -178,13 +180,13 @@ def _check_options(to: str, format: Format, given: ExportOptions) -> None:
 
 
 def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
-    """Refuse to replace what is exported."""
+    """Refuse to replace the exported files."""
     sources = [subject.machine.yaml_path, subject.machine.urdf_path]
     if subject.result is not None:
         sources.append(subject.result.folder / RESULT_NAME)
     for place in places:
-        there = [one for one in sources if os.path.exists(one) and os.path.exists(place)]
-        if any(os.path.samefile(one, place) for one in there):
+        there = [source for source in sources if os.path.exists(source) and os.path.exists(place)]
+        if any(os.path.samefile(source, place) for source in there):
             raise UsageError(
                 f"{place}: the export could not be written: found a file of {subject.given}, which "
                 "is exported, needed another one; give another path."
@@ -192,7 +194,6 @@ def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
 
 
 def _write_folder(destination: Path, rendered: Rendered, *, force: bool) -> tuple[Path, ...]:
-    """Write the files of a folder."""
     names = [Path(file.name) for file in rendered.files]
     there = [str(name) for name in names if os.path.lexists(destination / name)]
     if there and not force:

@@ -1,12 +1,12 @@
-"""Names of a machine as identifiers and text of other languages, whatever stands in them."""
+"""Names of a machine as identifiers and literals of other languages."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 
-MAX_IDENTIFIER = 40  # letters: a MATLAB name holds 63, with what is put before it
-# Of Python, C and MATLAB alike, so that a machine is called the same in all of them
+MAX_IDENTIFIER = 40  # letters: MATLAB names have at most 63, with prefixes
+# Reserved in Python, C or MATLAB, so that a machine has the same name in all of them.
 _RESERVED = frozenset(
     {
         "false", "none", "true", "and", "as", "assert", "async", "await", "auto", "bool",
@@ -23,32 +23,32 @@ _RESERVED = frozenset(
 
 def identifier(name: str) -> str:
     """Return a name as an identifier of ASCII letters, digits and underscores."""
-    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:MAX_IDENTIFIER].lower()
-    if not found or found[0].isdigit() or found in _RESERVED:
-        found = f"m_{found}".rstrip("_")
-    return found
+    text = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:MAX_IDENTIFIER].lower()
+    if not text or text[0].isdigit() or text in _RESERVED:
+        text = f"m_{text}".rstrip("_")
+    return text
 
 
 def is_identifier(name: str) -> bool:
-    """Say whether a name is an identifier in all of the languages."""
+    """Return whether a name is an identifier in all languages."""
     return re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", name) is not None and name not in _RESERVED
 
 
 def identifiers(names: Iterable[str]) -> list[str]:
-    """Return names as identifiers that differ from each other."""
-    found: list[str] = []
+    """Return names as distinct identifiers."""
+    unique_names: list[str] = []
     for name in names:
         plain, number = identifier(name), 1
         unique = plain
-        while unique in found:
+        while unique in unique_names:
             number += 1
             unique = f"{plain}_{number}"
-        found.append(unique)
-    return found
+        unique_names.append(unique)
+    return unique_names
 
 
 def c_string(text: str) -> str:
-    """Return text as a literal of C, in UTF-8."""
+    """Return text as a C literal, in UTF-8."""
     return '"' + "".join(_c_byte(byte) for byte in text.encode()) + '"'
 
 
@@ -59,10 +59,10 @@ def _c_byte(byte: int) -> str:
 
 
 def matlab_string(text: str) -> str:
-    """Return text as a character row of MATLAB."""
+    """Return text as a character vector of MATLAB."""
     return "'" + text.replace("'", "''") + "'"
 
 
 def comment(text: str) -> str:
-    """Return text that may stand in a comment of any language: ASCII of one line, no end of it."""
+    """Return text for a comment of any language: one line of ASCII without comment ends."""
     return re.sub(r"[^A-Za-z0-9 ._,;:()+=-]", "_", text)

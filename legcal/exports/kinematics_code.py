@@ -1,11 +1,11 @@
-"""Kinematics of a machine as source: its numbers, readings at a pose, pose at readings.
+"""Kinematics of a machine as source code: its numbers, inverse and forward kinematics.
 
-All three languages write the same equations, those of :mod:`legcal.machine.equations` in the links
-of base and platform: lengths of legs, directions that stay across a leg (R joints, legs that are
-fixed to the platform), twists, and the plane of a planar machine. Joints at A on carriages and arms
-are where readings have them; readings at a pose are in closed form, in the working mode of home.
-The pose at readings, or at coordinates of the platform, is followed from a start in short steps by
-Newton's method, so that the assembly mode is kept.
+All three languages have the equations of :mod:`legcal.machine.equations` in the links of base and
+platform: lengths of legs, directions perpendicular to a leg (R joints, legs fixed to the platform),
+twists, and the plane of a planar machine. Joints at A on carriages and arms follow the readings;
+readings at a pose are in closed form, in the working mode of home. The pose at readings, or at
+coordinates of the platform, is followed from a start in short steps by Newton's method, so that the
+assembly mode is kept.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
-from legcal.machine.coordinates import COORDINATES, own_coordinates
+from legcal.machine.coordinates import COORDINATES, independent_coordinates
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.model import Machine
@@ -36,13 +36,13 @@ from legcal.machine.rods import actuator_index
 from legcal.version import __version__
 
 TEMPLATES = Path(__file__).parent / "templates"
-MAX_STEP = 0.05  # of a leg length: what readings or coordinates move, from one pose to the next
-MAX_TURN = 0.25  # [rad] of a short arm
+MAX_STEP = 0.05  # largest motion between poses, relative to the leg length
+MAX_TURN = 0.25  # largest rotation of a short arm between poses [rad]
 _ALONG_PLATFORM = (EquationKind.DIRECTION_1, EquationKind.DIRECTION_2)
 
 
 def kinematics_refusal(subject: Subject) -> str | None:
-    """Return why a machine has no kinematics that Newton's method follows, or None."""
+    """Return the reason for refusing kinematics that Newton's method cannot follow, or None."""
     machine = subject.machine
     if not machine.is_determined:
         return f"found that {machine.undetermined}, needed readings that give the pose"
@@ -55,17 +55,17 @@ def kinematics_refusal(subject: Subject) -> str | None:
 
 
 def python_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return a module of Python."""
+    """Return a Python module."""
     return one_file(_rendered("kinematics.py.jinja", subject.machine, subject.name, repr))
 
 
 def c_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return a source file of C99."""
+    """Return a C99 source file."""
     return one_file(_rendered("kinematics.c.jinja", subject.machine, subject.name, c_string))
 
 
 def matlab_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return a function file of MATLAB; its name is that of the file."""
+    """Return a MATLAB function file, named like its function."""
     name = path.stem
     if not is_identifier(name) or path.suffix != ".m":
         raise UsageError(
@@ -80,7 +80,7 @@ def matlab_files(subject: Subject, options: ExportOptions, path: Path) -> Render
 
 
 def _rendered(template: str, machine: Machine, name: str, quoted: Any, **more: Any) -> str:
-    """Return a template filled in with the numbers of a machine."""
+    """Return a template rendered with the numbers of a machine."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -98,18 +98,18 @@ def _rendered(template: str, machine: Machine, name: str, quoted: Any, **more: A
 
 
 def _row(numbers: Any) -> str:
-    """Return numbers with commas, read back exactly."""
+    """Return numbers separated by commas, read back exactly."""
     return ", ".join(repr(float(x)) for x in np.ravel(numbers))
 
 
 def _numbers(machine: Machine) -> dict[str, Any]:
-    """Return what templates are filled in with."""
+    """Return the variables of the templates."""
     home = machine.home.as_matrix()
     legs, on = machine.legs, actuator_index(machine.legs)
     scale = machine.size
     first = sorted(set(machine.reads))  # the leg of each reading
     home_readings = inverse_kinematics(machine, machine.home)[first]
-    own = own_coordinates(machine)
+    columns = independent_coordinates(machine)
     return {
         "version": __version__,
         "base": machine.base,
@@ -117,7 +117,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
         "legs": [
             {
                 "name": leg.name,
-                "identifier": known,
+                "identifier": identifier,
                 "type": leg.type,
                 "A": leg.A,
                 "B": leg.B,
@@ -128,7 +128,9 @@ def _numbers(machine: Machine) -> dict[str, Any]:
                 "reading": first.index(machine.reads[j]),
                 "hangs_on": on[j],
             }
-            for j, (leg, known) in enumerate(zip(legs, identifiers(machine.leg_names), strict=True))
+            for j, (leg, identifier) in enumerate(
+                zip(legs, identifiers(machine.leg_names), strict=True)
+            )
         ],
         "readings": [
             {
@@ -146,7 +148,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
         ],
         "coordinates": [
             {"name": COORDINATES[k], "number": int(k), "step": MAX_STEP * (scale if k < 3 else 1.0)}
-            for k in own
+            for k in columns
         ],
         "across": [row for j, leg in enumerate(legs) for row in _across(j, leg)],
         "twists": [row for j, leg in enumerate(legs) for row in _twists(j, leg)],
@@ -158,7 +160,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
 
 
 def _step(leg: Leg, length: float) -> float:
-    """Return by how much a reading may change where the joint that it moves goes a length [m]."""
+    """Return the largest change of a reading that moves its joint by a length [m]."""
     if leg.actuator is None or not leg.actuator.turns:
         return length
     arm = float(np.linalg.norm(np.cross(leg.actuator.axis, leg.A - leg.actuator.point)))
@@ -166,7 +168,7 @@ def _step(leg: Leg, length: float) -> float:
 
 
 def _carrier(j: int, mode: int, actuator: Actuator, at_home: float) -> dict[str, Any]:
-    """Return a carriage or an arm, and how its first rod, leg j, gives its reading."""
+    """Return a carriage or an arm, with the solution of its reading from its first rod, leg j."""
     middle = 0.5 * sum(actuator.travel)
     return {
         "leg": j,
@@ -180,22 +182,22 @@ def _carrier(j: int, mode: int, actuator: Actuator, at_home: float) -> dict[str,
 
 
 def _across(j: int, leg: Leg) -> list[dict[str, Any]]:
-    """Return the directions that stay across a leg, in base or platform."""
-    found = []
+    """Return the directions that stay perpendicular to a leg, in base or platform."""
+    directions = []
     for kind in leg.equations:
         if kind is EquationKind.BASE_AXIS:
-            found.append({"leg": j, "in_platform": 0, "direction": leg.base_axis})
+            directions.append({"leg": j, "in_platform": 0, "direction": leg.base_axis})
         elif kind is EquationKind.PLATFORM_AXIS:
-            found.append({"leg": j, "in_platform": 1, "direction": leg.platform_axis})
+            directions.append({"leg": j, "in_platform": 1, "direction": leg.platform_axis})
         elif kind in _ALONG_PLATFORM and leg.platform_axis is not None:
             basis = normal_basis(leg.platform_axis)
             direction: Array = basis[_ALONG_PLATFORM.index(kind)]
-            found.append({"leg": j, "in_platform": 1, "direction": direction})
-    return found
+            directions.append({"leg": j, "in_platform": 1, "direction": direction})
+    return directions
 
 
 def _twists(j: int, leg: Leg) -> list[dict[str, Any]]:
-    """Return the angle between the axes at both ends of a leg that does not twist."""
+    """Return the angle between the axes at both ends of a leg without S."""
     if leg.twist is None or leg.base_axis is None or leg.platform_axis is None:
         return []
     tied = normal_basis(leg.platform_axis)[0] if leg.is_fixed_to_platform else leg.platform_axis

@@ -4,7 +4,7 @@ genhexkins documents (manual page ``kins``): base and platform joint coordinates
 ``genhexkins.base.N.x|y|z`` and ``genhexkins.platform.N.x|y|z`` in machine units; a pose X Y Z A B C
 is the position and the angles about fixed x, y and z [deg], R = Rz(C) Ry(B) Rx(A); joint N is the
 length |xyz + R platform_N - base_N|. ``spindle-offset`` and ``tool-offset`` shift all joints along
-z, ``screw-lead`` corrects screws that turn with their leg: all three are zero in the model.
+z, ``screw-lead`` corrects screws that rotate with their leg: all three are zero in the model.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from legcal.version import __version__
 
 N_STRUTS = 6
 _MM = 1e3
-_PARALLEL = 0.99  # cosine between the rails of a linear Delta
+_PARALLEL = 0.99  # least cosine between the rails of a linear Delta
 
 
 def linuxcnc_refusal(subject: Subject) -> str | None:
-    """Return why a machine is none of genhexkins, or None."""
+    """Return the reason for refusing a machine unsupported by genhexkins, or None."""
     machine, legs = subject.machine, subject.machine.legs
     needed = "needed six legs with motors between universal and spherical joints (genhexkins)"
     if machine.actuators:
@@ -35,7 +35,7 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
             f"; {delta} has the dimensions of an ideal Delta and no others: leave the controller "
             "those of the nominal model and take the correction"
         )
-        upright = all(abs(one.axis @ motor.axis) > _PARALLEL for one in machine.actuators)
+        upright = all(abs(actuator.axis @ motor.axis) > _PARALLEL for actuator in machine.actuators)
         is_delta = machine.mobility == len(machine.actuators) == 3 and len(legs) == N_STRUTS
         is_delta &= motor.turns or upright
         return f"found that the motor '{motor.joint}' moves joints at A, {needed}{ideal * is_delta}"
@@ -50,7 +50,7 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
 
 
 def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the HAL file; what belongs into the INI file stands in its comments."""
+    """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
     home = readings_at(machine, machine.home)
     lines = [
@@ -61,10 +61,10 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
         "# Load it after the module: loadrt genhexkins, or [KINS] KINEMATICS = genhexkins.",
         "",
     ]
-    for what, points in (("base", machine.A_base), ("platform", machine.B_platform)):
+    for side, points in (("base", machine.A_base), ("platform", machine.B_platform)):
         for j, point in enumerate(points):
             lines += [
-                f"setp genhexkins.{what}.{j}.{axis} {float(_MM * x)!r}"
+                f"setp genhexkins.{side}.{j}.{axis} {float(_MM * x)!r}"
                 for axis, x in zip("xyz", point, strict=True)
             ]
         lines.append("")

@@ -1,9 +1,9 @@
-"""MuJoCo's MJCF: the tree as bodies at home, the loops as equality constraints.
+"""MJCF of MuJoCo: the tree as bodies at home, the loops as equality constraints.
 
-Bodies stand at the machine's home, where every loop is closed, and joints count from there (``ref``
-is the joint value at home), so that positions of joints are the values of the URDF, readings among
-them. A ``3d`` closure is a ``<connect>`` and a ``6d`` closure a ``<weld>`` of two sites. Links
-without inertia, or with one that no body has, get a stub, as MuJoCo takes none without.
+Bodies are at the home of the machine, where every loop is closed, and ``ref`` is the joint value at
+home, so that joint positions equal those of the URDF, readings included. A ``3d`` closure is a
+``<connect>`` and a ``6d`` closure a ``<weld>`` of two sites. Links without inertia, or with an
+impossible one, get a stub, which MuJoCo requires.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from legcal.version import __version__
 
 WORLD = "world"
 _X, _Y, _Z = np.eye(3)
-STIFF = "0.001 1"  # solref of closures: a millisecond, critically damped
-GAIN = 1e4  # of the position servos [N/m]
-LEAST = 1e-15  # mass, moment of inertia or size that MuJoCo takes
+STIFF = "0.001 1"  # solref of closures: one millisecond, critically damped
+GAIN = 1e4  # gain of the position servos [N/m]
+LEAST = 1e-15  # least mass, moment of inertia or size that MuJoCo accepts
 
 
 def mjcf_refusal(subject: Subject) -> str | None:
-    """Return why a machine's tree cannot be MuJoCo's, or None."""
+    """Return the reason for refusing a tree that MuJoCo cannot represent, or None."""
     if gains := other_gains(subject.machine):
         return (
             f"found gains other than 1 ({gains}), needed joints that move by their "
@@ -61,7 +61,7 @@ def mjcf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
 
 
 class _Writer:
-    """The bodies of one machine."""
+    """The writer of the bodies of one machine."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -72,7 +72,7 @@ class _Writer:
         for joint in urdf.joints.values():
             self._below.setdefault(joint.parent, []).append(joint)
         self._world = etree.Element("worldbody")
-        self._name = {link: link for link in urdf.links}  # of bodies; the root is the world
+        self._name = {link: link for link in urdf.links}  # names of bodies; the root is the world
         if WORLD in self._name and urdf.root != WORLD:
             self._name[WORLD] = _unused(WORLD, set(urdf.links))
         self._joints = set(urdf.joints)
@@ -80,7 +80,7 @@ class _Writer:
         self._body: dict[str, etree._Element] = {urdf.root: self._world}
 
     def model(self, name: str) -> etree._Element:
-        """Return ``<mujoco>``."""
+        """Return the ``<mujoco>`` element."""
         machine = self._machine
         mujoco = etree.Element("mujoco", model=name)
         etree.SubElement(
@@ -111,7 +111,7 @@ class _Writer:
         return mujoco
 
     def _add(self, joint: UrdfJoint) -> None:
-        """Add the body below a joint."""
+        """Add the child body of a joint."""
         machine, link = self._machine, joint.child
         chain, home = machine.chain, machine.home_configuration
         is_free = joint.type == "floating"
@@ -121,7 +121,8 @@ class _Writer:
         self._body[link] = body
         if is_free:
             etree.SubElement(body, "freejoint", name=joint.name)
-        elif joint.type == "planar":  # of Pinocchio: x and y of the joint frame, then about z
+        elif joint.type == "planar":
+            # As in Pinocchio: x and y of the joint frame, then rotation about z.
             x, y, cosine, sine = home[chain.q_index(joint.name) :][:4]
             turned = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
             for name, kind, axis, value in (
@@ -185,14 +186,14 @@ class _Writer:
 
 
 def _joint(body: etree._Element, name: str, kind: str, axis: Array, value: float) -> etree._Element:
-    """Add a joint at the origin of a body, whose value at home is given."""
+    """Add a joint at the origin of a body, with its value at home."""
     return etree.SubElement(
         body, "joint", name=name, type=kind, axis=_text(*axis), ref=_text(value), damping="1"
     )
 
 
 def _pose(T: RigidTransform) -> dict[str, str]:
-    """Return a pose as attributes."""
+    """Return a pose as XML attributes."""
     x, y, z, w = T.rotation.as_quat()
     return {"pos": _text(*T.translation), "quat": _text(w, x, y, z)}
 
@@ -203,8 +204,8 @@ def _text(*numbers: float) -> str:
 
 
 def _unused(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken."""
-    found = name
-    while found in taken:
-        found += "_"
-    return found
+    """Return an unused name."""
+    unused = name
+    while unused in taken:
+        unused += "_"
+    return unused

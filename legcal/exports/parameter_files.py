@@ -1,7 +1,7 @@
 """Parameters for people and scripts, in millimetres and degrees: ``table``, ``csv``, ``json``.
 
-Every joint stands there twice: in the link that carries it, as its owner knows it, and in R_b or
-R_e, in which it was estimated and which the joints of the ``base_frame`` legs define.
+Every joint is listed twice: in the link that carries it, and in the frame of estimation, R_b or
+R_e, defined by the joints of the ``base_frame`` legs.
 """
 
 from __future__ import annotations
@@ -27,32 +27,35 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from legcal.calibration.documents import JointInLink
 
-UNITS = {"m": (1e3, "mm"), "rad": (float(np.degrees(1.0)), "deg")}  # of files; others stay
+UNITS = {
+    "m": (1e3, "mm"),
+    "rad": (float(np.degrees(1.0)), "deg"),
+}  # units in files; others are unchanged
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
-_DIGITS = 6  # of the table, behind the point
+_DIGITS = 6  # decimals in the table
 _OF_FRAME = re.compile(r"\.(base|platform)(\.[xyz]|_axis\.[12])$")
-_MODEL = "model"  # the status of numbers without a result
+_MODEL = "model"  # status of numbers without a result
 
 
 class Row(NamedTuple):
-    """A number of a machine, in a unit of files."""
+    """A number of a machine, in a unit of the files."""
 
     name: str
-    frame: str  # a link, R_b or R_e; "" where the number does not depend on one
+    frame: str  # a link, R_b or R_e; "" if independent of a frame
     unit: str
     value: float
     nominal: float | None  # None without a result
-    sigma: float | None  # None where it was not estimated
+    sigma: float | None  # None if not estimated
     status: str  # estimated, fixed, weak, frame (defines R_b or R_e), derived (axes) or model
 
     @property
     def change(self) -> float | None:
-        """Value less nominal."""
+        """Value minus nominal."""
         return None if self.nominal is None else self.value - self.nominal
 
 
 def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return one row for each number; numbers are read back exactly."""
+    """Return a CSV with a row for each number, read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -62,7 +65,7 @@ def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
 
 
 def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return aligned text."""
+    """Return a text table with aligned columns."""
     rows = [
         ["" if getattr(row, c) is None else _shown(getattr(row, c)) for c in COLUMNS]
         for row in rows_of(subject)
@@ -81,7 +84,7 @@ def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
 
 def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return legs in links and in R_b and R_e, and the parameters with their covariance."""
-    machine, known = subject.machine, _joints(subject)
+    machine, joints = subject.machine, _joints(subject)
     document: dict[str, Any] = {
         "legcal_export": 1,
         "legcal": __version__,
@@ -94,7 +97,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         "T_platform_Re": _millimetres(machine.T_platform_Re.as_matrix()),
         "home": _millimetres(machine.home.as_matrix()),
         "legs": [
-            _leg(name, in_links, in_frames, known)
+            _leg(name, in_links, in_frames, joints)
             for name, in_links, in_frames in zip(
                 machine.leg_names, machine.legs_of_frames, geometries(machine), strict=True
             )
@@ -107,7 +110,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         unit = {row.name: row.unit for row in result.parameters}
         names = result.kinematic.names
         units = [UNITS.get(unit.get(name, "m"), (1.0, "")) for name in names]
-        scale = np.array([one for one, _ in units])
+        scale = np.array([factor for factor, _ in units])
         covariance = np.array(result.kinematic.covariance) * np.outer(scale, scale)
         document["covariance"] = {
             "names": names,
@@ -118,23 +121,23 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
 
 
 def rows_of(subject: Subject) -> list[Row]:
-    """Return all numbers of a subject."""
+    """Return the rows of a subject."""
     return [*_joint_rows(subject), *_parameter_rows(subject)]
 
 
 def _joint_rows(subject: Subject) -> Iterator[Row]:
-    """Give joint centres and axes in their links."""
+    """Yield the rows of joint centres and axes in their links."""
     machine, nominal = subject.machine, subject.nominal
-    known = _joints(subject)
+    joints = _joints(subject)
     for side, link in (("base", machine.base), ("platform", machine.platform)):
         for j, leg in enumerate(machine.legs_of_frames):
-            joint = known.get((side, leg.name))
+            joint = joints.get((side, leg.name))
             point, axis = _end(leg, side)
             before, turned = None, None
             if nominal is not None:
                 before, turned = _end(nominal.legs_of_frames[j], side)
             if axis is not None and turned is not None and axis @ turned < 0.0:
-                turned = -turned  # an axis is a line
+                turned = -turned  # axes are lines
             for k, letter in enumerate("xyz"):
                 sigma = None if joint is None else joint.sigma[k]
                 yield Row(
@@ -157,15 +160,19 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
 
 
 def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
-    """Give directions and axes of what moves joints at A, in the base link."""
-    before = {} if nominal is None else {one.joint: one for one in nominal.actuators}
+    """Yield the rows of directions and axes of actuators, in the base link."""
+    before = (
+        {}
+        if nominal is None
+        else {nominal_actuator.joint: nominal_actuator for nominal_actuator in nominal.actuators}
+    )
     status = _MODEL if nominal is None else "derived"
     for actuator in machine.actuators:
         other = before.get(actuator.joint)
-        what = "axis" if actuator.turns else "direction"
+        vector = "axis" if actuator.turns else "direction"
         for k, letter in enumerate("xyz"):
             was = None if other is None else float(other.axis[k])
-            name = f"{actuator.joint}.{what}.{letter}"
+            name = f"{actuator.joint}.{vector}.{letter}"
             yield Row(name, machine.base, "", float(actuator.axis[k]), was, None, status)
         for k, letter in enumerate("xyz" * actuator.turns):
             was = None if other is None else 1e3 * float(other.point[k])
@@ -174,7 +181,7 @@ def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
 
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
-    """Return what a result knows of joints in their links, by side and leg."""
+    """Return the joints of a result in their links, by side and leg."""
     links = None if subject.result is None else subject.result.document.links
     return {
         (side, joint.leg): joint for side, block in (links or {}).items() for joint in block.joints
@@ -187,7 +194,7 @@ def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
 
 
 def _parameter_rows(subject: Subject) -> Iterator[Row]:
-    """Give the parameters in R_b and R_e: those of the result, or of the model."""
+    """Yield the rows of the parameters in R_b and R_e, from the result or the model."""
     if subject.result is not None:
         for row in subject.result.document.parameters:
             if not row.is_shown:
@@ -203,23 +210,23 @@ def _parameter_rows(subject: Subject) -> Iterator[Row]:
                 of = f"{name}.{side}.{axis}"
                 yield Row(of, _frame_of(of), "mm", 1e3 * float(x), None, None, _MODEL)
         if leg.kind is not LegKind.PASSIVE:
-            what = "length" if leg.kind is LegKind.CONSTANT else "offset"
-            yield Row(f"{name}.{what}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
+            quantity = "length" if leg.kind is LegKind.CONSTANT else "offset"
+            yield Row(f"{name}.{quantity}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
         if leg.twist is not None:
             degrees = float(np.degrees(leg.twist))
             yield Row(f"{name}.twist", "", "deg", degrees, None, None, _MODEL)
 
 
 def _frame_of(name: str) -> str:
-    """Return the frame of a parameter by its name."""
+    """Return the frame of a parameter."""
     side = _OF_FRAME.search(name)
     return "" if side is None else {"base": "R_b", "platform": "R_e"}[side[1]]
 
 
 def _leg(
-    name: str, in_links: Leg, in_frames: Leg, known: Mapping[tuple[str, str], JointInLink]
+    name: str, in_links: Leg, in_frames: Leg, joints: Mapping[tuple[str, str], JointInLink]
 ) -> dict[str, Any]:
-    """Return a leg of the document."""
+    """Return the entry of a leg in the document."""
     actuator = in_links.actuator
     has_travel = in_links.has_value and bool(np.isfinite(in_links.travel).all())
     scale = UNITS["m" if actuator is None else actuator.unit][0]
@@ -233,12 +240,12 @@ def _leg(
         "A": {
             "link": _point(in_links.A),
             "R_b": _point(in_frames.A),
-            **_uncertainty(known.get(("base", name))),
+            **_uncertainty(joints.get(("base", name))),
         },
         "B": {
             "link": _point(in_links.B),
             "R_e": _point(in_frames.B),
-            **_uncertainty(known.get(("platform", name))),
+            **_uncertainty(joints.get(("platform", name))),
         },
         "base_axis": _axes(in_links.base_axis, in_frames.base_axis, "R_b"),
         "platform_axis": _axes(in_links.platform_axis, in_frames.platform_axis, "R_e"),
@@ -248,20 +255,20 @@ def _leg(
 
 
 def _actuators(machine: Machine) -> dict[str, Any]:
-    """Return what moves joints at A, by joint, in the base link and in R_b."""
+    """Return the entries of actuators, in the base link and in R_b."""
     in_frames = {actuator.joint: actuator for actuator in actuators_of(geometries(machine))}
-    found = {}
+    actuators = {}
     for actuator in machine.actuators:
         there = in_frames[actuator.joint]
-        what = "axis" if actuator.turns else "direction"
-        found[actuator.joint] = {
+        vector = "axis" if actuator.turns else "direction"
+        actuators[actuator.joint] = {
             "kind": actuator.kind.value,
-            what: _axes(actuator.axis, there.axis, "R_b"),
+            vector: _axes(actuator.axis, there.axis, "R_b"),
         }
         if actuator.turns:
             points = {"link": _point(actuator.point), "R_b": _point(there.point)}
-            found[actuator.joint]["point"] = points
-    return {"actuators": found} if found else {}
+            actuators[actuator.joint]["point"] = points
+    return {"actuators": actuators} if actuators else {}
 
 
 def _point(point: Array) -> list[float]:
@@ -270,7 +277,7 @@ def _point(point: Array) -> list[float]:
 
 
 def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
-    """Return what is known of a joint centre in its link [mm, mm^2]."""
+    """Return the uncertainty of a joint centre in its link [mm, mm^2]."""
     if joint is None:
         return {}
     return {
@@ -280,7 +287,7 @@ def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
 
 
 def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str, Any] | None:
-    """Return a direction in its link and frame."""
+    """Return a direction in its link and in its frame."""
     if in_link is None or in_frame is None:
         return None
     return {"link": in_link.tolist(), frame: in_frame.tolist()}
@@ -288,12 +295,12 @@ def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str
 
 def _millimetres(matrix: Array) -> list[list[float]]:
     """Return a motion with its translation in millimetres."""
-    found = matrix.copy()
-    found[:3, 3] *= 1e3
-    rows: list[list[float]] = found.tolist()
+    scaled = matrix.copy()
+    scaled[:3, 3] *= 1e3
+    rows: list[list[float]] = scaled.tolist()
     return rows
 
 
 def _shown(value: str | float) -> str:
-    """Return a cell of the table."""
+    """Return the text of a cell of the table."""
     return value if isinstance(value, str) else f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"

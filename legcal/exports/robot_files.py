@@ -1,8 +1,8 @@
-"""URDF of one file with its loops, and the folder for ROS.
+"""A single URDF file with loops, and the folder for ROS.
 
-The tree is the machine's own, number for number. What a single file cannot hold (meshes) is left
-out; loops become ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
-reads the file without a YAML; other programs skip elements they do not know.
+The tree has exactly the numbers of the machine. Meshes, which a single file cannot hold, are left
+out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
+reads the file without a YAML; other programs skip unknown elements.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from legcal.files.motions import motion_to_xyz_quat
 from legcal.machine.model import Machine
 from legcal.version import __version__
 
-STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about all axes of the link
+STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about each axis of the link
 _SHAPES = ("visual", "collision")
 
 
 def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the URDF."""
+    """Return the URDF file."""
     content, notes = urdf_text(subject.machine, inertia=options.inertia)
     return Rendered((ExportedFile("", content),), notes)
 
 
 def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the URDF and the numbers of the calibration beside it."""
+    """Return the URDF and the numbers of the calibration."""
     content, notes = urdf_text(subject.machine, inertia=options.inertia)
     name = identifier(subject.name)
     document = {
@@ -46,7 +46,7 @@ def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
 
 
 def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...]]:
-    """Return a URDF that stands alone, and what was left out of it."""
+    """Return a self-contained URDF, and the elements left out."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     robot = etree.fromstring(machine.urdf.content, parser)
     meshes = _without_meshes(robot)
@@ -77,29 +77,29 @@ def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...
         )
     if meshes:
         named_meshes = ", ".join(meshes[:3]) + " and more" * (len(meshes) > 3)
-        notes.append(f"Meshes lie in files of their own and were left out: {named_meshes}.")
+        notes.append(f"Meshes are in separate files and were left out: {named_meshes}.")
     return content, tuple(notes)
 
 
 def _without_meshes(robot: etree._Element) -> list[str]:
-    """Remove shapes and textures of other files; return what they were."""
-    found = []
+    """Remove shapes and textures in other files; return their names."""
+    removed = []
     for link in robot.iterfind("link"):
         for shape in [part for part in link if part.tag in _SHAPES]:
             mesh = shape.find("geometry/mesh")
             if mesh is not None:
-                found.append(mesh.get("filename", "a mesh without a name"))
+                removed.append(mesh.get("filename", "a mesh without a name"))
                 link.remove(shape)
     for texture in list(robot.iter("texture")):
         parent = texture.getparent()
         if parent is not None:
-            found.append(texture.get("filename", "a texture without a name"))
+            removed.append(texture.get("filename", "a texture without a name"))
             parent.remove(texture)
-    return found
+    return removed
 
 
 def _stub() -> etree._Element:
-    """Return an inertia that simulators accept."""
+    """Return an inertia accepted by simulators."""
     inertial = etree.Element("inertial")
     etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=repr(STUB_MASS))
@@ -112,7 +112,7 @@ def _stub() -> etree._Element:
 def _calibration(subject: Subject) -> dict[str, object]:
     """Return the numbers of calibration.yaml [m, rad]."""
     machine = subject.machine
-    found: dict[str, object] = {
+    calibration: dict[str, object] = {
         "base_link": machine.base,
         "platform_link": machine.platform,
         "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
@@ -130,14 +130,14 @@ def _calibration(subject: Subject) -> dict[str, object]:
             for leg in machine.legs
         },
     }
-    if machine.actuators:  # which carry the joints of their legs: these are at reading 0
-        found["actuators"] = {a.joint: a.document() for a in machine.actuators}
+    if machine.actuators:  # joints carried by actuators are at reading 0
+        calibration["actuators"] = {a.joint: a.document() for a in machine.actuators}
     if subject.result is not None:
         result = subject.result.document
-        known = {row.name: row for row in result.parameters}
+        row_of = {row.name: row for row in result.parameters}
         names = result.kinematic.names
-        rows = [known.get(name) for name in names]
-        found["parameters"] = {
+        rows = [row_of.get(name) for name in names]
+        calibration["parameters"] = {
             "frames": "R_b and R_e",
             "names": names,
             "units": ["m" if row is None else row.unit for row in rows],
@@ -146,4 +146,4 @@ def _calibration(subject: Subject) -> dict[str, object]:
             "sigma": [None if row is None else row.sigma for row in rows],
             "covariance": np.array(result.kinematic.covariance).tolist(),
         }
-    return found
+    return calibration

@@ -1,4 +1,4 @@
-"""What is exported: a machine, and of a result what is known of its parameters."""
+"""The subject of an export: a machine, and the result that it comes from."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ RESULT_NAME = "result.json"
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What only some formats ask for."""
+    """Options of some formats."""
 
     inertia: bool = False  # urdf, ros: stubs of inertia in links that have none
-    nodes: int | None = None  # correction: of its grid, along each coordinate
+    nodes: int | None = None  # correction: nodes of the grid along each coordinate
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A mechanism, and the result that it comes from, if it does."""
+    """A mechanism, and the result that it comes from, if any."""
 
     machine: Machine
-    given: str  # as the caller named it
-    nominal: Machine | None = None  # of which only the legs are looked at; None of a model
+    given: str  # argument of the caller
+    nominal: Machine | None = None  # nominal machine (legs only); None for a model
     result: EarlierResult | None = None
 
     @property
     def name(self) -> str:
-        """The name of the machine: that of its URDF for a result, else that of its file."""
+        """The name of the machine: from its URDF for a result, else from its file."""
         return model_name(self.machine) if self.result is None else self.machine.urdf.name
 
 
@@ -49,31 +49,31 @@ class Subject:
 class ExportedFile:
     """A file of an export."""
 
-    name: str  # relative to a folder; "" for the one file of a format
+    name: str  # relative to a folder; "" for a single file
     content: bytes
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What a format makes of a subject."""
+    """The files of a format, with notes and figures."""
 
     files: tuple[ExportedFile, ...]
-    notes: tuple[str, ...] = ()  # what the reader should know, one sentence each
+    notes: tuple[str, ...] = ()  # notes for the reader, one sentence each
     figures: Mapping[str, Any] = field(default_factory=dict)  # for ``--json``
 
 
 def one_file(text: str) -> Rendered:
-    """Return the rendering of a format that is one text file."""
+    """Return the rendering of a format with a single text file."""
     return Rendered((ExportedFile("", text.encode()),))
 
 
 def other_gains(machine: Machine) -> str:
-    """Return the gains other than 1 of motors, which formats have no place for, in words."""
+    """Return the motor gains other than 1, which formats cannot hold, in words."""
     return ", ".join(f"'{a.joint}' {a.gain:.9g}" for a in machine.actuators if a.gain != 1.0)
 
 
 def load_subject(given: str | Path) -> Subject:
-    """Return what is exported: the result in a folder or ``result.json``, else a mechanism.
+    """Return the subject of an export: the result in a folder or ``result.json``, else a mechanism.
 
     Raises
     ------
@@ -92,17 +92,19 @@ def load_subject(given: str | Path) -> Subject:
 
 
 def _nominal(result: EarlierResult) -> Machine:
-    """Return the nominal machine of a result, in the same links; its legs alone are nominal."""
+    """Return the nominal machine of a result, in the same links; only its legs are nominal."""
     machine, document = result.machine, result.document
-    known = parametrization_of(machine, twists=True)
+    parametrization = parametrization_of(machine, twists=True)
     rows = {row.name: row for row in document.parameters}
     axes: Mapping[str, Mapping[str, list[float]]] = document.nominal_axes
     legs = []
-    for name, place, leg in zip(machine.leg_names, known.place, geometries(machine), strict=True):
+    for name, place, leg in zip(
+        machine.leg_names, parametrization.place, geometries(machine), strict=True
+    ):
         numbers = np.concatenate([leg.A, leg.B, [leg.q0]])
         for column, at in enumerate(place[: LegColumns.LENGTH + 1].tolist()):
-            if at >= 0 and known.names[at] in rows:
-                numbers[column] = rows[known.names[at]].nominal
+            if at >= 0 and parametrization.names[at] in rows:
+                numbers[column] = rows[parametrization.names[at]].nominal
         base, platform = (axes.get(side, {}).get(name) for side in ("base", "platform"))
         twist = rows.get(f"{name}.twist")
         legs.append(

@@ -1,9 +1,8 @@
 """The output folder: a set of files that appears complete or not at all.
 
-A set of files is first written into a temporary folder beside its destination (in it, where it
-is a file system of its own) and moved there when it is complete. A run that stops before that
-leaves the destination as it was; what the temporary folder of a killed run leaves behind is never
-looked at again.
+A set of files is first written into a temporary folder beside its destination (inside it, if it is
+a separate file system) and moved there when it is complete. A run that stops before that leaves the
+destination as it was; temporary folders left behind by killed runs are ignored.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from legcal.files.schema import read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
-_HEAD = 1000  # bytes of a file, in which its mark stands
-_MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for what is added to it
+_HEAD = 1000  # bytes at the beginning of a file that contain its mark
+_MOST_OF_NAME = 40  # maximum letters of a name, which leave room for an addition
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -50,9 +49,9 @@ def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
 
 
 def path_problem(folder: Path, named: str) -> str | None:
-    """Return what keeps a path from being a relative path inside a folder, or None.
+    """Return in words why a path is not a relative path inside a folder, or None if it is.
 
-    Symbolic links are followed: a link that leads out of the folder is a way out of it.
+    Symbolic links are followed: a link may not lead out of the folder.
     """
     if PurePosixPath(named).is_absolute() or PureWindowsPath(named).is_absolute():
         return "an absolute path"
@@ -69,14 +68,14 @@ def path_problem(folder: Path, named: str) -> str | None:
 class OutputFile:
     """A kind of file."""
 
-    noun: str  # what is written, with its article, for sentences: "the camera"
-    what: str  # what the file is called where it cannot be read: "camera file"
-    key: str  # the entry by which a YAML file of this kind is known; "" if it has none
-    needed: str  # what may stand in its place, for sentences: "a new file or an earlier location"
-    mark: bytes = b""  # by which any other file is known, near its beginning
+    noun: str  # the content, with its article, for sentences: "the camera"
+    what: str  # name of the file in messages about reading it: "camera file"
+    key: str  # the entry that identifies a YAML file of this kind; "" if it has none
+    needed: str  # acceptable file in its place, for sentences: "a new file or an earlier location"
+    mark: bytes = b""  # bytes near the beginning that identify a file of another format
 
     def check_place(self, path: Path, *, force: bool = False) -> None:
-        """Refuse a place where no file can be written, or, without *force*, another one stands."""
+        """Refuse a path where no file can be written, or, without *force*, with another file."""
         start = f"{path}: {self.noun} could not be written: found"
         if not path.name or os.path.isdir(path):
             raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
@@ -85,9 +84,9 @@ class OutputFile:
                 f"{start} no folder {path.parent}, needed one that exists; create it or give "
                 "another file."
             )
-        said = _takes_no_files(path.parent)
-        if said:
-            raise UsageError(f"{start} {said}; give another file.")
+        refusal = _takes_no_files(path.parent)
+        if refusal:
+            raise UsageError(f"{start} {refusal}; give another file.")
         may_go = os.path.isfile(path) if force else self.is_at(path)
         if os.path.lexists(path) and not may_go:
             raise UsageError(
@@ -95,7 +94,7 @@ class OutputFile:
             )
 
     def is_at(self, path: Path) -> bool:
-        """Say whether a file is of this kind."""
+        """Return whether a file is of this kind."""
         try:
             if self.mark:
                 with path.open("rb") as file:
@@ -105,7 +104,7 @@ class OutputFile:
             return False
 
     def write(self, path: Path, content: str | bytes, *, force: bool = False) -> None:
-        """Write a file; an earlier one of its kind is replaced, any other only with *force*."""
+        """Write a file; an earlier file of its kind is replaced, any other only with *force*."""
         self.check_place(path, force=force)
         try:
             data = content.encode() if isinstance(content, str) else content
@@ -121,24 +120,24 @@ class OutputFile:
 class OutputKind:
     """A kind of output folder."""
 
-    noun: str  # what the folder holds
+    noun: str  # the content of the folder, for sentences
     marker: str  # the JSON document that legcal leaves in such a folder; "" if others may be there
     key: str  # a key of that document
 
     def is_in(self, folder: Path) -> bool:
-        """Say whether a folder holds an output of this kind that legcal wrote."""
+        """Return whether a folder holds an output of this kind written by legcal."""
         try:
-            found = read_json(folder / self.marker)
+            document = read_json(folder / self.marker)
         except (OSError, ValueError):
             return False
-        return isinstance(found, dict) and self.key in found
+        return isinstance(document, dict) and self.key in document
 
 
 RESULT = OutputKind("result", "result.json", "legcal_result")
 
 
 def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
-    """Return the path of an output folder; refuse an empty text, which as a path would be "."."""
+    """Return the path of an output folder; refuse an empty text, which would mean "."."""
     if output == "":
         raise UsageError(
             f"The {kind.noun} could not be written: found an empty text, needed the path of a "
@@ -164,7 +163,7 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
 
 
 def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
-    """Refuse a path at which no folder is and none can be made, or that takes no files."""
+    """Refuse a path where no folder exists or can be made, or that cannot be written to."""
     start = f"{destination}: the {kind.noun} could not be written: found"
     remedy = "needed a path that can be created; give another output folder."
     try:
@@ -184,27 +183,27 @@ def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
-    said = _takes_no_files(destination if destination.is_dir() else existing_parent(destination))
-    if said:
-        raise UsageError(f"{start} {said}; give another output folder.")
+    refusal = _takes_no_files(destination if destination.is_dir() else existing_parent(destination))
+    if refusal:
+        raise UsageError(f"{start} {refusal}; give another output folder.")
 
 
-def in_the_way(destination: Path, kind: OutputKind, found: str) -> str:
-    """Return what is said about something that stands where a file of an output belongs."""
+def in_the_way(destination: Path, kind: OutputKind, actual: str) -> str:
+    """Return the message about an obstacle at the path of an output file."""
     return (
-        f"{destination}: the {kind.noun} could not be written: found {found}, needed its place; "
+        f"{destination}: the {kind.noun} could not be written: found {actual}, needed its place; "
         "move it away, or give another folder; nothing was changed."
     )
 
 
 def _takes_no_files(folder: Path) -> str:
-    """Return what keeps files from being created in a folder and what is needed, or "".
+    """Return in words why files cannot be created in a folder and the remedy, or "" if they can.
 
-    One is created: permissions say nothing of disks that are full or read-only, or of ``/proc``.
+    A file is created as a test: permissions do not tell of full or read-only disks, or ``/proc``.
     """
     try:
-        with temporary_folder(folder, "try") as own:
-            (own / "file").write_bytes(b"legcal")
+        with temporary_folder(folder, "try") as trial:
+            (trial / "file").write_bytes(b"legcal")
     except OSError as error:
         return (
             f"that {folder} takes no files ('{error.strerror or error}'), needed permission and "
@@ -214,7 +213,7 @@ def _takes_no_files(folder: Path) -> str:
 
 
 def holds_files(folder: Path) -> bool:
-    """Say whether a folder holds more than what killed runs left behind."""
+    """Return whether a folder holds files other than leftovers of killed runs."""
     return any(not path.name.endswith(TEMPORARY_SUFFIX) for path in folder.iterdir())
 
 
@@ -234,10 +233,10 @@ def result_folder(
     *,
     replaceable: Container[Path] | None = None,
 ) -> Iterator[Path]:
-    """Give a temporary folder whose files become the result when the block ends well.
+    """Give a temporary folder; its files become the result when the block ends without error.
 
     An earlier result is replaced file by file; other files beside it are kept. If the block or
-    the moving is interrupted, the destination is as it was before.
+    the moving is interrupted, the destination is unchanged.
     """
     check_destination(destination, kind)
     try:
@@ -265,7 +264,7 @@ def result_folder(
 
 @contextmanager
 def _named(destination: Path, new: Path) -> Iterator[None]:
-    """Let what is refused in the block speak of the destination, not of the temporary folder."""
+    """Make errors of the block name the destination instead of the temporary folder."""
     try:
         yield
     except LegcalError as error:
@@ -275,23 +274,23 @@ def _named(destination: Path, new: Path) -> Iterator[None]:
 def _check_places(
     new: Path, destination: Path, kind: OutputKind, replaceable: Container[Path] | None
 ) -> None:
-    """Refuse to replace what is no file of an earlier output, and to write through links."""
+    """Refuse to replace anything but files of an earlier output, and to write through links."""
     for name in _files_in(new):
-        found = ""
+        obstacle = ""
         for parent in [destination / above for above in name.parents if above != Path()]:
             if parent.is_symlink() or (parent.exists() and not parent.is_dir()):
-                found = f"{parent.relative_to(destination)}, which is no folder of its own"
-        if not found and os.path.lexists(destination / name):
+                obstacle = f"{parent.relative_to(destination)}, which is no folder of its own"
+        if not obstacle and os.path.lexists(destination / name):
             if (destination / name).is_dir():
-                found = f"{name}, which is a folder"
+                obstacle = f"{name}, which is a folder"
             elif (destination / name).exists() and not (destination / name).is_file():
-                found = f"{name}, which is a pipe or a device"
+                obstacle = f"{name}, which is a pipe or a device"
             elif (
                 replaceable is not None and name not in replaceable and name.parent.name != SCHEMAS
             ):
-                found = f"{name}, which legcal did not write"
-        if found:
-            raise UsageError(in_the_way(destination, kind, found))
+                obstacle = f"{name}, which legcal did not write"
+        if obstacle:
+            raise UsageError(in_the_way(destination, kind, obstacle))
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -302,8 +301,8 @@ def _files_in(folder: Path) -> list[Path]:
 def _workshop(destination: Path) -> Path:
     """Return the folder for temporary files: beside the destination if they can move from there.
 
-    Files do not move from one file system to another, and a folder that is one of its own (a
-    mount) may stand where nothing else may be written: then it is the destination itself.
+    Files do not move between file systems, and the folder above a mount point may not be writable:
+    then it is the destination itself.
     """
     parent = existing_parent(destination)
     if not destination.is_dir():
@@ -313,7 +312,7 @@ def _workshop(destination: Path) -> Path:
 
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
-    """Move files into a folder; if that is interrupted, put back what was there."""
+    """Move files into a folder; if that is interrupted, restore the previous files."""
     names = _files_in(new)
     gone = [name for name in stale if name not in names and (destination / name).is_file()]
     kept = [name for name in names if os.path.lexists(destination / name)] + gone

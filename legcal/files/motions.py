@@ -1,4 +1,4 @@
-"""How files write a rigid motion: ``{xyz: [m], quat_xyzw: [-]}``."""
+"""Rigid motions in files: ``{xyz: [m], quat_xyzw: [-]}``."""
 
 import math
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.files.schema import Document, FileSchema, Metres, Number, Triple
 from legcal.geometry.motions import motion_of
 
-QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
+QUATERNION_TOLERANCE = 1e-3  # rounding of quaternions in files; a larger error is a mistake
 
 Vector = tuple[Metres, Metres, Metres]
 
 
 def _of_unit_norm(quat: tuple[float, ...]) -> tuple[float, ...]:
-    """Refuse a quaternion that is not one of a turn, up to its last digits."""
+    """Refuse a quaternion of a norm other than 1, up to its last digits."""
     norm = math.hypot(*quat)
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise ValueError(
@@ -56,11 +56,11 @@ class Pose(Document):
 
     @classmethod
     def of(cls, T: RigidTransform) -> "Pose":
-        """Return a motion as documents have it."""
+        """Return a motion in the form of documents."""
         return cls(**motion_to_xyz_quat(T))
 
     def motion(self) -> RigidTransform:
-        """Return the motion; ValueError if its quaternion is none of a turn."""
+        """Return the motion; ValueError if its quaternion is not of unit norm."""
         return MotionEntry(**self.model_dump()).motion()
 
 

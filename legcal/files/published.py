@@ -1,4 +1,4 @@
-"""JSON Schemas of the formats, as they come with the package, and the headers that name them.
+"""JSON Schemas of the formats, shipped with the package, and the headers that name them.
 
 The files in ``schemas`` are made from the models that read and write the formats, by
 ``tests/format_schemas.py``. A YAML that legcal writes names its schema in its first line, relative
@@ -10,19 +10,19 @@ from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
-SCHEMAS = ".schemas"  # the folder beside a YAML
+SCHEMAS = ".schemas"  # folder of schemas beside a YAML
 _HEADER = "# yaml-language-server: $schema={}/{}.json\n"
 _NAMED = re.compile(re.escape(_HEADER).replace(r"\{\}", r"([\w.-]+)").encode())
 
 
 def schema_names() -> list[str]:
     """Return the names of the formats that have a schema."""
-    found = (one.name for one in files("legcal.files").joinpath("schemas").iterdir())
-    return sorted(name.removesuffix(".json") for name in found)
+    file_names = (entry.name for entry in files("legcal.files").joinpath("schemas").iterdir())
+    return sorted(name.removesuffix(".json") for name in file_names)
 
 
 def schema_content(name: str) -> bytes:
-    """Return the schema of a format as its file has it."""
+    """Return the content of the schema file of a format."""
     return files("legcal.files").joinpath("schemas", f"{name}.json").read_bytes()
 
 

@@ -1,4 +1,4 @@
-"""A number as somebody states it, with its unit and how well it is known: ``420±0.1 mm``."""
+"""A stated number with its unit and standard deviation: ``420±0.1 mm``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from legcal.files.schema import describe
 LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0}
 ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
 PIXELS: Mapping[str, float] = {"px": 1.0}
-# What people read in place of metres and radians, and by what these are multiplied
+# Units shown in place of metres and radians, and their factors
 SHOWN_IN: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
 
 _NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
@@ -28,32 +28,32 @@ def split_quantity(text: str) -> tuple[float, str]:
     return (float(match[1]), match[2]) if match else (math.nan, "")
 
 
-def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
+def parse_quantity(text: str, units: Mapping[str, float], name: str) -> float:
     """Return a quantity in metres, radians or pixels."""
     value, unit = split_quantity(text)
     if not math.isfinite(value) or (unit not in units and (unit or value != 0.0)):
         raise UsageError(
-            f"{what} could not be used: found {describe(text)}, needed a number and its unit "
+            f"{name} could not be used: found {describe(text)}, needed a number and its unit "
             f"({', '.join(units)}), such as 0.5{next(iter(units))}; write the unit behind the "
             "number."
         )
     if value < 0.0:
         raise UsageError(
-            f"{what} could not be used: found the negative {describe(text)}, needed zero or more; "
+            f"{name} could not be used: found the negative {describe(text)}, needed zero or more; "
             "leave out the sign."
         )
     return value * units.get(unit, 1.0)
 
 
-MIN_SIGMA = 1e-9  # [m, rad, px]; what is known better is fixed
-MAX_SIGMA = 1e6  # [m, rad, px]; no prior
+MIN_SIGMA = 1e-9  # [m, rad, px]; more certain quantities are fixed
+MAX_SIGMA = 1e6  # [m, rad, px]; less certain quantities have no prior
 
 _DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
 _SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
 _DIMENSION = {unit: name for name, units in _DIMENSIONS.items() for unit in units}
 EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
 _NUMBERS = {"value": {"type": "number"}, "sigma": {"type": "number", "exclusiveMinimum": 0}}
-PRIOR_SCHEMA = {  # what read_prior takes, as JSON Schema
+PRIOR_SCHEMA = {  # JSON Schema of the input of read_prior
     "anyOf": [
         {"type": "string", "pattern": r"±|\+/?-"},
         {"type": "array", "prefixItems": [*_NUMBERS.values()], "minItems": 2, "maxItems": 2},
@@ -73,7 +73,7 @@ class Quantity:
 
     value: float  # in SI units or pixels
     sigma: float | None = None  # its standard deviation; None where there is none
-    dimension: str = ""  # what its unit is one of; "" where none was written
+    dimension: str = ""  # kind of its unit; "" if none was written
 
 
 def read_prior(value: object) -> Quantity:
@@ -120,7 +120,7 @@ def _read_prior_text(text: str) -> Quantity:
 
 
 def read_value(text: str) -> Quantity:
-    """Return the number that a text states, with its unit if there is one."""
+    """Parse a number with an optional unit."""
     match = _VALUE.fullmatch(text)
     if match is None or not math.isfinite(float(match[1])):
         raise ValueError(
@@ -137,14 +137,14 @@ def read_value(text: str) -> Quantity:
 
 
 def _in_si(number: float, unit: str) -> float:
-    """Return a number in SI units or pixels, 350 mm as the same number that 0.35 m is."""
+    """Return a number in SI units or pixels; 350 mm is exactly equal to 0.35 m."""
     size = _SIZES.get(unit, 1.0)
     per_one = round(1.0 / size)
     return number / per_one if math.isclose(per_one * size, 1.0, rel_tol=1e-12) else number * size
 
 
 def _prior(value: float, sigma: float, dimension: str = "") -> Quantity:
-    """Return a prior if its numbers make one."""
+    """Return a prior; refuse numbers that make none."""
     if not math.isfinite(value):
         raise ValueError(f"found the value {value:g}, needed a finite one; correct it.")
     if not math.isfinite(sigma) or sigma <= 0.0:
@@ -166,5 +166,5 @@ def _prior(value: float, sigma: float, dimension: str = "") -> Quantity:
 
 
 def _is_number(value: object) -> bool:
-    """Say whether something is a real number; booleans are not."""
+    """Return whether a value is a real number; booleans are not."""
     return isinstance(value, Real) and not isinstance(value, bool)

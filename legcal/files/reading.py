@@ -1,4 +1,4 @@
-"""Reading files of a size that their kind can have: a video that is named as a table is none."""
+"""Reading files with a limit on their size: a video in place of a table is refused."""
 
 import errno
 import json
@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-MAX_TEXT = 16_000_000  # bytes of a table, a YAML, a URDF: as many rows of outlines as one may have
-MAX_DOCUMENT = 32_000_000  # of a JSON document that legcal wrote
+MAX_TEXT = 16_000_000  # bytes of a table, YAML or URDF: enough for the largest table of outlines
+MAX_DOCUMENT = 32_000_000  # bytes of a JSON document from legcal
 MAX_IMAGE = 256_000_000
 
 

@@ -1,4 +1,4 @@
-"""Files that people write: YAML read safely, and what a schema finds wrong, in sentences."""
+"""Files that people write: YAML read safely, and the errors of a schema in sentences."""
 
 import difflib
 import os
@@ -30,10 +30,10 @@ from legcal.causes import Cause
 from legcal.errors import BadValue, Code, DatasetError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
-_MOST_NAMES = 10  # that a hint lists
-_LONGEST_WORD = 100  # for which one that is like it is looked for
+_MOST_NAMES = 10  # maximum number of names in a hint
+_LONGEST_WORD = 100  # maximum length of words for the search of a similar one
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # of which all parsers think the same
+_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # parsed equally by all parsers
 
 _NEEDED = {
     "float_type": "a number",
@@ -56,9 +56,9 @@ NAME_NEEDED = "printable characters without spaces at the ends, the first none o
 
 
 def is_name(name: str) -> bool:
-    """Say whether tables and messages can show a name as it is.
+    """Return whether tables and messages can show a name verbatim.
 
-    What begins like a formula is run as one by programs that open tables.
+    Programs that open tables run a cell that begins like a formula.
     """
     return (
         bool(name)
@@ -69,14 +69,14 @@ def is_name(name: str) -> bool:
 
 
 def _one_plain_line(name: str) -> str:
-    """Refuse a name that tables and messages cannot show as it is."""
+    """Refuse a name that tables and messages cannot show verbatim."""
     if not is_name(name):
         raise BadValue(f"the name {describe(name)}", NAME_NEEDED, "rename it")
     return name
 
 
 def is_plain_name(name: object) -> bool:
-    """Say whether a name can be part of a file name, of joint names and of a list with commas."""
+    """Return whether a name can be part of a file name, of joint names and of a comma list."""
     return isinstance(name, str) and _PLAIN.fullmatch(name) is not None
 
 
@@ -91,7 +91,7 @@ def plain_name(name: object) -> object:
 
 
 def _version(value: object) -> object:
-    """Refuse true, which Python takes for one, and the formats of later versions."""
+    """Refuse ``true``, which equals 1 in Python, and the formats of later versions."""
     if isinstance(value, bool):
         raise BadValue(str(value).lower(), "1", "correct the value")
     if isinstance(value, int) and value > 1:
@@ -103,8 +103,8 @@ def _version(value: object) -> object:
 Version = Annotated[Literal[1], BeforeValidator(_version)]
 Name = Annotated[str, AfterValidator(_one_plain_line)]
 PlainName = Annotated[str, BeforeValidator(plain_name)]
-Number = Annotated[float, Strict()]  # true is not one, nor is text
-Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger ones overflow
+Number = Annotated[float, Strict()]  # neither true nor text is a number
+Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger numbers overflow
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
@@ -125,12 +125,12 @@ class Document(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
 
     def document(self) -> dict[str, Any]:
-        """Return what ``--json`` prints."""
+        """Return the document for ``--json``."""
         return self.model_dump()
 
 
 class SparseDocument(Document):
-    """A document without the keys that are null by default: what a machine or session lacks."""
+    """A document without the null keys of absent parts of a machine or session."""
 
     @model_serializer(mode="wrap")
     def _without_none(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -147,13 +147,13 @@ class _Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
-        seen: set[str] = set()
+        keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise _at(key, "a key that is not a single word")
-            if key.value in seen:
+            if key.value in keys:
                 raise _at(key, f"the key '{key.value}' twice")
-            seen.add(key.value)
+            keys.add(key.value)
             if key.tag != "tag:yaml.org,2002:merge":
                 key.tag = "tag:yaml.org,2002:str"
         return node
@@ -175,7 +175,7 @@ _Loader.add_implicit_resolver(
 
 
 class _QuickLoader(_Loader):
-    """The same with the parser of libyaml: five times as fast, but says less of what is wrong."""
+    """The loader with the parser of libyaml: five times as fast, with poorer error messages."""
 
     def __init__(self, stream: Any) -> None:
         super().__init__("")
@@ -184,22 +184,22 @@ class _QuickLoader(_Loader):
             setattr(self, name, getattr(parser, name))
 
 
-def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
+def _at(node: yaml.Node, actual: str) -> yaml.MarkedYAMLError:
     """Return a YAML error at the place of a node."""
-    return yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark)
+    return yaml.MarkedYAMLError(problem=actual, problem_mark=node.start_mark)
 
 
-def content_of(path: Path, what: str) -> bytes:
+def content_of(path: Path, noun: str) -> bytes:
     """Return the bytes of a file, or refuse it in a sentence."""
     unread = Problem(
-        f"the {what} could not be read",
-        remedy=f"check the path of the {what}",
+        f"the {noun} could not be read",
+        remedy=f"check the path of the {noun}",
         file=str(path),
         code=Code.UNREADABLE_FILE,
     )
     if not os.path.isfile(path):  # unlike that of a Path, False where a name is too long
-        found = "a folder" if os.path.isdir(path) else "no such file"
-        raise DatasetError(replace(unread, found=found, needed="a file", code=Code.MISSING_FILE))
+        actual = "a folder" if os.path.isdir(path) else "no such file"
+        raise DatasetError(replace(unread, found=actual, needed="a file", code=Code.MISSING_FILE))
     try:
         return read_bytes(path, MAX_TEXT)
     except TooLarge as error:
@@ -211,32 +211,32 @@ def content_of(path: Path, what: str) -> bytes:
         raise DatasetError(bad) from error
 
 
-def read_yaml(path: Path, what: str) -> dict[str, Any]:
+def read_yaml(path: Path, noun: str) -> dict[str, Any]:
     """Return the mapping that a YAML file holds, with its keys as text."""
-    return parse_yaml(content_of(path, what), path, what)
+    return parse_yaml(content_of(path, noun), path, noun)
 
 
-def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
+def parse_yaml(content: bytes, path: Path, noun: str) -> dict[str, Any]:
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
-    unread = Problem(f"the {what} could not be read", file=str(path), code=Code.BAD_SYNTAX)
+    unread = Problem(f"the {noun} could not be read", file=str(path), code=Code.BAD_SYNTAX)
     try:
-        found = _loaded(content)
+        document = _loaded(content)
     except yaml.MarkedYAMLError as error:
         bad = replace(unread, found=str(error.problem), needed="YAML", remedy="mend that line")
         if mark := error.problem_mark:
             bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
         raise DatasetError(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        found, needed = _first_line(error), "YAML text in UTF-8"
+        actual, needed = _first_line(error), "YAML text in UTF-8"
     else:
-        if isinstance(found, dict):
-            return typing.cast("dict[str, Any]", found)
-        found, needed = _kind_of(found), "'key: value' lines"
-    raise DatasetError(replace(unread, found=found, needed=needed, remedy="write the file again"))
+        if isinstance(document, dict):
+            return typing.cast("dict[str, Any]", document)
+        actual, needed = _kind_of(document), "'key: value' lines"
+    raise DatasetError(replace(unread, found=actual, needed=needed, remedy="write the file again"))
 
 
 def _loaded(content: bytes) -> Any:
-    """Return what YAML holds, whichever parser there is; both agree where text is plain."""
+    """Return the content of YAML, with either parser; both agree on plain text."""
     if yaml.__with_libyaml__ and _PLAIN_TEXT.fullmatch(content):
         with suppress(yaml.YAMLError):
             return yaml.load(content, Loader=_QuickLoader)
@@ -244,13 +244,13 @@ def _loaded(content: bytes) -> Any:
 
 
 def _first_line(error: Exception) -> str:
-    """Return what an exception says, on one line."""
+    """Return the message of an exception, on one line."""
     text = str(error).strip().splitlines()
     return f"'{text[0]}'" if text else "text nested too deeply"
 
 
 def _kind_of(value: object) -> str:
-    """Return what a foreign file holds, without showing any of it."""
+    """Return the kind of content in a foreign file, without showing any of it."""
     if value is None:
         return "nothing"
     kinds = {str: "text", list: "a list", bool: "true or false", int: "a number", float: "a number"}
@@ -258,18 +258,18 @@ def _kind_of(value: object) -> str:
 
 
 def validate(
-    schema: type[_Schema], found: Mapping[str, Any], path: Path, prefix: str = ""
+    schema: type[_Schema], document: Mapping[str, Any], path: Path, prefix: str = ""
 ) -> _Schema:
-    """Return a mapping as its schema has it; ``prefix`` is its own key in the file."""
+    """Validate a mapping by its schema; ``prefix`` is its key in the file."""
     try:
-        return schema.model_validate(dict(found))
+        return schema.model_validate(dict(document))
     except ValidationError as error:
-        found_wrong = error.errors(include_url=False)
-        raise DatasetError([_problem(schema, e, path, prefix) for e in found_wrong]) from error
+        details = error.errors(include_url=False)
+        raise DatasetError([_problem(schema, e, path, prefix) for e in details]) from error
 
 
 class _Short(reprlib.Repr):
-    """Values as YAML writes them where Python does otherwise."""
+    """Short representations with the YAML forms of values."""
 
     def repr_NoneType(self, value: None, level: int) -> str:
         return "null"
@@ -281,32 +281,32 @@ class _Short(reprlib.Repr):
 
 
 def describe(value: object) -> str:
-    """Return a value as a message shows it, on one short line."""
+    """Return a value in the form for messages, on one short line."""
     short = _Short()
     short.maxstring = short.maxother = 60
     return "nothing" if value is None else short.repr(value)
 
 
-def closest(word: str, known: Iterable[str]) -> str:
-    """Return a hint at the known word most like a given one, or the known words, ten at most."""
-    names = list(known)
+def closest(word: str, candidates: Iterable[str]) -> str:
+    """Return a hint at the name most similar to a word, or a list of at most ten names."""
+    names = list(candidates)
     near = nearest(word, names)
     if near:
         return f"did you mean '{near}'?"
     more = len(names) - _MOST_NAMES
     shown = names[:_MOST_NAMES]
-    rest = f" and {more} more" if more > 0 else ""
-    return f"known are: {', '.join(shown) or 'none'}{rest}"
+    others = f" and {more} more" if more > 0 else ""
+    return f"known are: {', '.join(shown) or 'none'}{others}"
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return the known word most like a given one, "" if none is like it."""
-    near = difflib.get_close_matches(word, known, n=1) if len(word) <= _LONGEST_WORD else []
+def nearest(word: str, names: Iterable[str]) -> str:
+    """Return the name most similar to a word, "" if none is similar."""
+    near = difflib.get_close_matches(word, names, n=1) if len(word) <= _LONGEST_WORD else []
     return near[0] if near else ""
 
 
 def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> Problem:
-    """Return what pydantic found wrong."""
+    """Return an error of pydantic as a problem."""
     loc = [step for step in error["loc"] if not str(step).startswith("[")]  # key, or kind of value
     is_short = error["type"] == "missing" and isinstance(loc[-1], int)
     steps = loc[:-1] if is_short else loc
@@ -320,8 +320,8 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
         done: str = "read",
         code: Code = Code.BAD_VALUE,
     ) -> Problem:
-        what = f"{place} could not be {done}"
-        return Problem(what, found, needed, remedy, str(path), name=place, code=code)
+        sentence = f"{place} could not be {done}"
+        return Problem(sentence, found, needed, remedy, str(path), name=place, code=code)
 
     match error["type"]:
         case "extra_forbidden":
@@ -330,8 +330,8 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
         case "missing" if is_short:
             return refused(f"{loc[-1]} numbers", "more", "add what is missing")
         case "missing":
-            known = _annotation_at(schema, loc)
-            words = typing.get_args(known) if typing.get_origin(known) is Literal else ()
+            annotation = _annotation_at(schema, loc)
+            words = typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
             value = " or ".join(map(str, words))
             remedy = f"add '{loc[-1]}: {value or '...'}' to the file"
             return refused("no such key", value or "it", remedy, code=Code.MISSING_KEY)
@@ -339,8 +339,8 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
             bad = context["error"]
             if isinstance(bad, BadValue):
                 return refused(bad.found, bad.needed, bad.remedy, "used")
-            what = f"{place} could not be used: {bad}"
-            return Problem(what, file=str(path), name=place, code=Code.BAD_VALUE)
+            sentence = f"{place} could not be used: {bad}"
+            return Problem(sentence, file=str(path), name=place, code=Code.BAD_VALUE)
         case "greater_than":
             needed = f"a number greater than {context['gt']:g}"
         case "less_than":
@@ -361,24 +361,24 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
 
 
 def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
-    """Return the keys that a schema knows at a place."""
-    here = _annotation_at(schema, loc)
-    if isinstance(here, type) and issubclass(here, BaseModel):
-        return [f.alias or name for name, f in here.model_fields.items()]
+    """Return the keys of a schema at a location."""
+    annotation = _annotation_at(schema, loc)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [f.alias or name for name, f in annotation.model_fields.items()]
     return []
 
 
 def _annotation_at(schema: type[BaseModel], loc: Iterable[int | str]) -> Any:
-    """Return the type that a schema demands at a place, of several the first with keys."""
-    here: Any = schema
+    """Return the type in a schema at a location; among several, the first one with keys."""
+    annotation: Any = schema
     for step in loc:
-        if isinstance(here, type) and issubclass(here, BaseModel):
-            field = here.model_fields.get(str(step))
-            here = field.annotation if field else None
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            field = annotation.model_fields.get(str(step))
+            annotation = field.annotation if field else None
         else:
-            here = typing.get_args(here)[-1] if typing.get_args(here) else None
-        options = [here, *typing.get_args(here)]
+            annotation = typing.get_args(annotation)[-1] if typing.get_args(annotation) else None
+        options = [annotation, *typing.get_args(annotation)]
         models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
-        is_container = typing.get_origin(here) in (dict, list, tuple)
-        here = here if is_container or not models else models[0]
-    return here
+        is_container = typing.get_origin(annotation) in (dict, list, tuple)
+        annotation = annotation if is_container or not models else models[0]
+    return annotation

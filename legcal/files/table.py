@@ -1,10 +1,9 @@
-"""Tables in CSV, which people edit: the one reader and the one writer of them.
+"""Tables in CSV, which people edit: the single reader and writer of them.
 
-A table is declared by its columns. Reading is strict (just these columns, complete rows, cells that
-hold what their column says) and refuses a file with all of its problems at once:
-:func:`read_table` collects the problems of single cells, the reader of that table adds with
-:meth:`Table.refuse` those of rows together, and :meth:`Table.check` raises them in the order of
-the lines.
+A table is declared by its columns. Reading is strict (exactly these columns, complete rows, cells
+of the declared kind) and refuses a file with all of its problems at once: :func:`read_table`
+collects the problems of single cells, the reader of a particular table adds the problems across
+rows with :meth:`Table.refuse`, and :meth:`Table.check` raises them in the order of the lines.
 """
 
 from __future__ import annotations
@@ -35,35 +34,35 @@ from legcal.files.schema import (
 from legcal.geometry.types import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_MAX_NAMED = 10  # columns that a sentence names
-_TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # of Windows-1252, without what is rare
+_MAX_NAMED = 10  # maximum number of columns named in a sentence
+_TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
-Lines = list[tuple[int, list[str]]]  # those that are not blank: number from 1, stripped cells
+Lines = list[tuple[int, list[str]]]  # lines that are not blank: number from 1, stripped cells
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: what its header and its cells have to be."""
+    """The declaration of a column: its header and its cells."""
 
     name: str
     kind: Literal["text", "number", "whole"] = "number"
-    what: str = ""  # what a number is, for messages; "" for what the whole row is
+    what: str = ""  # noun for a number in messages; "" for the noun of the row
     unit: str = ""  # in words, for messages
-    least: float = -math.inf  # of a number
+    least: float = -math.inf  # limits of a number
     most: float = math.inf
-    needed: str = ""  # says the range in words
+    needed: str = ""  # the range in words
     remedy: str = "correct it or remove the row"
     choices: tuple[str, ...] = ()  # the only texts
     required: bool = True  # in the header
     blank: bool = False  # a cell may be empty; a number is then NaN
-    group: str = ""  # columns of a group stand together, in the header and in each row
+    group: str = ""  # columns of a group are complete or absent, in the header and in each row
 
     def problem(self, text: str) -> str:
-        """Return what a cell needs that it is not, or "" if it is good."""
+        """Return the needed content of an invalid cell in words, or "" if it is valid."""
         if not text and self.blank:
             return ""
         if self.kind == "text":
@@ -83,16 +82,16 @@ class Column:
 
 
 class Table:
-    """The complete rows of a CSV file, their cells stripped, and what is wrong with them.
+    """The complete rows of a CSV file with stripped cells, and their problems.
 
-    ``places[i]`` is where row i is in the file, ``where[i]`` where it is with the file;
-    ``name in table`` says whether a column is there.
+    ``places[i]`` is the place of row i in the file, ``where[i]`` the place with the file;
+    ``name in table`` is true if there is such a column.
     """
 
     def __init__(self, path: Path, thing: str, columns: Sequence[Column]) -> None:
         self.path = path
-        self.thing = thing  # what a row is, for messages
-        self.columns = {column.name: column for column in columns}  # that the header has
+        self.thing = thing  # noun for a row in messages
+        self.columns = {column.name: column for column in columns}  # in the order of the header
         self._rows: list[int] = []
         self._lines: list[int] = []
         self._cells: list[list[str]] = []
@@ -118,7 +117,7 @@ class Table:
         return [Place(str(self.path), row, line) for row, line in rows]
 
     def text(self, name: str) -> tuple[str, ...]:
-        """Return the cells of a column; empty ones of a column that is not there."""
+        """Return the cells of a column; empty cells for an absent column."""
         if name not in self.columns:
             return ("",) * len(self)
         place = self._place(name)
@@ -164,13 +163,13 @@ class Table:
         )
 
     def refuse_cell(self, row: int, name: str, needed: str) -> None:
-        """Refuse one cell that is not what its column needs."""
+        """Refuse a cell with content that is invalid in its column."""
         text, column = self._cells[row][self._place(name)], self.columns[name]
-        found = describe(text) if text else "an empty cell"
-        self.refuse(row, found, needed, name, remedy=column.remedy, what=column.what)
+        actual = describe(text) if text else "an empty cell"
+        self.refuse(row, actual, needed, name, remedy=column.remedy, what=column.what)
 
     def refuse_file(self, problem: Problem) -> None:
-        """Refuse more than one row."""
+        """Refuse several rows with one problem."""
         self._problems.append(problem)
 
     def need(self, names: Iterable[str], rows: BoolArray) -> None:
@@ -182,17 +181,17 @@ class Table:
                 if not texts[row]:
                     self.refuse_cell(row, name, "a finite number")
 
-    def once(self, keys: Sequence[Hashable], same: str) -> None:
-        """Refuse rows with the key of an earlier row; a key of None is not looked at."""
+    def once(self, keys: Sequence[Hashable], repeated: str) -> None:
+        """Refuse rows with the key of an earlier row; a key of None is ignored."""
         first: dict[Hashable, int] = {}
         for row, key in enumerate(keys):
             if key is not None and first.setdefault(key, row) != row:
                 earlier = self.places[first[key]]
-                found, remedy = f"{same} in {earlier}", "remove one of them"
-                self.refuse(row, found, "it once", remedy=remedy, code=Code.REPEATED_ROW)
+                actual, remedy = f"{repeated} in {earlier}", "remove one of them"
+                self.refuse(row, actual, "it once", remedy=remedy, code=Code.REPEATED_ROW)
 
     def keep(self, rows: BoolArray) -> None:
-        """Leave out all but some rows, and what is wrong with the others."""
+        """Keep some rows only, and discard the problems of the others."""
         gone = {line for line, kept in zip(self._lines, rows, strict=True) if not kept}
         kept_rows = np.flatnonzero(rows).tolist()
         self._rows = [self._rows[row] for row in kept_rows]
@@ -208,7 +207,7 @@ class Table:
             raise DatasetError(self._problems)
 
     def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
-        """Take the lines below the header; those that are not complete are refused."""
+        """Add the lines below the header; incomplete lines are refused."""
         columns, n = list(self.columns.values()), len(header)
         order = [header.index(column.name) for column in columns]
         for row, (line, cells) in enumerate(lines, start=1):
@@ -219,9 +218,9 @@ class Table:
                 remedy = "complete or remove the row"
                 if len(cells) > n:
                     remedy = "remove what is too much, and write decimals with points"
-                found = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
+                actual = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
                 needed = f"{n} as in the header"
-                self.refuse(len(self) - 1, found, needed, remedy=remedy, what="row")
+                self.refuse(len(self) - 1, actual, needed, remedy=remedy, what="row")
         problems = self._problems
         self.keep(np.array([bool(cells) for cells in self._cells], dtype=np.bool_))
         self._problems = problems
@@ -248,7 +247,7 @@ class Table:
 
 def read_table(
     path: Path,
-    what: str,
+    noun: str,
     thing: str,
     columns: Sequence[Column],
     *,
@@ -259,70 +258,74 @@ def read_table(
 ) -> Table:
     """Return a CSV file as a table, with the problems of its cells still to be raised.
 
-    ``reshape`` makes what stands in tables of people into the columns that are declared; such
-    tables may be separated by semicolons or tabs and have decimal commas then.
+    ``reshape`` converts free-form tables into the declared columns; such tables may be separated by
+    semicolons or tabs, with decimal commas.
     """
-    lines = _read_lines(path, what, loose=reshape is not None)
+    lines = _read_lines(path, noun, loose=reshape is not None)
     if reshape is not None and lines:
         lines = reshape(lines)
     if needed and len(lines) < 2:
-        found = f"{'a' if lines else 'no'} header and no row"
+        actual = f"{'a' if lines else 'no'} header and no row"
         raise DatasetError(
             Problem(
-                f"the {what} could not be used", found, needed, file=str(path), code=Code.NO_ROW
+                f"the {noun} could not be used", actual, needed, file=str(path), code=Code.NO_ROW
             )
         )
     header = lines[0][1] if lines else []
-    other = re.search(r"[;\t]", header[0]) if len(header) == 1 else None
-    if other:
-        found, needed = f"{other[0]!r} between columns", "',' there and '.' in numbers"
+    separator = re.search(r"[;\t]", header[0]) if len(header) == 1 else None
+    if separator:
+        actual, needed = f"{separator[0]!r} between columns", "',' there and '.' in numbers"
         again = "save it again with commas (CSV)"
-        raise DatasetError(header_problem(path, found, needed, again, Code.BAD_SYNTAX))
-    known = {column.name: column for column in columns}
-    if problems := list(_of_header(path, header, known, what, remedy, unknown)):
+        raise DatasetError(header_problem(path, actual, needed, again, Code.BAD_SYNTAX))
+    column_of_name = {column.name: column for column in columns}
+    if problems := list(_of_header(path, header, column_of_name, noun, remedy, unknown)):
         raise DatasetError(problems)
-    table = Table(path, thing, [known[name] for name in header])
+    table = Table(path, thing, [column_of_name[name] for name in header])
     table._add(lines[1:], header)
     return table
 
 
 def header_problem(path: Path, found: str, needed: str, remedy: str, code: Code) -> Problem:
-    """Return what is wrong with the header of a table."""
-    what = "the columns could not be used"
-    return Problem(what, found, needed, remedy, str(path), HEADER, code=code)
+    """Return a problem of the header of a table."""
+    sentence = "the columns could not be used"
+    return Problem(sentence, found, needed, remedy, str(path), HEADER, code=code)
 
 
 def _of_header(
     path: Path,
     header: Sequence[str],
-    known: dict[str, Column],
-    what: str,
+    columns: dict[str, Column],
+    noun: str,
     remedy: str,
     unknown: Callable[[str], Problem | None],
 ) -> Iterator[Problem]:
-    """Yield what is wrong with the names of columns, each cause once."""
-    strange = [name for name in dict.fromkeys(header) if name not in known]
+    """Yield the problems of the names of columns, one for each cause."""
+    strange = [name for name in dict.fromkeys(header) if name not in columns]
     yield from (problem for name in strange if (problem := unknown(name)))
-    if others := [name for name in strange if not unknown(name)]:
-        near = dict.fromkeys(one for name in others if (one := nearest(name, known)))
-        hint = f"did you mean {_names(near)}?" if near else closest(others[0], known)
-        found = f"the unknown column{'s' * (len(others) > 1)} {_names(others)}"
-        yield header_problem(path, found, f"those of a {what}", hint, Code.UNKNOWN_COLUMN)
-    for name in known:
+    if unknown_names := [name for name in strange if not unknown(name)]:
+        near = dict.fromkeys(
+            near_name for name in unknown_names if (near_name := nearest(name, columns))
+        )
+        hint = f"did you mean {_names(near)}?" if near else closest(unknown_names[0], columns)
+        actual = f"the unknown column{'s' * (len(unknown_names) > 1)} {_names(unknown_names)}"
+        yield header_problem(path, actual, f"those of a {noun}", hint, Code.UNKNOWN_COLUMN)
+    for name in columns:
         if header.count(name) > 1:
-            found = f"the column '{name}' {header.count(name)} times"
-            yield header_problem(path, found, "it once", "remove one", Code.REPEATED_COLUMN)
-    groups = {known[name].group for name in header if name in known} - {""}
-    missing: dict[str, list[str]] = {}  # by what they are
-    for name, column in known.items():
+            actual = f"the column '{name}' {header.count(name)} times"
+            yield header_problem(path, actual, "it once", "remove one", Code.REPEATED_COLUMN)
+    groups = {columns[name].group for name in header if name in columns} - {""}
+    missing: dict[str, list[str]] = {}  # names by description
+    for name, column in columns.items():
         if name not in header and (column.required or column.group in groups):
-            says = ", ".join(filter(None, (column.what, column.unit and f"in {column.unit}")))
-            missing.setdefault(f" ({says})" if says else "", []).append(name)
-    for says, names in missing.items():
+            description = ", ".join(
+                filter(None, (column.what, column.unit and f"in {column.unit}"))
+            )
+            missing.setdefault(f" ({description})" if description else "", []).append(name)
+    for description, names in missing.items():
         s, it = ("s", "them") if len(names) > 1 else ("", "it")
         add = f"add the column{s}{f', or {remedy}' if remedy else ''}"
-        found = f"no column{s} {_names(names)}"
-        yield header_problem(path, found, f"{it}{says}", add, Code.MISSING_COLUMN)
+        actual = f"no column{s} {_names(names)}"
+        yield header_problem(path, actual, f"{it}{description}", add, Code.MISSING_COLUMN)
 
 
 def _names(names: Iterable[str]) -> str:
@@ -345,21 +348,21 @@ def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str
 
 
 def is_number(text: str) -> bool:
-    """Say whether a cell holds a number."""
+    """Return whether a cell holds a number."""
     return math.isfinite(_number_in(text))
 
 
 def _number_in(text: str) -> float:
-    """Return the number in a cell, NaN if it holds no finite one."""
+    """Return the number in a cell, NaN if it holds no finite number."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else math.nan
 
 
 @cache
 def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
-    """Return the pattern of headings with one of some units behind them."""
-    one = "|".join([*map(re.escape, units), "µm", "μm"])
-    return re.compile(rf"(.*?)(?:\s*[\[(]\s*({one})\s*[\])]|[\s_/]({one}))?")
+    """Return the pattern of headings that end with one of some units."""
+    unit_pattern = "|".join([*map(re.escape, units), "µm", "μm"])
+    return re.compile(rf"(.*?)(?:\s*[\[(]\s*({unit_pattern})\s*[\])]|[\s_/]({unit_pattern}))?")
 
 
 def split_heading(text: str, units: Iterable[str] = LENGTH) -> tuple[str, str]:
@@ -373,23 +376,23 @@ def split_heading(text: str, units: Iterable[str] = LENGTH) -> tuple[str, str]:
     return letters, "um" if unit in ("µm", "μm") else unit
 
 
-def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
+def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     """Return the lines that are not blank, numbered from 1, their cells stripped.
 
-    A byte-order mark and either kind of line end are accepted; if ``loose``, also what programs
-    for tables write in other countries.
+    A byte-order mark and either kind of line end are accepted; if ``loose``, also the encodings and
+    separators of spreadsheet programs in other locales.
     """
-    content = content_of(path, what)
+    content = content_of(path, noun)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
         raise DatasetError(
-            f"{path}: the {what} could not be read: found {workbook}, needed CSV; save the sheet "
+            f"{path}: the {noun} could not be read: found {workbook}, needed CSV; save the sheet "
             "as CSV (comma-separated)."
         )
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
-        if delimiter == " ":  # several stand between columns, or at the end
+        if delimiter == " ":  # several may be between columns, or at the end
             text = "\n".join(map(str.strip, text.splitlines()))
         reader = csv.reader(
             io.StringIO(text, newline=""),
@@ -404,13 +407,13 @@ def _read_lines(path: Path, what: str, *, loose: bool = False) -> Lines:
                 cells = [_with_point(cell) for cell in cells]
             lines.append((reader.line_num, cells))
     except (UnicodeDecodeError, csv.Error) as error:
-        found = (
+        actual = (
             f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"
             if isinstance(error, UnicodeDecodeError)
             else f"'{error}'"
         )
         raise DatasetError(
-            f"{path}: the {what} could not be read: found {found}, needed comma-separated text "
+            f"{path}: the {noun} could not be read: found {actual}, needed comma-separated text "
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]
@@ -435,7 +438,7 @@ def _decoded(content: bytes, *, loose: bool) -> str:
 
 
 def _delimiter(text: str) -> str:
-    """Return what separates the cells of the first line that is not blank."""
+    """Return the separator of cells in the first line that is not blank."""
     first = next(filter(None, map(str.strip, text.splitlines())), "")
     return next((mark for mark in ";\t, " if mark in first), ",")
 

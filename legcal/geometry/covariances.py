@@ -9,7 +9,7 @@ def whitener(covariance: Array) -> Array:
     """Return lower triangular W with W C W^T = 1, of positive definite covariances (..., n, n)."""
     if covariance.shape[-1] != 2:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-    # Many small ones: written out, numbers of one place next to each other.
+    # Many small matrices: written out, with equal entries contiguous.
     (first, _), (mixed, second) = np.moveaxis(covariance, (-2, -1), (0, 1))
     W = np.zeros((2, 2, *first.shape))
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,8 +1,8 @@
 """Oriented lines in space: a unit direction u and any point M of the line.
 
-This is the one place that fixes the sign of eq (1): the moment of a line is
-``u x M``, with M measured from the origin of the frame (the camera centre C where the
-frame is a camera). Renaud, Andreff, Gogu, Martinet (2002), eq (1).
+The sign of eq (1) is defined here only: the moment of a line is ``u x M``, with M measured from the
+origin of the frame (the camera centre C in a camera frame). Renaud, Andreff, Gogu, Martinet (2002),
+eq (1).
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ _COORDINATE_AXES = np.eye(3)
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return vector products a x b along the last axis; numpy's own is slow on few of them."""
+    """Return vector products a x b along the last axis; np.cross is slow on few vectors."""
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     i, j, k = b[..., 0], b[..., 1], b[..., 2]
     first = y * k - z * j
@@ -34,7 +34,7 @@ def nearest_point_to_origin(
     u: Array,  # (..., 3) unit directions
     M: Array,  # (..., 3) any point of each line [m]
 ) -> Array:
-    """Return the point of each line that lies nearest to the origin of the frame, (..., 3) [m]."""
+    """Return the point of each line nearest to the origin of the frame, (..., 3) [m]."""
     return np.asarray(M - u * np.sum(u * M, axis=-1, keepdims=True))
 
 
@@ -55,7 +55,7 @@ def normal_basis(
     The choice is a fixed function of u: the coordinate axis least aligned with u, made
     orthogonal to it, comes first; u x e1 comes second.
     """
-    axis = _COORDINATE_AXES[np.abs(u).round(9).argmin(axis=-1)]  # ties are not left to rounding
+    axis = _COORDINATE_AXES[np.abs(u).round(9).argmin(axis=-1)]  # ties independent of rounding
     basis = np.empty((*u.shape[:-1], 2, 3))
     e1, e2 = basis[..., 0, :], basis[..., 1, :]
     np.subtract(axis, u * (u * axis).sum(axis=-1, keepdims=True), out=e1)
@@ -73,9 +73,9 @@ def direction_above(up: Array, turn: float, lift: float) -> Array:
 
 
 def nearest_point_to_line(u: Array, M: Array, d: Array, P: Array) -> Array:
-    """Return the point of each line (u, M) that is nearest to a line along d through P.
+    """Return the point of each line (u, M) nearest to a line along d through P.
 
-    All are (..., 3), u and d unit directions that are not parallel.
+    All are (..., 3); u and d are unit directions, not parallel.
     """
     across = u - d * np.sum(u * d, axis=-1, keepdims=True)
     t = np.sum(across * (P - M), axis=-1) / np.sum(across * across, axis=-1)
@@ -83,10 +83,10 @@ def nearest_point_to_line(u: Array, M: Array, d: Array, P: Array) -> Array:
 
 
 def segment_distance(start_1: Array, span_1: Array, start_2: Array, span_2: Array) -> Array:
-    """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1."""
+    """Return the distances of pairs of segments start + s span, 0 <= s <= 1."""
 
-    def dot(one: Array, other: Array) -> Array:
-        return np.asarray(np.einsum("ni,ni->n", one, other))
+    def dot(first: Array, second: Array) -> Array:
+        return np.asarray(np.einsum("ni,ni->n", first, second))
 
     between = start_1 - start_2
     a, e, b = dot(span_1, span_1), dot(span_2, span_2), dot(span_1, span_2)

@@ -1,6 +1,6 @@
-"""Rigid motions, as transforms, batched as (R, t) or as matrices (..., 4, 4), and point sets.
+"""Rigid motions, as transforms, as batches (R, t) or matrices (..., 4, 4), and point sets.
 
-Matrices are for chains of motions: SciPy's transforms cost ten times what their product does.
+Matrices are for chains of motions: transforms of SciPy are ten times slower than a matrix product.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ def frame_on_points(
     points: Array,  # (3, 3) joint centres in some frame L [m]
     normal: Array | None = None,  # (3,) unit normal of the plane of motion in L, for two points
 ) -> RigidTransform:
-    """Return the frame that three points define: origin, x axis, xy plane (z completes).
+    """Return the frame defined by three points: origin, x axis, xy plane (z completes).
 
-    Two points define the frame of a planar mechanism: its z axis is the normal of the plane, its
-    x axis the direction of the second point in that plane.
+    Two points define the frame of a planar mechanism: its z axis is the normal of the plane, its x
+    axis the direction of the second point in that plane.
     """
     x = points[1] - points[0]
     spread = float(np.linalg.norm(points - points[0], axis=1).max())
@@ -40,27 +40,27 @@ def frame_on_points(
 def look_at(
     position: Array,  # (3,) [m]
     target: Array,  # (3,) [m]
-    roll: float = 0.0,  # about its view [rad]
+    roll: float = 0.0,  # about the viewing direction [rad]
     *,
     up: Array | Sequence[float] = (0.0, 0.0, 1.0),
 ) -> RigidTransform:
-    """Return the pose of a camera that looks at a point, with its y axis down before it rolls."""
+    """Return the pose of a camera that looks at a point, with its y axis down before the roll."""
     z = (target - position) / np.linalg.norm(target - position)
     x = cross(z, np.asarray(up))
     size = np.linalg.norm(x)
-    x = x / size if size >= 1e-6 else normal_basis(z)[0]  # it looks along *up*
+    x = x / size if size >= 1e-6 else normal_basis(z)[0]  # the view is along *up*
     upright = np.column_stack([x, cross(z, x), z])
     return motion_of(upright @ Rotation.from_euler("z", roll).as_matrix(), position)
 
 
 def motion_of(
-    R: Array,  # (..., 3, 3) rotation matrix, orthogonal but for rounding, which is corrected
+    R: Array,  # (..., 3, 3) rotation matrix; rounding is corrected
     t: Array,  # (..., 3) translation [m]
 ) -> RigidTransform:
     """Return the rigid motion of a rotation matrix and a translation.
 
-    Quick: ``RigidTransform.from_components`` decomposes every matrix anew, which is most of the
-    time of reading a model.
+    Faster than ``RigidTransform.from_components``, which decomposes every matrix: most of the time
+    of reading a model.
     """
     return RigidTransform(matrix_of(R, t), normalize=False, copy=False)
 
@@ -75,34 +75,34 @@ def matrix_of(R: Array, t: Array) -> Array:
 
 
 def matrix_product(*matrices: Array) -> Array:
-    """Return the matrix (..., 4, 4) of motions one after the other, the last one first."""
-    found = matrices[0]
+    """Return the matrix (..., 4, 4) of a sequence of motions, the last one applied first."""
+    product = matrices[0]
     for matrix in matrices[1:]:
-        found = found @ matrix
-    return matrix_of(found[..., :3, :3], found[..., :3, 3])
+        product = product @ matrix
+    return matrix_of(product[..., :3, :3], product[..., :3, 3])
 
 
 def matrix_inverse(matrix: Array) -> Array:
     """Return the matrix (4, 4) of the inverse motion."""
-    found = np.eye(4)
-    found[:3, :3] = matrix[:3, :3].T
-    found[:3, 3] = -(found[:3, :3] @ matrix[:3, 3])
-    return found
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -(inverse[:3, :3] @ matrix[:3, 3])
+    return inverse
 
 
 def matrix_applied(matrix: Array, points: Array) -> Array:
-    """Return points (..., 3) moved by the motion of a matrix (4, 4) [m]."""
+    """Return points (..., 3) transformed by a matrix (4, 4) [m]."""
     return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-def pose_distance(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
+def pose_distance(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
     """Return distance [m] and angle [rad] between two poses."""
-    off = one.inv() * other
+    off = first.inv() * second
     return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
 
 
 def product(*motions: RigidTransform) -> RigidTransform:
-    """Return the product of motions, as ``*`` does, quickly; see :func:`motion_of`."""
+    """Return the product of motions, like ``*`` but faster; see :func:`motion_of`."""
     matrix = matrix_product(*[motion.as_matrix() for motion in motions])
     return RigidTransform(matrix, normalize=False, copy=False)
 
@@ -121,16 +121,16 @@ def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
 def moved_poses(R: Array, t: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
     """Return poses (..., 3, 3), (..., 3) after rotation vectors from the left and displacements.
 
-    The exponential map of the rotation beside the translation: Exp(turn) R, t + shift. Estimates
-    use Cayley's map instead (:func:`turned`), which agrees to second order.
+    The map is Exp(turn) R, t + shift. Estimation uses Cayley's map instead (:func:`turned`), which
+    agrees to second order.
     """
     return rotation_matrices(turn) @ R, t + shift
 
 
 def register_points(P_from: Array, P_to: Array) -> RigidTransform:
-    """Return the rigid motion that lays points on points best, unweighted, in closed form.
+    """Return the rigid motion of points onto points, unweighted least squares in closed form.
 
-    A mirror is never returned, and coplanar points are enough.
+    It is never a reflection, and coplanar points suffice.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def register_groups(
     group : (n,) array of int
         The group of each point: 0, 1 and so on.
     weight : (n,) array, optional
-        Weight of each point; all weigh the same without it.
+        Weight of each point, equal by default.
 
     Returns
     -------
@@ -175,9 +175,9 @@ def register_groups(
 def register_in_plane(
     P_from: Array, P_to: Array, group: IntArray, weight: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the motion in the plane z = 0 that lays points on points best, for each group.
+    """Return the motion in the plane z = 0 of points onto points, for each group.
 
-    Two points are enough; heights are not looked at. Otherwise as :func:`register_groups`.
+    Two points suffice; heights are ignored. Otherwise as :func:`register_groups`.
     """
     arm_from, arm_to, centre_from, centre_to, weight = _arms(P_from, P_to, group, weight)
     (x, y), (i, j) = arm_from.T[:2], arm_to.T[:2]
@@ -193,14 +193,14 @@ def register_in_plane(
 def _arms(
     P_from: Array, P_to: Array, group: IntArray, weight: Array | None
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return points from the centres of their groups, these centres, and the weights."""
+    """Return points relative to the centres of their groups, these centres, and the weights."""
     weight = np.ones(len(group)) if weight is None else weight
     whole = np.bincount(group, weights=weight)[:, None]
 
     def centres(points: Array) -> Array:
-        found = np.zeros((len(whole), 3))
-        np.add.at(found, group, weight[:, None] * points)
-        return found / whole
+        sums = np.zeros((len(whole), 3))
+        np.add.at(sums, group, weight[:, None] * points)
+        return sums / whole
 
     centre_from, centre_to = centres(P_from), centres(P_to)
     return P_from - centre_from[group], P_to - centre_to[group], centre_from, centre_to, weight

@@ -25,7 +25,7 @@ def rotation_matrices(w: Array) -> Array:
 
 
 def cayley(w: Array) -> Array:
-    """Return Cayley's rotation matrices (..., 3, 3) of w (..., 3): turns by w [rad] if small.
+    """Return Cayley's rotation matrices (..., 3, 3) of w (..., 3), rotations by w [rad] if small.
 
     w / 2 is the Gibbs vector, tan(angle / 2) along the axis: no branches and no square root.
     """
@@ -35,37 +35,36 @@ def cayley(w: Array) -> Array:
 
 
 def turned(R: Array, w: Array) -> Array:
-    """Return rotation matrices turned from the left by :func:`cayley`, orthogonal to rounding."""
+    """Return rotation matrices rotated from the left by :func:`cayley`, orthogonal to rounding."""
     return orthogonal(cayley(w) @ R)
 
 
 def orthogonal(R: Array) -> Array:
-    """Return rotation matrices (..., 3, 3) without the rounding that made them less than that."""
+    """Return rotation matrices (..., 3, 3) with their rounding errors corrected."""
     return np.asarray(R @ (_HALF_MORE - 0.5 * (np.swapaxes(R, -1, -2) @ R)))
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation matrices nearest to some matrices (..., 3, 3); never a mirror."""
+    """Return the nearest rotation matrices to matrices (..., 3, 3), never reflections."""
     U, _, Vt = np.linalg.svd(matrix)
     flip = np.ones(U.shape[:-1])
     flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
     return np.asarray((U * flip[..., None, :]) @ Vt)
 
 
-def rotation_between(one: Array, other: Array) -> Rotation:
-    """Return the smallest rotation that takes one unit direction (3,) onto another."""
-    normal = cross(one, other)
-    sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
+def rotation_between(first: Array, second: Array) -> Rotation:
+    """Return the smallest rotation of one unit direction (3,) onto another."""
+    normal = cross(first, second)
+    sine, cosine = float(np.linalg.norm(normal)), float(first @ second)
     if sine == 0.0:
-        return Rotation.from_rotvec((0.0 if cosine > 0.0 else np.pi) * normal_basis(one)[0])
+        return Rotation.from_rotvec((0.0 if cosine > 0.0 else np.pi) * normal_basis(first)[0])
     return Rotation.from_rotvec(np.arctan2(sine, cosine) / sine * normal)
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return the angles of a rotation matrix about fixed x, y, z, (3,) [rad], to rounding.
 
-    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
-    makes up for it.
+    Near a pitch of 90 degrees the yaw is poorly determined, and the roll compensates for it.
     """
     r = rotation
     yaw = np.arctan2(r[1, 0], r[0, 0])

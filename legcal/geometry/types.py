@@ -1,4 +1,4 @@
-"""The array types that signatures use."""
+"""Array types for signatures."""
 
 from typing import Any
 

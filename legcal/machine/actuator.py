@@ -6,8 +6,8 @@ A rod of constant length hangs at A, which moves with the reading q of the motor
     revolute   A(q) = c + Rot(w, g q)(a - c)    c a point of the axis, w its direction
 
 a is A at reading 0, and the gain g is 1 unless it is estimated. Several rods may hang on one motor
-(the arm of a Delta carries two): each has the same :class:`Actuator`, known by its joint. An arm
-that is a cylinder (:class:`Arm`) is seen itself: its line turns with A and need not meet it.
+(the arm of a Delta carries two): all have the same :class:`Actuator`, identified by its joint. A
+cylindrical arm (:class:`Arm`) is visible to cameras: its line turns with A and need not meet it.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from legcal.geometry.types import Array
 
 
 class ActuatorKind(StrEnum):
-    """How a motor moves what hangs on it."""
+    """The motion of a motor: translation or rotation."""
 
     PRISMATIC = "prismatic"
     REVOLUTE = "revolute"
 
 
 class ActuatorColumns:
-    """Where the numbers of an actuator stand in those of its legs, after their own twelve."""
+    """Columns of the actuator among the numbers of a leg (:class:`LegColumns`), after 12."""
 
     AXIS, POINT, GAIN = slice(12, 14), slice(14, 16), 16
     ARM_AXIS, ARM_POINT = slice(17, 19), slice(19, 21)
-    LINE, ARM = slice(12, 16), slice(17, 21)  # what the axis is, and the line of the arm
+    LINE, ARM = slice(12, 16), slice(17, 21)  # the line of the axis, the line of the arm
     COUNT = 9
 
 
@@ -47,34 +47,34 @@ class JointMotion(NamedTuple):
     """A joint centre at k readings, and its derivatives."""
 
     A: Array  # (k, 3) [m]
-    by_A: Array  # (k, 3, 3) by A at reading 0; this is also how directions in the arm turn
-    by_axis: Array  # (k, 3, 2) by turns of the axis about its normal_basis
-    by_point: Array  # (k, 3, 2) by displacements of a revolute's axis along its normal_basis
+    by_A: Array  # (k, 3, 3) derivative by A at reading 0, which is also the rotation of the arm
+    by_axis: Array  # (k, 3, 2) derivative by rotations of the axis about its normal_basis
+    by_point: Array  # (k, 3, 2) derivative by displacements of the axis along its normal_basis
     by_gain: Array  # (k, 3)
-    by_q: Array  # (k, 3) by the reading [1, or m/rad]
-    angle: Array  # (k,) by which a revolute has turned [rad]; zero of a prismatic
+    by_q: Array  # (k, 3) derivative by the reading [1, or m/rad]
+    angle: Array  # (k,) rotation of a revolute [rad]; zero for a prismatic
 
 
-US_PER_DEG = (0.1, 1000.0)  # of hobby servos, either way
+US_PER_DEG = (0.1, 1000.0)  # plausible range of |pulse width per degree| of hobby servos
 
 
 @dataclass(frozen=True)
 class Pulses:
-    """How a hobby servo is told where to go: by pulses, one of the centre for joint value 0."""
+    """The pulse widths that command a hobby servo; joint value 0 is at the centre pulse."""
 
-    centre: float  # [us]
+    centre: float  # pulse width at joint value 0 [us]
     per_degree: float  # [us/deg], negative where longer pulses turn it backwards
 
     @staticmethod
     def stated(
         centre: float | None, per_degree: float | None, *, turns: bool = True
     ) -> Pulses | None:
-        """Return the pulses that a file states, None where it says nothing of them.
+        """Return the stated pulses, None if neither number is given.
 
         Raises
         ------
         BadValue
-            If a number is missing or is none of a servo, or the motor does not turn.
+            If a number is missing or implausible for a servo, or the motor does not turn.
         """
         if centre is None and per_degree is None:
             return None
@@ -106,30 +106,30 @@ class Pulses:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line in space, whose four numbers are two turns of its axis and two places across it."""
+    """A line in space; its four numbers are two rotations of its axis and two offsets across it."""
 
     point: Array  # (3,) any point of it [m]
     axis: Array  # (3,) unit
 
     @cached_property
     def across(self) -> Array:
-        """Two directions across its axis (2, 3), by which it turns and moves."""
+        """Two directions perpendicular to the axis (2, 3), along which it rotates and moves."""
         return normal_basis(self.axis)
 
     def moved(self, step: Array) -> Line:
-        """Return the line after a step (4,): turns of its axis, and displacements across it."""
+        """Return the line after a step (4,): rotations of its axis, displacements across it."""
         point = self.point + step[2:] @ self.across
         return Line(point, turned_axis(self.axis, step[:2]))
 
     def in_frame(self, T_to_from: Array) -> Line:
-        """Return the same in another frame, T_to_from (4, 4)."""
+        """Return the line in another frame, T_to_from (4, 4)."""
         return Line(matrix_applied(T_to_from, self.point), T_to_from[:3, :3] @ self.axis)
 
     def numbers(self, nominal: Line) -> Array:
-        """Return its four numbers: turns of the axis from the nominal one, and its place.
+        """Return the four numbers (4,): rotations of the axis from the nominal one, and offsets.
 
-        The place is where the line meets the plane across the nominal axis at the nominal point,
-        from that point.
+        The offsets are those of its intersection with the nominal plane (perpendicular to the
+        nominal axis, through the nominal point) from the nominal point.
         """
         crossing = self._crossing(nominal)[0] - nominal.point
         place = nominal.across @ crossing
@@ -146,27 +146,27 @@ class Line:
         return slope
 
     def _crossing(self, nominal: Line) -> tuple[Array, float, float]:
-        """Return where the line crosses the nominal plane, how far along it, and w . w0."""
+        """Return the point on the nominal plane, its distance along the line, and w . w0."""
         along = float(self.axis @ nominal.axis)
         s = float((nominal.point - self.point) @ nominal.axis) / along
         return self.point + s * self.axis, s, along
 
     @staticmethod
     def with_numbers(nominal: Line, numbers: Array) -> Line:
-        """Return the line that has these four numbers; the inverse of :meth:`numbers`."""
+        """Return the line with these four numbers; the inverse of :meth:`numbers`."""
         point = nominal.point + numbers[2:] @ nominal.across
         return Line(point, turned_axis(nominal.axis, numbers[:2]))
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm that cameras see as a cylinder, where its motor reads 0."""
+    """The visible cylinder of an arm, with its motor at reading 0."""
 
-    line: Line  # about which it is, at its middle, in the frame of its actuator
+    line: Line  # axis of the cylinder through its middle, in the frame of the actuator
     length: float  # [m]
     radius: float  # [m]
     link: str  # the URDF link that carries the visual; it names the part in observations
-    leg: str  # the rod as a part of which observations have it: the first on its motor
+    leg: str  # the rod under which observations list the arm: the first on its motor
 
     @property
     def ends(self) -> Array:
@@ -189,16 +189,16 @@ class Actuator:
     joint: str  # the URDF joint, whose value is the reading [m or rad]
     kind: ActuatorKind
     axis: Array  # (3,) unit: d of a prismatic, w of a revolute
-    point: Array  # (3,) a point of a revolute's axis [m]; of a prismatic where its joint stands
+    point: Array  # (3,) a point of a revolute's axis [m]; of a prismatic the origin of its joint
     travel: tuple[float, float]  # limits of the joint [m or rad]
     link: str = ""  # the carriage or arm
     gain: float = 1.0  # true motion over reading
     pulses: Pulses | None = None  # of a hobby servo
-    arm: Arm | None = None  # where cameras see it as a cylinder
+    arm: Arm | None = None  # the visible cylinder, if the arm is one
 
     @cached_property
     def line(self) -> Line:
-        """The axis of a revolute."""
+        """The axis of a revolute, as a line."""
         return Line(self.point, self.axis)
 
     @property
@@ -212,7 +212,7 @@ class Actuator:
         return "rad" if self.turns else "m"
 
     def with_arm(self, A: Array, radius: float, leg: str) -> Actuator:
-        """Return it with a round arm from its axis to the middle of joints (n, 3) at reading 0."""
+        """Return the actuator with a round arm, from its axis to the middle of A (n, 3)."""
         middle = A.mean(axis=0)
         along = middle - self.point
         along = along - (along @ self.axis) * self.axis
@@ -221,7 +221,7 @@ class Actuator:
         return replace(self, arm=Arm(line, length, radius, self.link, leg))
 
     def rotations(self, q: Array) -> Array:
-        """Return how directions fixed in the carriage or arm turn at readings, (k, 3, 3)."""
+        """Return the rotations (k, 3, 3) of the carriage or arm at readings (k,)."""
         q = np.asarray(q, dtype=np.float64)
         if not self.turns:
             return np.broadcast_to(np.eye(3), (len(q), 3, 3))
@@ -230,16 +230,16 @@ class Actuator:
         return np.asarray(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K))
 
     def at(self, A: Array, q: Array) -> Array:
-        """Return the joint centre (k, 3) that is at A (3,) at reading 0, at readings (k,)."""
+        """Return the joint centre (k, 3) at readings (k,); it is at A (3,) at reading 0."""
         q = np.asarray(q, dtype=np.float64)
         if not self.turns:
             return np.asarray(A + self.gain * q[:, None] * self.axis)
         return np.asarray(self.point + self.rotations(q) @ (A - self.point))
 
     def path(self, A: Array) -> tuple[Array, Array, Array, Array]:
-        """Return middle, cos, sin and slide (3,) of a joint centre that is at A (3,) at reading 0.
+        """Return middle, cos, sin and slide (3,) of the path of a joint at A (3,) at reading 0.
 
-        It is at middle + cos cosine(g q) + sin sine(g q) + slide q.
+        Its position is middle + cos cosine(g q) + sin sine(g q) + slide q.
         """
         zero = np.zeros(3)
         if not self.turns:
@@ -249,7 +249,7 @@ class Actuator:
         return A - cos, cos, sin, zero
 
     def motion(self, A: Array, q: Array) -> JointMotion:
-        """Return the same with its derivatives."""
+        """Return :meth:`at` with its derivatives."""
         q = np.asarray(q, dtype=np.float64)
         k, basis = len(q), self.line.across
         if not self.turns:
@@ -278,7 +278,7 @@ class Actuator:
         )
 
     def moved(self, step: Array) -> Actuator:
-        """Return it after a step (9,): turns of its axis, its point, its gain, and its arm."""
+        """Return the actuator after a step (9,): its axis (rotations, point), gain and arm."""
         arm = self.arm
         return replace(
             self.with_line(self.line.moved(step[:4])),
@@ -287,19 +287,20 @@ class Actuator:
         )
 
     def with_line(self, line: Line) -> Actuator:
-        """Return it with another axis."""
+        """Return the actuator with another axis."""
         return replace(self, axis=line.axis, point=line.point)
 
     def in_frame(self, T_to_from: Array) -> Actuator:
-        """Return the same in another frame, T_to_from (4, 4)."""
+        """Return the actuator in another frame, T_to_from (4, 4)."""
         line, arm = self.line.in_frame(T_to_from), self.arm
         moved = None if arm is None else replace(arm, line=arm.line.in_frame(T_to_from))
         return replace(self.with_line(line), arm=moved)
 
     def numbers(self, nominal: Actuator) -> Array:
-        """Return its nine numbers: those of its axis, its gain, and those of the line of its arm.
+        """Return the nine numbers (9,): four of the axis, the gain, four of the line of the arm.
 
-        They are :meth:`Line.numbers`; a prismatic has no place, and without an arm its are zero.
+        Lines are :meth:`Line.numbers`; offsets of a prismatic and numbers of a missing arm are
+        zero.
         """
         axis, arm = self.line.numbers(nominal.line), np.zeros(4)
         if not self.turns:
@@ -319,7 +320,7 @@ class Actuator:
         return slope
 
     def with_numbers(self, nominal: Actuator, numbers: Array) -> Actuator:
-        """Return the actuator that has these nine numbers; the inverse of :meth:`numbers`."""
+        """Return the actuator with these nine numbers; the inverse of :meth:`numbers`."""
         line, arm = Line.with_numbers(nominal.line, numbers[:4]), self.arm
         if arm is not None and nominal.arm is not None:
             arm = replace(arm, line=Line.with_numbers(nominal.arm.line, numbers[5:]))
@@ -327,7 +328,7 @@ class Actuator:
         return replace(self, axis=line.axis, point=point, gain=float(numbers[4]), arm=arm)
 
     def placed(self, document: Mapping[str, Any]) -> Actuator:
-        """Return it where a result has it; the inverse of :meth:`document`."""
+        """Return the actuator as a result document places it; the inverse of :meth:`document`."""
         if not self.turns:
             return replace(self, axis=np.array(document["direction"]))
         axis, point, arm = np.array(document["axis"]), np.array(document["point"]), self.arm
@@ -337,16 +338,16 @@ class Actuator:
         return replace(self, axis=axis, point=point, arm=arm)
 
     def document(self) -> dict[str, Any]:
-        """Return it as result files have it, in its frame."""
+        """Return the actuator as an entry of result files, in its frame."""
         if not self.turns:
             return {"kind": self.kind.value, "direction": self.axis.tolist()}
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             "kind": self.kind.value,
             "point": self.point.tolist(),
             "axis": self.axis.tolist(),
         }
         if self.arm is None:
-            return found
+            return document
         line = self.arm.line
         arm = {"link": self.arm.link, "point": line.point.tolist(), "axis": line.axis.tolist()}
-        return found | {"arm": arm}
+        return document | {"arm": arm}

@@ -31,21 +31,21 @@ from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
 from legcal.machine.solver import poses_after, solve
 
 TRIALS = 40
-CLOSED = 1e-10  # of the size of the machine
+CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
 ROUNDING = 1e-13
-MAX_HOME_RESIDUAL = 0.01  # of the size: a home written with few digits is nearer
+MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
 PARALLEL = 1e-9
-FREE_TRAVEL = (0.5, 1.5)  # of the length at home, for passive sliders without limits
+FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
 
 
 @dataclass(frozen=True, eq=False)
 class AssembledLeg:
-    """A leg of which everything is known."""
+    """A leg with all its numbers."""
 
     name: str
     type: LegType
     kind: LegKind
-    A_base: Array  # (3,) joint centre in the base link [m]; on a motor that at reading 0
+    A_base: Array  # (3,) joint centre in the base link [m], with its motor at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]
@@ -54,7 +54,7 @@ class AssembledLeg:
     rod: float | None  # radius of the half at the platform [m]
     base_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
     platform_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
-    actuator: Actuator | None = None  # what its joint at A rides on, in the base link
+    actuator: Actuator | None = None  # the motor that carries A, in the base link
     q_home: float = 0.0  # the reading of that motor at home [m or rad]
 
     @property
@@ -65,13 +65,13 @@ class AssembledLeg:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A machine of which everything is known."""
+    """A machine with all its numbers."""
 
     name: str
     legs: tuple[AssembledLeg, ...]
-    home: Home  # a pose in which it closes, as the file gets it
+    home: Home  # a pose in which it closes, as written to the file
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
-    planar: bool  # whether it moves in the xy plane of base and platform
+    planar: bool  # motion in the xy plane of base and platform
     home_readings: Mapping[str, float] = field(default_factory=dict)  # as stated [m or rad]
 
     @property
@@ -114,12 +114,12 @@ def assemble(described: Description) -> Assembled:
 
 
 def all_revolute(described: Description) -> bool:
-    """Say whether all joints are R, as in planar mechanisms."""
+    """Return whether all joints are R, as in planar mechanisms."""
     return all(leg.type.is_planar for leg in described.legs)
 
 
 def _in_a_plane(legs: Sequence[AssembledLeg]) -> bool:
-    """Say whether all axes are parallel revolutes across all legs."""
+    """Return whether all axes are parallel revolutes across all legs."""
     n = legs[0].base_axis
     return all(
         leg.type.is_planar
@@ -131,7 +131,7 @@ def _in_a_plane(legs: Sequence[AssembledLeg]) -> bool:
 
 
 def is_planar(legs: Sequence[AssembledLeg], T: RigidTransform) -> bool:
-    """Say whether the plane of motion is the xy plane of base and platform link."""
+    """Return whether the plane of motion is the xy plane of base and platform link."""
     z = np.array([0.0, 0.0, 1.0])
     upright = np.linalg.norm(cross(legs[0].base_axis, z)) < PARALLEL
     return _in_a_plane(legs) and bool(upright) and bool(T.rotation.apply(z)[2] > 1.0 - 1e-15)
@@ -170,7 +170,7 @@ def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
 
 
 def _base_frame(described: Description, count: int) -> tuple[str, ...]:
-    """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first that do."""
+    """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first possible."""
     legs = described.legs
     if described.base_frame is not None:
         names = [leg.name for leg in legs]
@@ -198,7 +198,7 @@ def _base_frame(described: Description, count: int) -> tuple[str, ...]:
 
 
 def _degenerate(described: Description, chosen: Sequence[int]) -> bool:
-    """Say whether the joints of some legs define no frame."""
+    """Return whether the joints of some legs define no frame."""
     try:
         for side in ("A_base", "B_platform"):
             frame_on_points(np.array([getattr(described.legs[j], side) for j in chosen]))
@@ -208,7 +208,6 @@ def _degenerate(described: Description, chosen: Sequence[int]) -> bool:
 
 
 def _refuse(problems: list[str]) -> None:
-    """Raise all problems at once, if there are any."""
     if problems:
         raise ModelError(problems)
 
@@ -216,28 +215,28 @@ def _refuse(problems: list[str]) -> None:
 def home_of_description(described: Description) -> Home:
     """Return a pose in which a machine closes, projected onto what its legs keep constant.
 
-    Without a given one it is the pose where all motors are at the middle of their travel that
-    turns the platform least; of mirror images in the plane of the base joints the one on the
-    positive side of z is taken.
+    If no home is given, all motors are at the middle of their travel; among such poses the one with
+    the smallest rotation of the platform is taken, and of mirror images in the plane of the base
+    joints the one on the positive side of z.
     """
     if described.home is not None:
         return _project(described, described.home)
     closure = _ClosingEquations(described, mid_travel=True)
-    found = _search(closure, turning=False) or _search(closure, turning=True)
-    if found is None:
+    home = _search(closure, turning=False) or _search(closure, turning=True)
+    if home is None:
         raise ModelError(
             f"{described.source}: no home was found: no pose has all motors at the middle of "
             "their travel with their axes in place, needed a pose in which the machine closes; "
             "write home, or correct the joints, offsets or travel."
         )
-    return found
+    return home
 
 
 class _ClosingEquations:
     """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
 
-    Unknown are the pose and the readings of motors that carry joints, which stand still where home
-    is at mid-travel. Residuals are parts of the machine's size.
+    Unknown are the pose and the readings of motors that carry joints; the readings are fixed if
+    home is at mid-travel. Residuals are relative to the size of the machine.
     """
 
     def __init__(self, described: Description, *, mid_travel: bool) -> None:
@@ -265,9 +264,9 @@ class _ClosingEquations:
             return np.zeros((len(q), 0)), np.zeros((len(q), 0, 6))
         R, t = poses[:, :, :3], poses[:, :, 3]
         with np.errstate(invalid="ignore"):  # a leg without length has no direction
-            found = posture_constraints(self.legs, R, t, q)
-        values = [found.values / self.size]
-        slopes = [np.concatenate([found.by_pose, found.by_q], axis=2) / self.size]
+            equations = posture_constraints(self.legs, R, t, q)
+        values = [equations.values / self.size]
+        slopes = [np.concatenate([equations.by_pose, equations.by_q], axis=2) / self.size]
         if self.still is not None:
             slopes[0][:, :, 6:] = 0.0
         for leg in self.legs if self.planar else ():
@@ -279,12 +278,14 @@ class _ClosingEquations:
         return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
 
     def readings_at(self, T: RigidTransform) -> Array:
-        """Return the readings (n,) at a pose: those that are still, or reach it by first rods."""
+        """Return the readings (n,) at a pose: fixed ones, or those of the first rods."""
         if self.still is not None:
             return self.still
         first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
-        found = [_candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators]
-        return np.array([both[0] for both in found])
+        candidates = [
+            _candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators
+        ]
+        return np.array([pair[0] for pair in candidates])
 
     def _point(self, T: RigidTransform) -> Array:
         """Return a pose with its readings, (1, 12 + n)."""
@@ -296,17 +297,17 @@ class _ClosingEquations:
 
     def nearest(self, T: RigidTransform) -> RigidTransform:
         """Return the nearest pose that closes, as far as steps get nearer to one."""
-        found = solve(self, _after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30)
-        pose = found.points[0, :12].reshape(3, 4)
+        solution = solve(self, _after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30)
+        pose = solution.points[0, :12].reshape(3, 4)
         return motion_of(pose[:, :3], pose[:, 3])
 
     def describe(self, T: RigidTransform) -> list[str]:
         """Return the residuals at a pose in words."""
         matrix, q = T.as_matrix()[None], self.readings_at(T)[None]
-        found = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
+        equations = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
         (A,) = joints_at(self.legs, q)
-        words, lengths = list[str](), dict[str, list[str]]()  # of legs that are off alike
-        for j, kind, value in zip(found.leg, found.kinds, found.values[0], strict=True):
+        words, lengths = list[str](), dict[str, list[str]]()  # lengths: legs with the same residual
+        for j, kind, value in zip(equations.leg, equations.kinds, equations.values[0], strict=True):
             leg = self.legs[j]
             length = float(np.linalg.norm(T.apply(leg.B) - A[j]))
             if kind is EquationKind.LENGTH:
@@ -326,7 +327,7 @@ class _ClosingEquations:
 
 
 def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
-    """Return a leg of the length that home needs, passive where any will do."""
+    """Return a leg with its length at home, passive if any length will do."""
     length = entry.offset if entry.kind is LegKind.CONSTANT else None
     if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
         length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
@@ -349,14 +350,14 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
 def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> list[float]:
     """Return the two readings at which a rod reaches a pose.
 
-    That inside its travel is the first, or the one nearer to what is stated.
+    The first is the one inside the travel, or the one nearer to the stated reading.
     """
     B = np.asarray(T.apply(leg.B))[None]
     low, high = leg.travel
-    found = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
+    readings = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
     if stated is not None:
-        return sorted(found, key=lambda q: abs(q - stated))
-    return sorted(found, key=lambda q: max(low - q, q - high, 0.0))
+        return sorted(readings, key=lambda q: abs(q - stated))
+    return sorted(readings, key=lambda q: max(low - q, q - high, 0.0))
 
 
 def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
@@ -373,15 +374,15 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
     Raises
     ------
     ModelError
-        If home is outside a travel, or two readings inside it close the machine there.
+        If home is outside a travel, or both readings of a rod are inside it.
     """
     closure = _ClosingEquations(described, mid_travel=False)
-    found, problems = dict[str, float](), list[str]()
+    readings, problems = dict[str, float](), list[str]()
     for actuator in closure.actuators:
         rods = [leg for leg in closure.legs if leg.actuator is actuator]
         stated = described.home_readings.get(actuator.joint)
         chosen, other = _candidates(rods[0], T, stated)
-        found[actuator.joint] = chosen
+        readings[actuator.joint] = chosen
         scale, unit = SHOWN_IN[actuator.unit]
         low, high = (scale * end for end in actuator.travel)
         where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
@@ -402,26 +403,26 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         elif not outside[1] and abs(other - chosen) > 1e-9:
             problems.append(
                 f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the one in home_readings, or give it a "
-                f"travel on one side of where {_of(rods)} stands across the motion."
+                f"{unit}, {needed} and not two; write the right one in home_readings, or limit the "
+                f"travel to one side of the turning point of {_rods_in_words(rods)}."
             )
     _refuse(problems)
-    return found
+    return readings
 
 
-def _of(rods: Sequence[Leg]) -> str:
+def _rods_in_words(rods: Sequence[Leg]) -> str:
     """Return rods in words."""
     return legs_in_words([leg.name for leg in rods])
 
 
 def _after(points: Array, steps: Array) -> Array:
-    """Return poses beside readings (k, 12 + n) after steps (k, 6 + n)."""
+    """Return poses with readings (k, 12 + n) after steps (k, 6 + n)."""
     poses = poses_after(points[:, :12].reshape(-1, 3, 4), steps[:, :6])
     return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + steps[:, 6:]], axis=1)
 
 
 def _project(described: Description, home: Home) -> Home:
-    """Return the pose nearest to home that closes where legs leave no choice."""
+    """Return the closed pose nearest to home."""
     closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
     if closure.residual(T) < ROUNDING:
         return home
@@ -431,15 +432,15 @@ def _project(described: Description, home: Home) -> Home:
         return _written(T)
     raise ModelError(
         [
-            f"{described.source}: home could not be used: found {found} there, needed a pose in "
+            f"{described.source}: home could not be used: found {residual} there, needed a pose in "
             "which the machine closes; correct home, lengths or axes."
-            for found in closure.describe(home.motion())
+            for residual in closure.describe(home.motion())
         ]
     )
 
 
 def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
-    """Return the best of the poses that seeded starts find; without turning first."""
+    """Return the best pose that seeded starts lead to, None if none closes."""
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
     n_trials = TRIALS if turning else 8
@@ -457,9 +458,9 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
         return values, slopes
 
     points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
-    found = solve(equations, _after, points, tolerance=1e-15, unit=closure.unit, damped=True)
+    solution = solve(equations, _after, points, tolerance=1e-15, unit=closure.unit, damped=True)
     best: tuple[float, RigidTransform] | None = None
-    for pose in found.points[found.worst <= CLOSED, :12].reshape(-1, 3, 4):
+    for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
         T = motion_of(pose[:, :3], pose[:, 3])
         below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
         rank = 10.0 * below + float(T.rotation.magnitude())
@@ -469,7 +470,7 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
 
 
 def _written(T: RigidTransform) -> Home:
-    """Return a computed pose, the rounding noise of its zeros left out."""
+    """Return a computed pose for a file, without the rounding noise of its zeros."""
     entry = motion_to_xyz_quat(T)
     clean = {key: [x if abs(x) > 1e-13 else 0.0 for x in value] for key, value in entry.items()}
     return Home(tuple(clean["xyz"]), tuple(clean["quat_xyzw"]))

@@ -1,8 +1,8 @@
-"""Rigid bodies of a mechanism and the joints between them, whatever tree its URDF chose.
+"""Rigid bodies of a mechanism and the joints between them, independent of the tree of its URDF.
 
-Links that fixed joints hold together are one body, and so are two bodies that a ``6d`` closure
-welds. What remains are the mechanism's own joints: those of the tree, and a sphere at each
-``3d`` closure. The virtual platform joint carries nothing and is left out.
+Links connected by fixed joints are one body, and so are two bodies welded by a ``6d`` closure.
+The remaining connections are the movable joints of the tree and a spherical joint at each ``3d``
+closure. The virtual platform joint carries nothing and is left out.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ class Connection:
     """A joint of the mechanism between two bodies: one of the tree, or a ``3d`` closure."""
 
     type: ConnectionType
-    bodies: tuple[str, str]  # each named by one of its links; of the tree's joints parent, child
-    T_body_joint: tuple[Array, Array]  # (4, 4) each; the second is the first moved by the joint
+    bodies: tuple[str, str]  # named by one of their links; parent and child of a joint of the tree
+    T_body_joint: tuple[Array, Array]  # (4, 4) each; the joint moves the second frame in the first
     joint: str | None  # the URDF joint; None for a closure
     closure: int | None  # the index of the closure; None for a joint of the tree
 
@@ -35,7 +35,7 @@ class Connection:
 class Bodies:
     """The bodies and connections of a mechanism."""
 
-    body_of: dict[str, str]  # of every link
+    body_of: dict[str, str]  # body of every link
     T_body_link: dict[str, Array]  # (4, 4)
     connections: tuple[Connection, ...]  # without the virtual platform joint
 
@@ -56,8 +56,8 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             _merge(body_of, T_body_link, joint.parent, joint.child, T)
     for closure in closures:
         if closure.kind == "6d":
-            one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
-            if body_of[one] == body_of[two]:
+            first, second = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            if body_of[first] == body_of[second]:
                 raise ModelError(
                     Problem(
                         f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
@@ -68,7 +68,7 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
                         str(urdf.path),
                     )
                 )
-            _merge(body_of, T_body_link, one, two, np.eye(4))
+            _merge(body_of, T_body_link, first, second, np.eye(4))
     tree = [
         Connection(
             "prismatic" if joint.type == "prismatic" else "revolute",
@@ -86,14 +86,17 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
     spheres = []
     for i, closure in enumerate(closures):
         if closure.kind == "3d":
-            one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
-            bodies, poses = (body_of[one], body_of[two]), (T_body_link[one], T_body_link[two])
+            first, second = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            bodies, poses = (
+                (body_of[first], body_of[second]),
+                (T_body_link[first], T_body_link[second]),
+            )
             spheres.append(Connection("sphere", bodies, poses, None, i))
     return Bodies(body_of, T_body_link, (*tree, *spheres))
 
 
 def frame_link(urdf: Urdf, frame: str) -> str:
-    """Return the link whose frame a name means: a link, or the child of a joint."""
+    """Return the link of a frame, named by a link or by the joint whose child it is."""
     return frame if frame in urdf.links else urdf.joints[frame].child
 
 
@@ -104,7 +107,7 @@ def _merge(
     join: str,
     T_keep_join: Array,
 ) -> None:
-    """Make the body of one link part of the body of another."""
+    """Merge the body of one link into the body of another."""
     into, gone = body_of[keep], body_of[join]
     T_into_gone = matrix_product(T_body_link[keep], T_keep_join, matrix_inverse(T_body_link[join]))
     for link, body in body_of.items():

@@ -36,12 +36,12 @@ class Closure:
 class ClosedChain:
     """A tree of joints with loop closures.
 
-    Configurations are Pinocchio's (quaternions for floating joints, cosine and sine for planar
-    and continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space,
-    so that one object serves one thread; it pickles by being built again. *normals* holds, for each
-    frame closure that need hold in a plane only, the normal of that plane in its first frame:
-    where all joints move in the plane, rounding of their axes opens it across. *gains* are of
-    joints, by their names: configurations have a joint's value over its gain, as encoders read it.
+    Configurations are Pinocchio's (quaternions for floating joints, cosine and sine for planar and
+    continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space, so
+    that one object serves one thread; it pickles by being built again. *normals* holds, for each
+    frame closure that need hold in a plane only, the normal of that plane in its first frame: where
+    all joints move in the plane, rounding of their axes opens it across. *gains* of joints, by
+    name, divide their values in configurations, as encoders read them.
 
     Raises
     ------
@@ -70,7 +70,7 @@ class ClosedChain:
                 "it reads; correct the URDF."
             ) from error
         self._data: Any = self._model.createData()
-        self._frames: dict[str, int] = {}  # by their names, as far as asked for
+        self._frames: dict[str, int] = {}  # cached frame indices by name
         self._anchors = [self._anchor(closure) for closure in self.closures]
         self._anchor_data = [anchor.createData() for anchor in self._anchors]
         self.nq: int = self._model.nq
@@ -84,8 +84,9 @@ class ClosedChain:
         for joint, gain in self.gains.items():
             q, v = self._joints[joint]
             self._of_value[q] = self._of_rate[v] = gain
-        self._placed_at = self._linearized_at = b""  # the configurations of Pinocchio's work space
-        self._linear = np.zeros(0), np.zeros((0, 0))  # what linearize returned last
+        # Last configurations evaluated in the work space of Pinocchio, as bytes.
+        self._placed_at = self._linearized_at = b""
+        self._linear = np.zeros(0), np.zeros((0, 0))  # last result of linearize
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
         return ClosedChain, (self.text, self.closures, self.normals, self.gains)
@@ -99,9 +100,9 @@ class ClosedChain:
         return np.asarray(pin.integrate(self._model, configuration, step))
 
     def residual(self, configuration: Array) -> Array:
-        """Return how far every closure is from closed, (n_rows,) [m] and [rad].
+        """Return the residuals of all closures, (n_rows,) [m] and [rad].
 
-        What opens across a plane counts here, in contrast to :meth:`linearize`.
+        Components across a plane of motion count here, in contrast to :meth:`linearize`.
         """
         self._place(configuration)
         pieces = []
@@ -142,7 +143,7 @@ class ClosedChain:
     def placement(self, configuration: Array, base: str, frame: str) -> tuple[Array, Array]:
         """Return rotation (3, 3) and translation (3,) [m] of a frame in another at a configuration.
 
-        The same as :meth:`pose` without the cost of the type, for inner loops.
+        Like :meth:`pose`, as arrays: faster, for inner loops.
         """
         self._place(configuration)
         M = self._placement(base).actInv(self._placement(frame))
@@ -163,7 +164,7 @@ class ClosedChain:
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual (6,) [m, rad] and Jacobian (6, nv) of holding a frame at a pose.
 
-        They are those at the last linearisation; the residual is the logarithm of what is left.
+        Both hold at the last linearisation; the residual is the logarithm of the remaining motion.
         """
         M = self._placement(base).actInv(self._placement(frame))
         matrix = T_base_frame.as_matrix()
@@ -172,9 +173,9 @@ class ClosedChain:
         return np.array(pin.log6(error).vector), np.asarray(jacobian)
 
     def twist(self, base: str, frame: str) -> Array:
-        """Return how a tangent step moves one frame in another, (6, nv): displacement and rotation.
+        """Return the Jacobian (6, nv) of the motion of a frame in another: displacement, rotation.
 
-        It is that at the last linearisation, in ``frame``.
+        It holds at the last linearisation and is expressed in ``frame``.
         """
         M = self._placement(base).actInv(self._placement(frame))
         J_frame, J_base = (
@@ -184,15 +185,15 @@ class ClosedChain:
         return np.asarray((J_frame - M.inverse().action @ J_base) * self._of_rate)
 
     def q_index(self, joint: str) -> int:
-        """Return where the value of a joint stands in a configuration."""
+        """Return the index of the value of a joint in a configuration."""
         return self._joints[joint][0]
 
     def v_index(self, joint: str) -> int:
-        """Return where the rate of a joint stands in a tangent vector."""
+        """Return the index of the rate of a joint in a tangent vector."""
         return self._joints[joint][1]
 
     def rotation_columns(self) -> IntArray:
-        """Return the tangent coordinates that are angles."""
+        """Return the indices of the tangent coordinates that are angles."""
         columns: list[int] = []
         for joint in list(self._model.joints)[1:]:  # the first is the universe
             name, start, size = joint.shortname(), int(joint.idx_v), int(joint.nv)
@@ -214,7 +215,7 @@ class ClosedChain:
     ) -> Array:
         """Return the configuration with the virtual joint that carries the platform set.
 
-        A planar joint takes the part of the motion that lies in its plane.
+        A planar joint takes the component of the motion in its plane.
         """
         self._place(configuration)
         index = self._model.getJointId(joint)
@@ -237,14 +238,14 @@ class ClosedChain:
         return placed
 
     def _place(self, configuration: Array) -> None:
-        """Place all joints, unless they are where they should be."""
+        """Place all joints, unless the configuration is the last one."""
         here = configuration.tobytes()
         if here != self._placed_at:
             pin.forwardKinematics(self._model, self._data, self._of_value * configuration)
             self._placed_at = here
 
     def _frame(self, name: str) -> int:
-        """Return the index of a link's frame, or of a joint's where no link has the name."""
+        """Return the index of the frame of a link, or of a joint if no link has the name."""
         if name in self._frames:
             return self._frames[name]
         if self._model.existBodyName(name):
@@ -259,13 +260,13 @@ class ClosedChain:
         return self._frames[name]
 
     def _placement(self, name: str) -> Any:
-        """Return the placement of a frame in the world at the last kinematics."""
+        """Return the placement of a frame in the world, as of the last kinematics."""
         frame = self._model.frames[self._frame(name)]
         return self._data.oMi[frame.parentJoint] * frame.placement
 
     def _anchor(self, closure: Closure) -> Any:
         """Return Pinocchio's constraint for a closure."""
-        one, two = (
+        first, second = (
             self._model.frames[self._frame(name)] for name in (closure.frame_1, closure.frame_2)
         )
         make = (
@@ -273,11 +274,13 @@ class ClosedChain:
             if closure.kind == "3d"
             else pin.FrameAnchorConstraintModel
         )
-        return make(self._model, one.parentJoint, one.placement, two.parentJoint, two.placement)
+        return make(
+            self._model, first.parentJoint, first.placement, second.parentJoint, second.placement
+        )
 
 
 def _projector(normal: Array) -> Array:
-    """Return what keeps displacements in a plane and turns about its normal, (6, 6)."""
+    """Return the projection (6, 6) onto displacements in a plane and rotations about its normal."""
     projector = np.zeros((6, 6))
     projector[3:, 3:] = np.outer(normal, normal)
     projector[:3, :3] = np.eye(3) - projector[3:, 3:]

@@ -1,8 +1,8 @@
-"""A leg from its joints: what the joints at its ends are, A, B, length law, axes and twist.
+"""A leg classified from its joints: types of its end joints, A, B, length law, axes and twist.
 
-A leg is taken apart with all its joints at zero, in the frame of the base body. The revolutes and
-spheres before and after its slider, or on both sides of the best split of a rod, make one R, U or S
-each; revolutes along the leg only turn it.
+A leg is analysed with all its joints at zero, in the frame of the base body. The revolutes and
+spheres before and after its slider, or on both sides of the best split of a rod, form one R, U or
+S joint each; revolutes along the leg only spin it.
 """
 
 import math
@@ -21,14 +21,14 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
-CONCURRENT = 1.5e-5  # of the span of the joints on base or platform: so near, axes meet
-PERPENDICULAR = 1e-3  # [rad]
+CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
+PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
 
 
 def joint_tolerance(joints: Iterable[Sequence[Array] | Array]) -> float:
-    """Return how far axes that meet may be apart [m], by the joints on base and on platform.
+    """Return the largest gap [m] of axes that meet, from the joints on base and on platform.
 
-    One joint on each, which is refused later, counts as a machine of a metre.
+    For a single joint on each (refused later) the tolerance is that of a machine of one metre.
     """
     spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in joints if len(points)]
     return CONCURRENT * (max(spans, default=0.0) or 1.0)
@@ -41,16 +41,17 @@ def classify_leg(
     within: float,
     motors: Sequence[str] = (),
 ) -> LegChain:
-    """Return a leg from its joints; the origin of the platform link is one in the platform's body.
+    """Return a leg from its joints and an origin of the platform body (that of the platform link).
 
-    Axes that meet may be *within* [m] (:func:`joint_tolerance`) of each other.
-    Where the first of its joints is one of the *motors* and the others make a rod with a joint at
-    each end, the rod hangs on what this motor moves.
+    Axes that meet may be *within* [m] (:func:`joint_tolerance`) of each other. If the first joint
+    is one of the *motors* and the others form a rod with a joint at each end, this motor carries
+    the rod.
 
     Raises
     ------
     OutOfClass
-        If it is not a joint, at most one slider, and a joint, with axes as the method needs them.
+        If the leg is not a joint, at most one slider, and a joint, with axes that the method
+        supports.
     """
     poses, axes = [np.eye(4)], list[Axis]()
     for step in steps:
@@ -71,16 +72,17 @@ def classify_leg(
             _check_moves(chain, axes[0], within)
             return chain
         if len(sliders) > 1 or 0 in sliders:
-            found = (
+            reason = (
                 f"{len(sliders)} sliders"
                 if len(sliders) > 1
                 else f"the slider '{axes[0].name}' on the base itself, so that the joint at A moves"
             )
             raise OutOfClass(
-                f"the leg of joint '{leg}' is outside the method: found {found}, needed a joint "
+                f"the leg of joint '{leg}' is not supported: found {reason}, needed a joint "
                 "whose centre is fixed in the base, at most one slider, and a joint whose centre "
                 "is fixed in the platform, or a motor that moves the joint at A and then a rod; "
-                "name this motor in name_mot, otherwise the machine cannot be calibrated this way."
+                "name this motor in name_mot, otherwise the machine cannot be calibrated with "
+                "legcal."
             )
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
@@ -95,12 +97,12 @@ def classify_leg(
 
 
 def is_actuator(step: Step, motors: Sequence[str]) -> bool:
-    """Say whether a joint on the base is a motor that may carry joints at A."""
+    """Return whether a joint on the base is a motor that may carry joints at A."""
     return step.connection.joint in motors and step.connection.type in ("prismatic", "revolute")
 
 
 def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> None:
-    """Check that nothing but a rod hangs on an actuator.
+    """Check that an actuator carries nothing but a rod.
 
     Raises
     ------
@@ -111,16 +113,16 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
     second = next((c.joint for c in onward if c.joint in motors), None)
     if second is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found a second motor '{second}' "
+            f"the leg of joint '{leg}' is not supported: found a second motor '{second}' "
             f"beyond the motor '{leg}' on the base, needed one motor for each leg; remove it from "
-            "name_mot if it has none, otherwise this machine cannot be calibrated this way."
+            "name_mot if it has none, otherwise this machine cannot be calibrated with legcal."
         )
     slider = next((c.joint for c in onward if c.type == "prismatic"), None)
     if slider is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the slider '{slider}' beyond "
+            f"the leg of joint '{leg}' is not supported: found the slider '{slider}' beyond "
             f"the motor '{leg}' on the base, needed a rod of constant length there; this machine "
-            "cannot be calibrated this way."
+            "cannot be calibrated with legcal."
         )
 
 
@@ -135,17 +137,17 @@ def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
     turns = chain.steps[0].connection.type == "revolute"
     if turns and axis.distance(chain.A) < within:
         raise OutOfClass(
-            f"the leg of motor '{axis.name}' is outside the method: found the joint at A on the "
+            f"the leg of motor '{axis.name}' is not supported: found the joint at A on the "
             "axis of the motor, which turns the rod and does not move its joint, needed an arm "
             "between them; remove it from name_mot if it has no motor, otherwise this machine "
-            "cannot be calibrated this way."
+            "cannot be calibrated with legcal."
         )
 
 
 def actuator_of(
     chain: LegChain, T_body_base: Array, travel: tuple[float, float], link: str
 ) -> Actuator | None:
-    """Return what the rod of a chain hangs on, in the base link, at T_body_base in its body."""
+    """Return the motor that carries the rod of a chain, in the base link (at T_body_base)."""
     step = chain.actuator
     if step is None:
         return None
@@ -176,10 +178,10 @@ def leg_of(
     home: RigidTransform | None,
     actuator: Actuator | None = None,
 ) -> Leg:
-    """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
+    """Return a leg in the links of base and platform, given T_body_link of both.
 
-    In a plane axes and twist say nothing. *home* is T_base_platform of a pose that shows the sign
-    of the length law.
+    Planar machines have neither axes nor twists. *home* (T_base_platform) determines the sign of
+    the length law.
     """
     T_base, T_platform = T_body_link
     A = matrix_applied(matrix_inverse(T_base), chain.A)
@@ -217,8 +219,8 @@ def leg_of(
 def _sign(reach: float, travel: tuple[float, float], length: float | None) -> int:
     """Return whether a leg grows (+1) or shrinks (-1) with its joint value.
 
-    B stands at reach + q along the slider. Its length at home shows on which side of A, where
-    only one of the two is within the travel; else the middle of the travel does.
+    B is at reach + q along the slider. The side of A is the one whose length at home is within the
+    travel, or, if both or neither are, the one at the middle of the travel.
     """
     if length is not None:
         inside = [travel[0] <= s * length - reach <= travel[1] for s in (1, -1)]
@@ -228,7 +230,7 @@ def _sign(reach: float, travel: tuple[float, float], length: float | None) -> in
 
 
 def _axis(chain: LegChain, pivot: Pivot, T_zero_link: Array) -> Array | None:
-    """Return the axis of a joint in its link, where it is a parameter."""
+    """Return the axis of a joint in its link, None if it is no parameter."""
     if pivot.outer is None or (pivot.type is JointType.UNIVERSAL and chain.twists):
         return None
     return undirected(T_zero_link[:3, :3].T @ pivot.outer)
@@ -254,16 +256,16 @@ LegEnds = tuple[Pivot, Pivot, Array, Array, Array, int]  # base, platform, A, B,
 
 
 def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -> Pivot:
-    """Return the joint that consecutive spheres and revolutes make, from their geometry.
+    """Return the joint formed by consecutive spheres and revolutes.
 
     Three or more revolutes whose axes meet in one point are an S, two that meet at right angles a
-    U. A revolute along the leg, whose direction may not be known yet, turns nothing but the leg.
-    *axes* come from the one fixed in base or platform to the one fixed in the leg.
+    U. A revolute along the leg (whose direction may not be determined yet) only spins it. *axes*
+    are ordered from base or platform to the leg.
 
     Raises
     ------
     OutOfClass
-        If the axes do not meet *within* so much [m], or a U is not at right angles.
+        If the axes do not meet *within* this distance [m], or those of a U are not perpendicular.
     """
     spheres = [axis for axis in axes if axis.direction is None]
     if spheres:
@@ -305,7 +307,7 @@ def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str, within: float)
 
 
 def _distinct(axes: Sequence[Axis], within: float) -> list[Axis]:
-    """Return axes, each only once where neighbours are one line."""
+    """Return the axes without repetitions of neighbours on one line."""
     lines: list[Axis] = []
     for axis in axes:
         same = (
@@ -319,17 +321,17 @@ def _distinct(axes: Sequence[Axis], within: float) -> list[Axis]:
 
 
 def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
-    """Return the one point where axes meet [m]."""
+    """Return the intersection of axes (3,) [m]."""
     points = []
-    for one, two in pairwise(lines):
-        near, far = nearest(one, two)
+    for first, second in pairwise(lines):
+        near, far = nearest(first, second)
         gap = None if near is None or far is None else float(np.linalg.norm(far - near))
         if near is None or gap is None or gap > within:
-            found = "are parallel" if gap is None else f"miss each other by {1e3 * gap:.4g} mm"
+            relation = "are parallel" if gap is None else f"miss each other by {1e3 * gap:.4g} mm"
             raise OutOfClass(
-                f"leg '{leg}' could not be classified: the axes of '{one.name}' and '{two.name}' "
-                f"{found}, needed axes that meet within {1e3 * within:.2g} mm; correct their "
-                "origins."
+                f"leg '{leg}' could not be classified: the axes of '{first.name}' and "
+                f"'{second.name}' {relation}, needed axes that meet within "
+                f"{1e3 * within:.2g} mm; correct their origins."
             )
         points.append(near)
     apart = max(float(np.linalg.norm(point - points[0])) for point in points)
@@ -342,49 +344,49 @@ def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
     return points[0]
 
 
-def nearest(one: Axis, two: Axis) -> tuple[Array, Array] | tuple[None, None]:
-    """Return the points of two axes that are nearest to each other [m], None if parallel."""
-    normal = cross(one.along, two.along)
+def nearest(first: Axis, second: Axis) -> tuple[Array, Array] | tuple[None, None]:
+    """Return the nearest points of two axes [m], None if they are parallel."""
+    normal = cross(first.along, second.along)
     square = float(normal @ normal)
     if square < PERPENDICULAR**2:
         return None, None
-    between = two.point - one.point
-    on_one = float(cross(between, two.along) @ normal) / square
-    on_two = float(cross(between, one.along) @ normal) / square
-    return one.point + on_one * one.along, two.point + on_two * two.along
+    between = second.point - first.point
+    on_first = float(cross(between, second.along) @ normal) / square
+    on_second = float(cross(between, first.along) @ normal) / square
+    return first.point + on_first * first.along, second.point + on_second * second.along
 
 
-def parallel(one: Array, two: Array) -> bool:
-    """Say whether two unit directions are parallel, or opposite, within 1 mrad."""
-    return bool(np.linalg.norm(cross(one, two)) < PERPENDICULAR)
+def parallel(first: Array, second: Array) -> bool:
+    """Return whether two unit directions are parallel, or opposite, within 1 mrad."""
+    return bool(np.linalg.norm(cross(first, second)) < PERPENDICULAR)
 
 
-def off_square(one: Array, two: Array) -> float:
-    """Return how far two unit directions are from perpendicular [rad]."""
-    return abs(float(np.arcsin(np.clip(one @ two, -1.0, 1.0))))
+def off_square(first: Array, second: Array) -> float:
+    """Return the deviation of two unit directions from perpendicular [rad]."""
+    return abs(float(np.arcsin(np.clip(first @ second, -1.0, 1.0))))
 
 
 def undirected(axis: Array) -> Array:
-    """Return the direction of a line whose last component that is not zero is positive."""
+    """Return the direction of a line, signed so that its last nonzero component is positive."""
     sized = axis[np.abs(axis) > 1e-9]
     return axis if len(sized) == 0 or sized[-1] > 0.0 else -axis
 
 
 def _names(axes: Sequence[Axis]) -> str:
-    """Return joints as a message names them."""
+    """Return joints in words."""
     return " and ".join(f"'{axis.name}'" for axis in axes)
 
 
 def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, int]:
-    """Return both joints with the revolutes along the leg made part of them, and the idle ones.
+    """Return both joints including the revolutes along the leg, and the number of idle ones.
 
-    A universal joint and a revolute along the leg are an S, on whichever end it stands: the leg
-    twists freely. What is left turns the leg idly, if there is an S.
+    A universal joint and a revolute along the leg are an S, at whichever end the revolute is: the
+    leg twists freely. If there is an S already, further revolutes spin the leg idly.
 
     Raises
     ------
     OutOfClass
-        If there is none, or nothing but a revolute along the leg at the base.
+        If there is no S for them, or the base has no joint but a revolute along the leg.
     """
     spare = [len(base.spins), len(platform.spins)]
     ends = [base, platform]
@@ -396,14 +398,14 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
     left, twisting = sum(spare), [end.type.twists_freely for end in ends]
     if ends[0].type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the axis of "
+            f"the leg of joint '{leg}' is not supported: found the axis of "
             f"'{base.spins[0].name}' along the leg, needed one perpendicular to it within "
-            f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated this way."
+            f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated with legcal."
         )
     if left and not any(twisting):
         name = (*base.spins, *platform.spins)[0].name
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found the axis of '{name}' along the "
+            f"the leg of joint '{leg}' is not supported: found the axis of '{name}' along the "
             "leg, and no S joint; needed the inner axis of a universal joint perpendicular to the "
             f"leg within {np.degrees(PERPENDICULAR):.2g} deg; correct its axis."
         )
@@ -412,35 +414,36 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
 
 
 def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
-    """Refuse revolute axes, and inner axes of legs without S, that are not square to the leg."""
+    """Refuse revolute axes, and inner axes of legs without S, not perpendicular to the leg."""
     twists = base.type.twists_freely or platform.type.twists_freely
     for end in (base, platform):
         if end.type is JointType.REVOLUTE or (end.type is JointType.UNIVERSAL and not twists):
             tilt = off_square(end.axes[-1].along, u)
             if tilt > PERPENDICULAR:
                 is_revolute = end.type is JointType.REVOLUTE
-                what = "a revolute axis" if is_revolute else "an inner axis of a U joint"
+                axis_kind = "a revolute axis" if is_revolute else "an inner axis of a U joint"
                 raise OutOfClass(
-                    f"the leg of joint '{leg}' is outside the method: found the axis of "
+                    f"the leg of joint '{leg}' is not supported: found the axis of "
                     f"'{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from perpendicular to the "
-                    f"leg, needed {what} within {np.degrees(PERPENDICULAR):.2g} deg; correct it."
+                    f"leg, needed {axis_kind} within {np.degrees(PERPENDICULAR):.2g} deg; "
+                    "correct it."
                 )
 
 
 def _rod(
     axes: Sequence[Axis], leg: str, within: float, on: str | None = None
 ) -> tuple[int, LegEnds]:
-    """Return how many joints of a leg without slider are at the base, and its ends.
+    """Return the number of base joints of a leg without slider, and its ends.
 
-    A revolute along the rod passes through both centres, and may belong to either joint: the one
-    that its origin is nearer to. *on* names the motor on whose carriage or arm it hangs.
+    A revolute along the rod passes through both centres and could belong to either joint; it is
+    assigned to the one nearer to its origin. *on* is the motor that carries the rod, for messages.
 
     Raises
     ------
     OutOfClass
-        If no split makes two joints, each with one centre, and axes as the method needs them.
+        If no split gives two joints with one centre each and axes that the method supports.
     """
-    found: list[tuple[float, int, LegEnds]] = []
+    splits: list[tuple[float, int, LegEnds]] = []
     problems: dict[int, OutOfClass] = {}
     for n_lower in range(1, len(axes)):
         try:
@@ -451,9 +454,9 @@ def _rod(
         lower, upper = axes[:n_lower], axes[n_lower:]
         away = [np.linalg.norm(axis.point - ends[2]) for axis in lower]
         away += [np.linalg.norm(axis.point - ends[3]) for axis in upper]
-        found.append((float(sum(away)), n_lower, ends))
-    if found:
-        _, n_lower, ends = min(found, key=lambda split: split[:2])
+        splits.append((float(sum(away)), n_lower, ends))
+    if splits:
+        _, n_lower, ends = min(splits, key=lambda split: split[:2])
         return n_lower, ends
     places = _places(axes, within)
     if len(places) == 2:
@@ -462,13 +465,13 @@ def _rod(
     where = f"{len(places)} joints in different places" if several else "all joints in one place"
     if on is not None:
         raise OutOfClass(
-            f"the leg of motor '{on}' is outside the method: found no slider and {where} beyond "
+            f"the leg of motor '{on}' is not supported: found no slider and {where} beyond "
             "it, needed a rod of constant length with a joint at each end; this machine cannot be "
-            "calibrated this way."
+            "calibrated with legcal."
         )
     hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
     raise OutOfClass(
-        f"the leg of joint '{leg}' is outside the method: found no slider and {where}{hangs}, "
+        f"the leg of joint '{leg}' is not supported: found no slider and {where}{hangs}, "
         "needed a joint whose centre is fixed in the base, then a slider or a rod of constant "
         "length, and a joint whose centre is fixed in the platform, or a motor that moves the "
         "joint at A; name this motor in name_mot, otherwise the machine cannot be calibrated this "
@@ -477,13 +480,13 @@ def _rod(
 
 
 def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> LegEnds:
-    """Return the ends of a rod whose first joints are at the base."""
+    """Return the ends of a rod, given the number of joints at the base."""
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
     A, B = _on_rod(_pivot(lower, None, leg, within), _pivot(upper, None, leg, within))
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found both its joints in one "
+            f"the leg of joint '{leg}' is not supported: found both its joints in one "
             "point, needed a distance between them; correct their origins."
         )
     u = (B - A) / length
@@ -491,7 +494,7 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     base, platform, idle_spins = _with_spins(base, platform, leg)
     if platform.type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is outside the method: found a rod that only turns "
+            f"the leg of joint '{leg}' is not supported: found a rod that only turns "
             "about itself at the platform, needed a joint there; correct its axes."
         )
     _check_axes(base, platform, u, leg)
@@ -499,12 +502,12 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
 
 
 def _on_rod(base: Pivot, platform: Pivot) -> tuple[Array, Array]:
-    """Return A and B of a rod: feet of the other centre, or of the common perpendicular."""
+    """Return A and B of a rod: the joint centres, or the feet of the (common) perpendicular."""
     A, B = base.centre, platform.centre
     if A is None and B is None:
         v, w = base.axes[0], platform.axes[0]
         A, B = nearest(v, w)
-        if A is None or B is None:  # parallel: where the joint at the base was put
+        if A is None or B is None:  # parallel: at the origin of the joint at the base
             A, B = v.point, w.foot(v.point)
     elif A is None and B is not None:
         A = base.axes[0].foot(B)
@@ -516,7 +519,7 @@ def _on_rod(base: Pivot, platform: Pivot) -> tuple[Array, Array]:
 
 
 def _places(axes: Sequence[Axis], within: float) -> list[list[Axis]]:
-    """Split the joints of a leg without slider where their axes stop meeting."""
+    """Return the joints of a leg without slider, split where their axes stop meeting."""
     places = [[axes[0]]]
     for axis in axes[1:]:
         last = places[-1]
@@ -551,16 +554,16 @@ def _telescope(
     leg: str,
     within: float,
 ) -> LegEnds:
-    """Return the ends of a leg whose slider, one of its joints, moves *towards* along its axis.
+    """Return the ends of a leg with a slider (a joint index), which moves *towards* along its axis.
 
-    Between joints with a centre the leg's axis is the line through one of them along the slider.
-    Between two R it is the line along the slider that meets both axes; where these are parallel,
-    as in a plane, its height along them is that of the slider's joint origin.
+    If a joint has a centre, the axis of the leg is the line through it along the slider. Between
+    two R joints it is the line along the slider that meets both axes; if these are parallel (planar
+    machines), it is at the height of the origin of the slider joint.
 
     Raises
     ------
     OutOfClass
-        If that line does not pass *within* so much [m] of a joint, or an axis is not square to it.
+        If that line misses a joint by more than *within* [m], or is not perpendicular to an axis.
     """
     u = towards * axes[slider].along  # a joint moves its child
     base = _pivot(axes[:slider], u, leg, within)
@@ -568,13 +571,13 @@ def _telescope(
     base, platform, idle_spins = _with_spins(base, platform, leg)
     origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
-    what = f"its axis through the {_END[platform.type]} misses the base joint"
+    misfit = f"its axis through the {_END[platform.type]} misses the base joint"
     for spin in (*base.spins, *platform.spins):
         if spin.distance(A) > miss:
-            miss, what = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
+            miss, misfit = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
     if miss > within:
         raise OutOfClass(
-            f"the leg of slider '{axes[slider].name}' is outside the method: {what} "
+            f"the leg of slider '{axes[slider].name}' is not supported: {misfit} "
             f"{'axis' if base.centre is None else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
             f"{1e3 * within:.2g} mm; correct the origins along the leg."
         )
@@ -584,11 +587,11 @@ def _telescope(
     return base, platform, A, B, u, idle_spins
 
 
-_COPLANAR = 1e-12  # volume that three unit directions span
+_COPLANAR = 1e-12  # volume spanned by three unit directions, below which they are coplanar
 
 
 def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[Array, Array, float]:
-    """Return A and B where a line along the slider meets both joints, and by how much it misses."""
+    """Return A and B on a line along the slider that meets both joints, and the miss distance."""
     A, B = base.centre, platform.centre
     v = base.axes[0] if base.type is JointType.REVOLUTE else None
     w = platform.axes[0] if platform.type is JointType.REVOLUTE else None
@@ -597,7 +600,7 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
             across = cross(v.along, u)
             return v.foot(origin), w.foot(origin), abs(float((w.point - v.point) @ across))
         directions = np.stack([v.along, u, -w.along], axis=1)
-        if abs(np.linalg.det(directions)) < _COPLANAR:  # one axis is not square to the slider
+        if abs(np.linalg.det(directions)) < _COPLANAR:  # an axis is not normal to the slider
             s, _, t = np.linalg.lstsq(directions, w.point - v.point)[0]
         else:
             s, _, t = np.linalg.solve(directions, w.point - v.point)
@@ -615,6 +618,6 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
 
 
 def _crossing(axis: Axis, u: Array, point: Array) -> Array:
-    """Return the point of an axis that is nearest to a line."""
+    """Return the point of an axis nearest to a line."""
     on_axis, _ = nearest(axis, Axis("", point, u))
     return axis.foot(point) if on_axis is None else on_axis

@@ -1,6 +1,6 @@
-"""The joints of all legs where the platform is known: the chain closed at a pose.
+"""The closed chain at a platform pose: all joint values of all legs.
 
-Sliders are set, joint angles solved from the closures of the URDF's tree in Pinocchio.
+Sliders follow from the pose; joint angles are solved from the closures of the URDF in Pinocchio.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.solver import Equations, Retraction, solve
 
-# [rad], and of a leg
-POSE_TOLERANCE = 2.5e-11  # of a pose at which the chain is closed
-AXIS_TOLERANCE = 2e-3  # what axes may be off; no other posture is as near
+# Tolerances [rad], and lengths relative to the leg length.
+POSE_TOLERANCE = 2.5e-11  # pose error of the platform of a closed chain
+AXIS_TOLERANCE = 2e-3  # closure error due to inexact axes; no other posture comes so close
 RESTARTS = 60
 
 
@@ -28,16 +28,15 @@ def close_at(
 ) -> Array:
     """Return the configuration (nq,) that closes every loop with the platform at a pose.
 
-    Sliders, and motors on which rods hang, are set from the pose, so that no leg is ever flipped;
-    other joint angles are solved from ``start``, and from seeded random ones for legs that do not
-    close from there. The pose must meet the constraints. Where it is not *exact* it need meet them
-    but for rounding: in the end the platform is free too, and moves by what the axes of the model
-    are off.
+    Sliders, and motors that carry rods, are set from the pose, so that no leg is ever flipped; the
+    other joint angles are solved from ``start``, and for legs that do not close from there also
+    from seeded random angles. The pose must meet the constraints; unless it is *exact* the platform
+    is free in the final solve and absorbs the errors of axes in the model.
 
     Raises
     ------
     DidNotConverge
-        If a leg does not close, naming its closure and the distance left.
+        If a leg does not close; the message names its closure and the remaining distance.
     """
     chain, metre = machine.chain, leg_scale(machine, T_base_platform)
     most = POSE_TOLERANCE if exact else AXIS_TOLERANCE
@@ -50,16 +49,18 @@ def close_at(
     angles[set_first] = False
     configuration = _placed(machine, T_base_platform, start, tolerance)
     rng = np.random.default_rng(20020701)
-    # Gaps count in leg lengths: those of short legs would weigh too little beside angles.
+    # Gaps in leg lengths: gaps of short legs would weigh too little beside angles.
     for _ in range(restarts):
         equations, retract = closure_equations(machine, T_base_platform, metre, angles)
-        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
-        configuration = found.points[0]
-        stuck = np.abs(found.values[0]) > AXIS_TOLERANCE
+        solution = solve(
+            equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True
+        )
+        configuration = solution.points[0]
+        stuck = np.abs(solution.values[0]) > AXIS_TOLERANCE
         if not stuck.any():
             break
         columns = np.zeros(chain.nv, dtype=np.bool_)
-        columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
+        columns[angles] = np.abs(solution.jacobian[0, stuck]).max(axis=0) > 1e-9
         step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
         configuration = chain.integrate(configuration, step)
     everything = closure_equations(machine, T_base_platform, metre, angles)
@@ -67,23 +68,27 @@ def close_at(
     if np.abs(left).max(initial=0.0) >= CLOSED:
         angles[set_first] = True
         pose = T_base_platform if exact else None
-        every = angles if exact else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = closure_equations(machine, pose, metre, every)
-        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
-        configuration, left = found.points[0], found.values[0]
-    off = _off(machine, T_base_platform, configuration)
+        freedoms = angles if exact else np.ones(chain.nv, dtype=np.bool_)
+        equations, retract = closure_equations(machine, pose, metre, freedoms)
+        solution = solve(
+            equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True
+        )
+        configuration, left = solution.points[0], solution.values[0]
+    off = _pose_error(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
         gap = worst_closure(machine, metre * left)
         problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
     elif off[0] > tolerance[0] or off[1] > tolerance[1]:
-        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
+        problem = (
+            f"the platform moved {_error_in_words(off)} away, needed a pose that the legs allow"
+        )
     else:
         return configuration
     raise _not_closed(machine, T_base_platform, problem)
 
 
 def worst_closure(machine: Machine, residual: Array) -> str:
-    """Return which closure is most open, in words."""
+    """Return the closure with the largest residual, in words."""
     row = 0
     worst = (0.0, "the platform pose")
     for closure in machine.chain.closures:
@@ -110,13 +115,13 @@ def _placed(
             machine.platform,
             T_base_platform,
         )
-        off = _off(machine, T_base_platform, configuration)
+        off = _pose_error(machine, T_base_platform, configuration)
         if off[0] > tolerance[0] or off[1] > tolerance[1]:
             raise _not_closed(
                 machine,
                 T_base_platform,
-                f"the virtual joint '{machine.platform_joint}' leaves it {_away(off)} away, "
-                "needed a joint that reaches it",
+                f"the virtual joint '{machine.platform_joint}' leaves it "
+                f"{_error_in_words(off)} away, needed a joint that reaches it",
             )
     q = readings_at(machine, T_base_platform)
     sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
@@ -127,7 +132,7 @@ def _placed(
 def closure_equations(
     machine: Machine, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
 ) -> tuple[Equations, Retraction]:
-    """Return the closures by free tangent coordinates; the platform fixed at T where legs carry it.
+    """Return the closures as functions of free tangent coordinates, the platform fixed at T.
 
     Lengths are divided by ``metre``.
     """
@@ -155,21 +160,21 @@ def closure_equations(
     return equations, retract
 
 
-def _off(
+def _pose_error(
     machine: Machine, T_base_platform: RigidTransform, configuration: Array
 ) -> tuple[float, float]:
-    """Return how far the platform is from where it should be [m], and how far turned [rad]."""
+    """Return distance [m] and angle [rad] of the platform from its required pose."""
     R, t = machine.chain.placement(configuration, machine.base, machine.platform)
     matrix = T_base_platform.as_matrix()
-    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
+    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # accurate for small and large angles
     turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
     return float(np.linalg.norm(t - matrix[:3, 3])), turn
 
 
-def _away(off: tuple[float, float]) -> str:
-    """Return a distance and a turn in words, without the one that is rounding beside the other."""
-    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
-    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
+def _error_in_words(off: tuple[float, float]) -> str:
+    """Return a distance and an angle in words, without one that is negligible beside the other."""
+    parts = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
+    return " and ".join(text for text, x in zip(parts, off, strict=True) if x > 1e-6 * max(off))
 
 
 def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str) -> DidNotConverge:

@@ -1,9 +1,9 @@
-"""Random closed configurations inside the travel, in the assembly mode of home.
+"""Random closed configurations within the travel, in the assembly mode of home.
 
-Where the motors determine the pose their readings are drawn and followed from home. Not all legs
-can be at the ends of a long travel at the same time: what is not reached is drawn again, and
-nearer to home after two draws in vain. Where motors do not determine the pose, home wanders on the
-manifold of closed configurations.
+If the motors determine the pose, their readings are drawn and followed from home. Not all legs can
+be at the ends of a long travel at the same time: readings that are not reached are drawn again,
+nearer to home after two failures. If motors do not determine the pose, configurations come from a
+random walk on the manifold of closed configurations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,30 +34,30 @@ from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.machine.solved_poses import solve_poses
 from legcal.machine.solver import RANK, poses_after
 
-MAX_DRAWS = 40  # draws for each configuration
-SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # how far from home draws go, at most all of the way
-MIN_SINGULARITY = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
-MIN_STEP = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
-WALK = 6  # steps of a random walk between two configurations
-ON_THE_CHAIN = 7  # draws of eight, where following is quick
-MAX_FAILED = 20  # configurations in vain, if they are the first
-STRIDE = 0.15  # [rad], and of a leg length
-TRAVEL_TOLERANCE = 1e-11  # of the larger limit
-WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are reported
+MAX_DRAWS = 40  # draws per configuration
+SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # share of the travel for each draw, at most 1
+MIN_SINGULARITY = 0.1  # least singularity measure, relative to home: nobody works nearer to one
+MIN_STEP = 1.0 / 16.0  # least step, relative to the way from home; harder draws are repeated
+WALK = 6  # steps of the random walk between two configurations
+ON_THE_CHAIN = 7  # draws out of eight that are followed on the chain, where that is quick
+MAX_FAILED = 20  # failures before the first configuration
+STRIDE = 0.15  # size of a step of the random walk [rad], and relative to the leg length
+TRAVEL_TOLERANCE = 1e-11  # tolerance of travel limits, relative to the larger one
+WORKSPACE_POSES = 100  # sample of the workspace, for all reported errors over it
 WORKSPACE_SEED = 20020721
 
-# Poses of any legs, many at once and without a chain
-PARTS = 5  # of the way from home to a pose, so that no pose jumps to another assembly mode
-STEPS, LAST_STEPS = 3, 9  # of the solver, a part of the way and at its end
-CLOSED = 1e-9  # of the mean leg length
-NEARLY_CLOSED = 1e-5  # where more is demanded than freedoms are left, and joints give way
-DEPENDENT = 1e-4  # singular values of equations below this are those of the others
-SINGULAR = 0.05  # smallest singular value, of its value at home
-FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
+# Random poses of legs without a chain, many at once.
+PARTS = 5  # steps from home to a pose, so that no pose jumps to another assembly mode
+STEPS, LAST_STEPS = 3, 9  # solver iterations per step, and in the last step
+CLOSED = 1e-9  # residual of a closed pose, relative to the mean leg length
+NEARLY_CLOSED = 1e-5  # the same for overdetermined readings, whose residual does not vanish
+DEPENDENT = 1e-4  # singular value of equations below which they are dependent
+SINGULAR = 0.05  # least smallest singular value, relative to home
+FREE = 0.05  # motion along freedoms that no motor holds, relative to the mean leg length
 ATTEMPTS = 12
-SHRINKING = 0.6  # each attempt with that part of the travel of the one before, but
-MIN_SHARE = 0.078  # of the travel at least
-LOOSE = 0.01  # of a hold by motors and joints, without unit
+SHRINKING = 0.6  # share of the travel of each attempt, relative to the one before
+MIN_SHARE = 0.078  # least share of the travel
+LOOSE = 0.01  # least hold of the platform by motors and joints, dimensionless
 
 
 class Configurations(NamedTuple):
@@ -92,7 +92,7 @@ def random_configurations(
     mechanism : Machine
         The machine.
     count : int
-        How many.
+        Number of configurations.
     rng : Generator or int
         Random generator, or its seed.
 
@@ -104,16 +104,18 @@ def random_configurations(
     Raises
     ------
     DidNotConverge
-        If too few are reached.
+        If too few configurations are reached.
     """
     generator = np.random.default_rng(rng)
     draw = _drawn if mechanism.is_determined else _wandered
-    found = list(draw(mechanism, count, generator))
-    _require(mechanism, count, len(found))
+    configurations = list(draw(mechanism, count, generator))
+    _require(mechanism, count, len(configurations))
     return Configurations(
-        np.array(found).reshape(count, mechanism.chain.nq),
-        np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
-        [platform_pose(mechanism, c) for c in found],
+        np.array(configurations).reshape(count, mechanism.chain.nq),
+        np.array([joint_values(mechanism, c) for c in configurations]).reshape(
+            count, mechanism.n_legs
+        ),
+        [platform_pose(mechanism, c) for c in configurations],
     )
 
 
@@ -122,8 +124,8 @@ def random_poses(
 ) -> tuple[Array, list[RigidTransform]]:
     """Return the readings and poses of :func:`random_configurations`, at a tenth of the time.
 
-    Where the motors determine the pose it is followed for many draws at once; the chain is closed
-    only where that leaves a doubt.
+    If the motors determine the pose it is followed for many draws at once; the chain is closed only
+    in doubtful cases.
 
     Raises
     ------
@@ -133,21 +135,20 @@ def random_poses(
     if not machine.is_determined:
         drawn = random_configurations(machine, count, rng)
         return drawn.readings, drawn.poses
-    found = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
-    _require(machine, count, len(found))
-    if not found:
+    pairs = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
+    _require(machine, count, len(pairs))
+    if not pairs:
         return np.zeros((0, machine.n_legs)), []
-    readings, poses = (np.array(part) for part in zip(*found, strict=True))
+    readings, poses = (np.array(part) for part in zip(*pairs, strict=True))
     return readings, list(motions_of(poses[:, :, :3], poses[:, :, 3]))
 
 
-def _require(machine: Machine, count: int, found: int) -> None:
-    """Refuse a machine of which too few random poses are found."""
-    if found < count:
+def _require(machine: Machine, count: int, n_found: int) -> None:
+    if n_found < count:
         raise DidNotConverge(
             Problem(
                 "random poses could not be drawn",
-                f"{found} of {count} inside the travel in {MAX_DRAWS} tries for each",
+                f"{n_found} of {count} inside the travel in {MAX_DRAWS} tries for each",
                 "all",
                 f"check {machine.urdf.wording.home} and the limits of the sliders",
                 str(machine.yaml_path),
@@ -155,12 +156,12 @@ def _require(machine: Machine, count: int, found: int) -> None:
         )
 
 
-@lru_cache(maxsize=2)  # verdict and report of a calibration need the same
+@lru_cache(maxsize=2)  # shared by verdict and report of a calibration
 def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
-    """Return the readings and poses that stand for the workspace, the same at every call.
+    """Return the readings and poses that sample the workspace, the same at every call.
 
-    Errors over the workspace are those at these poses, whether they are predicted or found by
-    comparing two models. The order of the legs does not matter.
+    All errors over the workspace, predicted or between two models, are errors at these poses. They
+    do not depend on the order of the legs.
 
     Raises
     ------
@@ -174,7 +175,7 @@ def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
 
 
 def _drawn(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
-    """Yield what is reached from home at random readings of the motors."""
+    """Yield configurations at random readings of the motors, followed from home."""
     drawn = 0
     for turn in range(count):
         if turn == MAX_FAILED and not drawn:
@@ -191,11 +192,11 @@ def _drawn(machine: Machine, count: int, generator: np.random.Generator) -> Iter
 def _drawn_poses(
     machine: Machine, count: int, generator: np.random.Generator
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield readings (n_legs,) and pose (3, 4) of what :func:`_drawn` yields.
+    """Yield readings (n_legs,) and pose (3, 4) of the configurations of :func:`_drawn`.
 
-    Draws to come are followed together as if none were in vain, which is so for most machines. With
-    redundant motors many are, where motors that follow leave their travel: those of one share are
-    followed together.
+    Draws are followed together as if none failed, which holds for most machines. With redundant
+    motors many fail, because dependent motors leave their travel: then the draws of one share of
+    the travel are followed together.
     """
     drawn = 0
     if machine.is_redundant:
@@ -243,7 +244,7 @@ def _random_readings(
 
 
 def _reached_on_the_chain(machine: Machine, q: Array, tries: int) -> Array | None:
-    """Return the configuration at readings of the motors, None where it cannot be used."""
+    """Return the configuration at readings of the motors, None if it is not usable."""
     try:
         reached = follow(
             machine,
@@ -261,7 +262,7 @@ def _reached_on_the_chain(machine: Machine, q: Array, tries: int) -> Array | Non
 
 
 def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
-    """Yield readings of all legs, pose, and whether it can be used, at readings of the motors."""
+    """Yield readings of all legs, pose, and whether it is usable, at readings of the motors."""
     motors = list(machine.motors)
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
     poses, part = follow_poses(machine, machine.home, home, q, MIN_STEP)
@@ -277,7 +278,7 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
 
 
 def _wandered(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
-    """Yield every few steps of a random walk whose sliders stay inside their travel."""
+    """Yield configurations of a random walk, every few steps, with sliders within their travel."""
     here = machine.home_configuration
     for _ in range(count):
         for _ in range(MAX_DRAWS):
@@ -306,7 +307,7 @@ def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
 
 
 def _outside(machine: Machine, values: Array) -> BoolArray:
-    """Return the same for joint values (..., n_legs)."""
+    """Return which joint values (..., n_legs) are outside the travel of their leg."""
     lower, upper = np.array([leg.travel for leg in machine.legs]).T
     slack = TRAVEL_TOLERANCE * np.maximum(np.abs(lower), np.abs(upper))
     outside = (values < lower - slack) | (values > upper + slack)
@@ -323,10 +324,10 @@ def random_postures_of_legs(
 ) -> tuple[Array, Array]:
     """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
 
-    Poses are those of legs in R_b and R_e that no file
-    describes: many at once, without a chain. *home* is T_Rb_Re near a closed pose of the wanted
-    assembly mode, *travel* (n_legs, 2) the shortest and longest length of each leg [m], equal for
-    legs of constant length; of rods on actuators the least and largest reading of these [m or rad].
+    The legs are in R_b and R_e and need no file and no chain. *home* is T_Rb_Re near a closed pose
+    of the assembly mode, *travel* (n_legs, 2) the shortest and longest length of each leg [m],
+    equal for legs of constant length, or for rods on actuators the lowest and highest reading [m or
+    rad].
 
     Raises
     ------
@@ -340,10 +341,10 @@ def random_postures_of_legs(
     slack = rounding + 0.05 * (travel[:, 1] - travel[:, 0])
     low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
     high = np.maximum(travel[:, 1], at_home) + slack
-    found = start.R[:0], start.t[:0]
+    postures = start.R[:0], start.t[:0]
     share, tried, near_singular = 1.0, 0, 0
     for _ in range(ATTEMPTS):
-        n = 2 * (count - len(found[1])) + 10
+        n = 2 * (count - len(postures[1])) + 10
         wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))[:, drive.first]
         wanted = at_home + share * (wanted - at_home)
         R, t = drive.wandered(n, share, rng)
@@ -355,28 +356,28 @@ def random_postures_of_legs(
         R, t = drive.closed(R, t, wanted, LAST_STEPS)
         values = drive.values(R, t)
         good &= drive.is_closed(R, t, wanted) & np.all((values >= low) & (values <= high), axis=1)
-        found = np.concatenate([found[0], R[good]]), np.concatenate([found[1], t[good]])
-        if len(found[1]) >= count:
-            return found[0][:count], found[1][:count]
+        postures = np.concatenate([postures[0], R[good]]), np.concatenate([postures[1], t[good]])
+        if len(postures[1]) >= count:
+            return postures[0][:count], postures[1][:count]
         share = max(SHRINKING * share, MIN_SHARE)
-    said = f"found {len(found[1])} of {count} random poses inside the travel"
+    reached = f"found {len(postures[1])} of {count} random poses inside the travel"
     if 2 * near_singular > tried and drive.hold() < LOOSE:
         raise DidNotConverge(
-            f"The observations could not be predicted: {said}, needed all; most ways there come "
+            f"The observations could not be predicted: {reached}, needed all; most ways there come "
             "near a singular pose, in which motors and joints do not hold the platform: choose a "
             "home further from it, or joints that do not make the same figure on base and platform."
         )
     raise DidNotConverge(
-        f"The observations could not be predicted: {said}, needed all; check the travel (limit "
+        f"The observations could not be predicted: {reached}, needed all; check the travel (limit "
         "lower, upper) and the home pose of the model."
     )
 
 
 class _Drive:
-    """Legs whose motors draw their values at many poses; of redundant motors as many as needed.
+    """Legs whose motors draw their values at many poses; of redundant motors an independent subset.
 
-    Those are taken that say most beside each other, of what the constraints leave open. The value
-    of a leg is its length, that of a rod on an actuator the reading of this.
+    The subset determines best the freedoms that the constraints leave. The value of a leg is its
+    length, or for a rod on an actuator the reading of the actuator.
     """
 
     def __init__(self, legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array) -> None:
@@ -384,7 +385,7 @@ class _Drive:
         self.columns = list(freedoms(frame_legs))
         self.on = np.array(actuator_index(legs), dtype=np.intp)
         each = np.arange(len(legs))
-        # The leg whose value each has: of rods on one actuator the first
+        # The leg that holds the value: for rods on one actuator the first.
         self.first = np.array(
             [j if a < 0 else int(np.argmax(self.on == a)) for j, a in enumerate(self.on.tolist())]
         )
@@ -393,16 +394,16 @@ class _Drive:
         self.driven = np.array([], dtype=np.intp)
         constrained = self.slopes(R, t)[0]
         self.driven = np.array(motors, dtype=np.intp)
-        every = self.slopes(R, t)[0]
-        rank_every, rank_constrained = (
+        unconstrained = self.slopes(R, t)[0]
+        rank_all, rank_constrained = (
             int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0
-            for J in (every, constrained)
+            for J in (unconstrained, constrained)
         )
-        count = rank_every - rank_constrained
+        count = rank_all - rank_constrained
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
-            found = pose_equations(legs, R, t, by_local=False)
-            rows = found.by_pose[0][found.measured][:, self.columns] / size
+            equations = pose_equations(legs, R, t, by_local=False)
+            rows = equations.by_pose[0][equations.measured][:, self.columns] / size
             left = np.eye(len(size)) - np.linalg.pinv(constrained / size, rcond=RANK) @ (
                 constrained / size
             )
@@ -424,33 +425,33 @@ class _Drive:
         return values
 
     def lengthening(self, wanted: Array) -> Array:
-        """Return s q, or q of actuators, at wanted values (k, n_legs) of driven motors, or NaN."""
+        """Return s q, or q of actuators, at target values (k, n_legs) of driven motors, or NaN."""
         driven = np.isin(self.first, self.driven)
         return np.asarray(np.where(driven, wanted - self.zero, np.nan))
 
     def equations(self, R: Array, t: Array) -> PoseEquations:
-        """Return what poses must satisfy: the constraints, and the lengths of driven motors."""
-        found = pose_equations(self.legs, R, t, by_local=False)
-        return found.of(~found.measured | np.isin(found.leg, self.driven))
+        """Return the equations of poses: the constraints, and the lengths of driven motors."""
+        equations = pose_equations(self.legs, R, t, by_local=False)
+        return equations.of(~equations.measured | np.isin(equations.leg, self.driven))
 
     def slopes(self, R: Array, t: Array) -> Array:
-        """Return their derivatives (k, m, f) by the possible motions."""
+        """Return the derivatives (k, m, f) of these equations by the possible motions."""
         return self.equations(R, t).by_pose[:, :, self.columns]
 
     def hold(self) -> float:
-        """Return how well motors and joints hold the platform at home: 0 where singular."""
+        """Return the hold of the platform by motors and joints at home; 0 if singular."""
         scale = np.where(np.array(self.columns) < 3, 1.0 / self.lengths(self.R, self.t).mean(), 1.0)
         slopes = self.slopes(self.R, self.t)[0] * scale
         return float(np.linalg.svd(slopes, compute_uv=False)[-1]) if slopes.size else 0.0
 
     def closed(self, R: Array, t: Array, wanted: Array, steps: int) -> tuple[Array, Array]:
-        """Return poses nearer to wanted values (k, n_legs) of driven motors."""
+        """Return poses nearer to target values (k, n_legs) of driven motors."""
         lengthening = self.lengthening(wanted)
-        found = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
-        return found.R, found.t
+        solution = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
+        return solution.R, solution.t
 
     def wandered(self, n: int, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return n poses that differ from home as far as no motor holds the platform."""
+        """Return n poses near home, moved along the freedoms that no motor holds."""
         J = self.slopes(self.R, self.t)[0]
         left = np.eye(len(self.columns))
         if len(J):
@@ -465,14 +466,14 @@ class _Drive:
         return poses[:, :, :3], poses[:, :, 3]
 
     def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
-        """Return at which poses the equations of legs hold with the wanted values."""
+        """Return at which poses the equations of legs hold with the target values."""
         redundant = len(self.equations(R[:1], t[:1]).leg) > len(self.columns)
         limit = (NEARLY_CLOSED if redundant else CLOSED) * self.lengths(R, t).mean(axis=1)
         missed = equations_at_readings(self.legs, R, t, self.lengthening(wanted)).values
         return np.asarray(np.abs(missed).max(axis=1, initial=0.0) <= limit)
 
     def is_regular(self, R: Array, t: Array) -> BoolArray:
-        """Return which poses are as far from singular as a share of home is, on the same side."""
+        """Return which poses are less singular than a share of home, and on the same side."""
         J, J0 = self.slopes(R, t), self.slopes(self.R, self.t)
         if J.shape[1] == 0:
             return np.ones(len(t), dtype=np.bool_)

@@ -1,7 +1,7 @@
-"""The platform's own coordinates: as many of x, y, z, roll, pitch, yaw as it has freedoms.
+"""Independent coordinates of the platform: as many of x, y, z, roll, pitch, yaw as its freedoms.
 
 A pose is that of the platform link in the base link; roll, pitch and yaw turn about the fixed axes
-x, y, z in this order. The coordinates that are not the machine's own follow from its constraints.
+x, y, z in this order. The other coordinates follow from the constraints of the machine.
 """
 
 from __future__ import annotations
@@ -14,60 +14,61 @@ from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
 COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
-_REACHED = 1e-9  # of a leg length
-_FREE = 0.1
+_REACHED = 1e-9  # largest error of a pose reached, relative to the size of the machine
+_FREE = 0.1  # least independent motion of a chosen coordinate
 
 
-def own_coordinates(machine: Machine) -> IntArray:
-    """Return which coordinates a machine has of its own, positions before angles.
+def independent_coordinates(machine: Machine) -> IntArray:
+    """Return the independent coordinates of a machine as indices, positions before angles.
 
-    A coordinate is taken where the motions that the constraints leave at home, and that those taken
-    before do not yet tell apart, move it by at least a tenth of a motion; rotations count in leg
-    lengths.
+    Coordinates are chosen in order. One is chosen if a motion that the constraints allow at home,
+    and that keeps those chosen before, moves it by at least a tenth of the motion; rotations count
+    in leg lengths.
     """
     pose = machine.home.as_matrix()[None, :3]
-    found = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
+    equations = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
     scale = machine.size
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    constraints = found.by_pose[0, ~found.measured] * unit
+    constraints = equations.by_pose[0, ~equations.measured] * unit
     _, _, rows = np.linalg.svd(np.vstack([constraints, np.zeros((6, 6))]))
     free = rows[6 - machine.mobility :] * unit  # (m, 6) motions
     slopes = coordinates_of(pose)[1][0]
     moved = (slopes @ free.T) * np.array([1.0] * 3 + [scale] * 3)[:, None]
-    own: list[int] = []
-    for least in (_FREE, 0.0):  # the second time, if need be, whatever is left
+    chosen: list[int] = []
+    for least in (_FREE, 0.0):  # the second pass takes any that is left
         for k in range(len(COORDINATES)):
-            basis = np.linalg.qr(moved[own].T)[0] if own else np.zeros((machine.mobility, 0))
+            basis = np.linalg.qr(moved[chosen].T)[0] if chosen else np.zeros((machine.mobility, 0))
             new = moved[k] - basis @ (basis.T @ moved[k])
-            if k not in own and len(own) < machine.mobility and np.linalg.norm(new) > least:
-                own.append(k)
-    return np.array(sorted(own), dtype=np.intp)
+            if k not in chosen and len(chosen) < machine.mobility and np.linalg.norm(new) > least:
+                chosen.append(k)
+    return np.array(sorted(chosen), dtype=np.intp)
 
 
 def poses_at_coordinates(
-    machine: Machine, own: IntArray, coordinates: Array, near: Array
+    machine: Machine, columns: IntArray, coordinates: Array, near: Array
 ) -> tuple[Array, BoolArray]:
-    """Return poses (k, 3, 4) with *own* coordinates (k, m) [m, rad], and where there is one, (k,).
+    """Return the poses (k, 3, 4) at values (k, m) of some coordinates, and which were reached (k,).
 
-    They are looked for from poses *near*, (3, 4) or (k, 3, 4).
+    The search for values [m, rad] of the coordinates *columns* starts at poses *near*, (3, 4) or
+    (k, 3, 4).
     """
     scale = machine.size
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        keep = ~found.measured
+        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        keep = ~rows.measured
         values, slopes = coordinates_of(poses)
-        unit = np.where(own < 3, 1.0, scale)
-        off = turned_back(values[:, own] - coordinates, own) * unit
+        unit = np.where(columns < 3, 1.0, scale)
+        off = turned_back(values[:, columns] - coordinates, columns) * unit
         return (
-            np.concatenate([found.values[:, keep], off], axis=1),
-            np.concatenate([found.by_pose[:, keep], slopes[:, own] * unit[:, None]], axis=1),
+            np.concatenate([rows.values[:, keep], off], axis=1),
+            np.concatenate([rows.by_pose[:, keep], slopes[:, columns] * unit[:, None]], axis=1),
         )
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     start = np.broadcast_to(near, (len(coordinates), 3, 4)).copy()
-    found = solve(equations, poses_after, start, tolerance=1e-14 * scale, unit=unit)
-    return found.points, found.worst <= _REACHED * scale
+    solution = solve(equations, poses_after, start, tolerance=1e-14 * scale, unit=unit)
+    return solution.points, solution.worst <= _REACHED * scale
 
 
 def coordinates_of(poses: Array) -> tuple[Array, Array]:
@@ -90,7 +91,9 @@ def coordinates_of(poses: Array) -> tuple[Array, Array]:
     return values, slopes
 
 
-def turned_back(differences: Array, own: IntArray) -> Array:
-    """Return differences of coordinates with angles within half a turn."""
-    turns = np.where(own < 3, 0.0, 2.0 * np.pi)
-    return np.asarray(differences - turns * np.round(differences / np.where(own < 3, 1.0, turns)))
+def turned_back(differences: Array, columns: IntArray) -> Array:
+    """Return differences of coordinates, those of angles within half a turn."""
+    turns = np.where(columns < 3, 0.0, 2.0 * np.pi)
+    return np.asarray(
+        differences - turns * np.round(differences / np.where(columns < 3, 1.0, turns))
+    )

@@ -1,7 +1,7 @@
-"""The visible cylinders of a file: those along legs, those that are arms, heights of planar legs.
+"""Visible cylinders of a file: along legs and on arms; the heights of planar legs.
 
-In a plane the kinematics say nothing of heights, and joint origins may stand anywhere along their
-axes. A camera sees the legs where their cylinders are.
+The kinematics of planar machines do not determine heights, and joint origins may be anywhere along
+their axes. A camera sees the legs where their cylinders are.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.urdf import Urdf, origins_of, parse_robot
 
 PARALLEL = 1e-6
-COAXIAL = 10.0  # times the tolerance of joints, at both ends of a cylinder
+COAXIAL = 10.0  # largest offset of the ends of a coaxial cylinder, in tolerances of joints
 
 Half = tuple[Literal["base", "platform"], Array, Array]
 
@@ -35,7 +35,7 @@ class VisualCylinder(NamedTuple):
 
 
 def coaxial_tolerance(legs: Sequence[Leg] | Sequence[LegChain]) -> float:
-    """Return how far the ends of a cylinder along a leg may be from its axis [m]."""
+    """Return the largest distance [m] of the ends of a cylinder along a leg from its axis."""
     joints = ([leg.A for leg in legs], [leg.B for leg in legs])
     return COAXIAL * joint_tolerance(joints)
 
@@ -62,9 +62,9 @@ def with_cylinders(
 def with_arms(
     legs: Sequence[Leg], shown: Sequence[VisualCylinder], bodies: Bodies, T_body_base: Array
 ) -> tuple[Leg, ...]:
-    """Return the legs with the arms of their motors that are cylinders, at T_body_base (4, 4).
+    """Return the legs with the cylindrical arms of their motors; the base link is at T_body_base.
 
-    It is the longest cylinder on what a motor turns that is not about the motor's own axis.
+    The arm is the longest cylinder on the link of a motor, other than those about the motor axis.
     """
     arms: dict[str, Actuator] = {}
     within = coaxial_tolerance(legs)
@@ -74,7 +74,7 @@ def with_arms(
             continue
         T = matrix_product(matrix_inverse(T_body_base), matrix_inverse(chain.poses[0]))
         T_base_arm = matrix_product(T, chain.poses[1])
-        found = [
+        candidates = [
             _arm(
                 cylinder,
                 matrix_applied(T_base_arm, _ends(cylinder, bodies)),
@@ -85,7 +85,7 @@ def with_arms(
             for cylinder in shown
             if bodies.body_of[cylinder.link] == chain.bodies[0]
         ]
-        seen = [arm for arm in found if _from_axis(arm.ends, actuator).max() > within]
+        seen = [arm for arm in candidates if _from_axis(arm.ends, actuator).max() > within]
         longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
         arms[actuator.joint] = replace(actuator, arm=longest)
     return tuple(
@@ -105,7 +105,7 @@ def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str, wi
 
 
 def _from_axis(points: Array, actuator: Actuator) -> Array:
-    """Return how far points (n, 3) are from the axis of a motor [m]."""
+    """Return the distances (n,) of points (n, 3) from the axis of a motor [m]."""
     return distance_to_line(points, actuator.axis, actuator.point)
 
 
@@ -114,8 +114,8 @@ def at_visible_heights(
 ) -> list[LegChain]:
     """Return the legs of a planar mechanism at the height of their longest cylinder.
 
-    A leg without a cylinder over its axis stays where its slider, or its joint at the base, has its
-    origin.
+    A leg without a cylinder over its axis stays at the height of the origin of its slider or base
+    joint.
     """
     within = coaxial_tolerance(chains)
     return [_raised(chain, shown, bodies, within) for chain in chains]
@@ -138,7 +138,7 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
 
 
 def is_measured(legs: Sequence[Leg], cylinder: VisualCylinder, bodies: Bodies) -> bool:
-    """Say whether outlines of a visual cylinder are a part of some leg, along it or its arm."""
+    """Return whether a visual cylinder is a part whose outlines are measured: a leg or an arm."""
     within = coaxial_tolerance(legs)
     return any(
         bool(_along(leg, leg.chain, [cylinder], bodies, within)) for leg in legs if leg.chain
@@ -152,9 +152,9 @@ def is_measured(legs: Sequence[Leg], cylinder: VisualCylinder, bodies: Bodies) -
 def _along(
     leg: Leg, chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies, within: float
 ) -> tuple[Cylinder, ...]:
-    """Return the cylinders along one leg, *within* so much [m] of its axis."""
+    """Return the cylinders along one leg, *within* this distance [m] of its axis."""
     halves = halves_of_leg(leg, chain)
-    found = []
+    cylinders = []
     for cylinder in shown:
         if bodies.body_of[cylinder.link] not in halves:
             continue
@@ -163,16 +163,16 @@ def _along(
         along = ends @ u
         if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < within:
             start, end = sorted(float(x) for x in along)
-            found.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
-    return tuple(found)
+            cylinders.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
+    return tuple(cylinders)
 
 
 def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
-    """Return the bodies that hold the leg's axis: their side, A or B, and u from A to B."""
+    """Return the side (A or B) of each body on the axis of the leg, with u from A to B."""
     halves: dict[str, Half] = {}
 
     def turns(body: int, side: Literal["base", "platform"], point: Array, step: Step) -> bool:
-        """Take a body, and say whether the joint behind it is a revolute about the leg."""
+        """Take a body, and return whether the joint behind it is a revolute about the leg."""
         at, u = chain.line_in(body, point)
         halves[chain.bodies[body - 1]] = side, at, leg.sign * u
         axis = step.line(step.far if side == "base" else step.near)[1]
@@ -197,13 +197,13 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
 def _raised(
     chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies, within: float
 ) -> LegChain:
-    """Return one leg with both centres at the height of its cylinder along the joints' axes."""
+    """Return one leg with both centres at the height of its cylinder along the joint axes."""
     if chain.platform.type is not JointType.REVOLUTE or len(chain.steps) != 2 + (
         chain.slider is not None
     ):
         return chain
     normal = chain.base.axes[-1].along
-    found = []
+    heights = []
     for k, centre in ((len(chain.bodies), chain.B), (1, chain.A)):
         for cylinder in shown:
             if bodies.body_of[cylinder.link] == chain.bodies[k - 1]:
@@ -211,15 +211,15 @@ def _raised(
                 height = float((offset @ normal).mean())
                 beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
                 if np.linalg.norm(beside, axis=1).max() < within:
-                    found.append((cylinder.length, height))
-    if not found:
+                    heights.append((cylinder.length, height))
+    if not heights:
         return chain
-    shift = max(found)[1] * normal
+    shift = max(heights)[1] * normal
     return replace(chain, A=chain.A + shift, B=chain.B + shift)
 
 
 def _ends(cylinder: VisualCylinder, bodies: Bodies) -> Array:
-    """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
+    """Return both ends of the axis of a cylinder in its body, (2, 3) [m]."""
     T = matrix_product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
     half = np.array([0.0, 0.0, 0.5 * cylinder.length])
     return matrix_applied(T, np.stack([-half, half]))

@@ -1,4 +1,4 @@
-"""A machine as a table describes it, and what cannot be in one."""
+"""A machine described by a table, and the checks of its numbers."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -32,9 +32,9 @@ NEEDED_TYPE = (
 
 @dataclass(frozen=True)
 class LegType:
-    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``PSS``."""
+    """The joints of a leg from base to platform, written as ``UPS``, ``SS``, ``PSS``."""
 
-    base: JointType  # the joint at the base, or on what a motor moves
+    base: JointType  # the joint at the base, or on the carriage or arm of a motor
     has_slider: bool  # whether there is a P along the leg
     platform: JointType  # the joint at the platform
     actuator: ActuatorKind | None = None  # the motor that carries the joint at A
@@ -50,13 +50,13 @@ class LegType:
         return self.base is self.platform is JointType.REVOLUTE
 
     def __str__(self) -> str:
-        """Return it as it is written."""
+        """Return the letters of the leg type."""
         motor = {None: "", ActuatorKind.PRISMATIC: "P", ActuatorKind.REVOLUTE: "R"}[self.actuator]
         return f"{motor}{self.base}{'P' * self.has_slider}{self.platform}"
 
 
 def leg_type(text: str) -> LegType | None:
-    """Return the leg type of a text such as ``UPS``; None for any other text."""
+    """Return the leg type of a text such as ``UPS``, None for any other text."""
     match = _TYPE.fullmatch(text)
     if match is None:
         return None
@@ -73,17 +73,17 @@ class LegEntry:
     """One leg as described."""
 
     name: str  # its name
-    type: LegType  # its joints
-    kind: LegKind  # whether its slider has a motor, moves freely, or is not there
-    A_base: Array  # (3,) joint centre in the base link [m]; on a motor that at reading 0
+    type: LegType  # joints
+    kind: LegKind  # actuated, passive or without slider
+    A_base: Array  # (3,) joint centre in the base link [m], with its motor at reading 0
     B_platform: Array  # (3,) joint centre in the platform link [m]
     offset: float | None  # length at reading zero [m] of an actuated leg, length of a constant one
     travel: tuple[float, float] | None  # lowest and highest reading [m]
     tube: float | None  # radius of the half at the base [m]
     rod: float | None  # radius of the half at the platform [m]
-    base_axis: Array | None  # (3,) in the base link, on a motor at reading 0; None for the default
+    base_axis: Array | None  # (3,) in the base link, at motor reading 0; None for the default
     platform_axis: Array | None  # (3,) in the platform link; None for the default
-    actuator: Actuator | None = None  # what its joint at A rides on, in the base link
+    actuator: Actuator | None = None  # the motor that carries A, in the base link
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,25 +91,25 @@ class Description:
     """A machine as described by a table."""
 
     name: str  # the name of the model and of its files
-    source: str  # where it was described, for messages: a path, or --family
-    unit: str  # the unit in which it was described, for messages
+    source: str  # origin of the description, for messages: a path, or --family
+    unit: str  # unit of the description, for messages
     legs: tuple[LegEntry, ...]  # the legs in order
     home: "Home | None"  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
-    notes: tuple[str, ...] = ()  # what was assumed
+    notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """A pose with the numbers as they were written."""
+    """A pose with its numbers as written."""
 
     xyz: tuple[float, ...]  # position [m]
-    quat_xyzw: tuple[float, ...]  # unit quaternion, as far as its digits go
+    quat_xyzw: tuple[float, ...]  # unit quaternion, to its digits
 
     @classmethod
     def of(cls, xyz: tuple[float, ...], turn: Rotation) -> "Home":
-        """Return a home with the quaternion of a rotation as files write it."""
+        """Return a home with the quaternion of a rotation, rounded as in files."""
         return cls(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
 
     def motion(self) -> RigidTransform:
@@ -118,7 +118,7 @@ class Home:
 
 
 def legs_in_words(names: Sequence[str]) -> str:
-    """Return legs as a sentence begins with them."""
+    """Return legs as the subject of a sentence."""
     quoted = [f"'{name}'" for name in names]
     return f"leg {quoted[0]}" if len(quoted) == 1 else f"legs {', '.join(quoted)}"
 
@@ -126,14 +126,14 @@ def legs_in_words(names: Sequence[str]) -> str:
 def home_at_height(described: Description, height: float, turn: Rotation | None) -> Description:
     """Return a machine whose platform is level at home, over the middle of the base.
 
-    *height* is that of the platform link over the base link [m]. Without a turn its joints lie over
-    those of the base as well as a turn about z, in whole degrees, allows; their middles stand over
-    each other to a whole millimetre.
+    *height* is the height of the platform link over the base link [m]. Without *turn* the platform
+    is turned about z, in whole degrees, so that its joints are nearest to those of the base; the
+    middles of both are over each other to a whole millimetre.
     """
     A, B = _joints(described)
     if turn is None:
-        one, two = ((p - p.mean(axis=0))[:, :2] @ [1.0, 1.0j] for p in (A, B))
-        angle = round(float(np.degrees(np.angle(np.sum(one * two.conj())))))
+        base, platform = ((p - p.mean(axis=0))[:, :2] @ [1.0, 1.0j] for p in (A, B))
+        angle = round(float(np.degrees(np.angle(np.sum(base * platform.conj())))))
         turn = Rotation.from_euler("z", angle, degrees=True)
     middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
     x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
@@ -141,9 +141,9 @@ def home_at_height(described: Description, height: float, turn: Rotation | None)
 
 
 def joints_from_base(described: Description) -> Description:
-    """Return a machine whose platform joints were given in the base link, at home.
+    """Return a machine whose platform joints were given in the base link at home.
 
-    The platform link gets the axes of the base link and stands in the middle of the joints.
+    The platform link has the axes of the base link and its origin in the middle of the joints.
     """
     origin = np.round(_joints(described)[1].mean(axis=0), 6) + 0.0
     legs = tuple(
@@ -159,13 +159,13 @@ def joints_from_base(described: Description) -> Description:
 
 
 def look_like_base(described: Description) -> list[str]:
-    """Return that platform joints look as if they were given in the base link.
+    """Return the problem of platform joints that seem to be given in the base link, if any.
 
-    That is so if all motors are inside their travel with both links in one place, the platform
-    joints lie away from those of the base, and the machine is not said to stand so.
+    They do if all motors are within their travel with both links coincident, the platform joints
+    are away from those of the base, and the stated home is not this pose.
     """
-    known = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
-    if len(known) < _MANY or (described.home is not None and _closes(described, described.home)):
+    measured = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
+    if len(measured) < _MANY or (described.home is not None and _closes(described, described.home)):
         return []
     origin = Home.of((0.0, 0.0, 0.0), Rotation.identity())
     A, B = _joints(described)
@@ -190,7 +190,7 @@ def _joints(described: Description) -> tuple[Array, Array]:
 
 
 def _closes(described: Description, home: Home) -> bool:
-    """Say whether all motors are inside their travel at a pose."""
+    """Return whether all motors are inside their travel at a pose."""
     A, B = _joints(described)
     lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
     return all(
@@ -202,13 +202,13 @@ def _closes(described: Description, home: Home) -> bool:
     )
 
 
-_SLACK = 2.5e-9  # of the length of a leg
-_MANY = 3  # legs that can hardly all fit by chance
-ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
+_SLACK = 2.5e-9  # tolerance of lengths, relative to the leg
+_MANY = 3  # legs that hardly all fit by chance
+ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if they coincide
 
 
 def wrong_sizes(described: Description) -> list[str]:
-    """Return what the numbers alone say is wrong."""
+    """Return the problems of radii, offsets and travels in themselves."""
     problems = []
     for leg in described.legs:
         if leg.offset is None:
@@ -244,13 +244,13 @@ def wrong_sizes(described: Description) -> list[str]:
 
 
 def wrong_lengths(described: Description, lengths: Array) -> list[str]:
-    """Return what is wrong with the lengths of the legs at home."""
+    """Return the problems of leg lengths at home."""
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        found = _out_of_proportion(described, leg.name, float(length))
-        if found:
-            return found
+        disproportions = _out_of_proportion(described, leg.name, float(length))
+        if disproportions:
+            return disproportions
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
@@ -277,7 +277,7 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
 
 
 def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
-    """Return that a leg has a length that no leg has."""
+    """Return the problem of an implausible leg length, if any."""
     if MIN_LENGTH <= length <= MAX_LENGTH:
         return []
     where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
@@ -288,7 +288,7 @@ def _out_of_proportion(described: Description, leg: str, length: float) -> list[
 
 
 def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
-    """Return what to do about sizes out of all proportion."""
+    """Return the remedy for implausible sizes."""
     if not positive:
         return "correct its joints, offset or travel (length = offset + reading)"
     if unit == "m" and too_long:
@@ -301,7 +301,7 @@ def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
 def wrong_axes(
     described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
 ) -> list[str]:
-    """Return which axes do not fit their leg at home."""
+    """Return the problems of axes that do not fit their leg at home."""
     problems = []
     for side, joint, axis in (
         ("base", entry.type.base, axes[0]),

@@ -1,10 +1,9 @@
 """A CSV of joints as the mapping that the same table would be in YAML.
 
-Headings are those that people write, and three layouts are understood: a row for each leg (``bx by
-bz px py pz``, ``base_x``, ``x_base``), a row with all joints (``B1x``), and a row for each joint
-(``B1, x, y, z``, or side and number in two columns; headings may be missing there). A and B are
-base and platform where both are there, as in the paper; otherwise B is the base and P, or T, the
-platform.
+Common headings are understood, in three layouts: a row for each leg (``bx by bz px py pz``,
+``base_x``, ``x_base``), a row with all joints (``B1x``), and a row for each joint (``B1, x, y, z``,
+or side and number in two columns; headings are optional there). If both A and B occur they are base
+and platform, as in the paper; otherwise B is the base and P, or T, the platform.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from legcal.errors import DatasetError
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
 
-WHAT = "table"
-MAX_NUMBER = 1e9  # of any number, whatever its unit
-UNITS = {"m": 0, "mm": -3}  # powers of ten
+FILE_KIND = "table"
+MAX_NUMBER = 1e9  # largest number, in any unit
+UNITS = {"m": 0, "mm": -3}  # units of length, as powers of ten
 SIDES = {
     "base": ("base", "bottom", "fixed", "ground", "lower", "a"),
     "platform": ("platform", "plat", "top", "moving", "mobile", "upper", "effector", "p", "t"),
@@ -47,7 +46,7 @@ _COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
 _COORDINATE_FIRST = re.compile(rf"([xyz])({_WORDS})(\d*)")
 _NAMED = re.compile(rf"({_WORDS})(?:joints?|points?|legs?)?0*(\d{{1,3}})")
 _XYZ = ("x", "y", "z")
-MOTIONS = ("direction", "point", "axis")  # of what rods hang on
+MOTIONS = ("direction", "point", "axis")  # columns of the motor that carries a rod
 _RADII = ("radius", "tube", "rod")
 _AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
@@ -55,7 +54,7 @@ _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
-    *(f"{what}_{i}" for what in ("direction", "point", "axis") for i in _XYZ),
+    *(f"{vector}_{i}" for vector in ("direction", "point", "axis") for i in _XYZ),
     *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
     *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
@@ -82,13 +81,13 @@ COLUMNS = (
 def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     """Return a CSV as the mapping that the same table would be in YAML.
 
-    ``unit`` is that of its lengths, unless a column states it. Raises DatasetError with one
-    sentence for each wrong column or cell.
+    ``unit`` is the unit of lengths if no column states it. Raises DatasetError with one sentence
+    for each wrong column or cell.
     """
     names = [column.name for column in COLUMNS]
     table = read_table(
         path,
-        WHAT,
+        FILE_KIND,
         "leg",
         COLUMNS,
         needed="one row for each leg; add them",
@@ -96,8 +95,8 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     )
     filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
-        found, remedy = "radius beside tube or rod", "empty the others"
-        table.refuse(row, found, "one of them", *_RADII, remedy=remedy, what="radius")
+        conflict, remedy = "radius beside tube or rod", "empty the others"
+        table.refuse(row, conflict, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
     cells = _Cells(table)
     hangs_on = cells.texts("hangs_on")
@@ -110,7 +109,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "types": cells.texts("type") if "type" in table else None,
         "base_joints": cells.points("base"),
         "platform_joints": cells.points("platform"),
-        # The travel of a leg that hangs on a motor is that of the motor.
+        # The travel of a leg carried by a motor is the travel of the motor.
         "travel": [
             travel if motor is None else None
             for travel, motor in zip(cells.pairs("travel"), hangs_on, strict=True)
@@ -131,12 +130,12 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "platform_axes": cells.vectors("platform_axis"),
         "hangs_on": hangs_on,
     }
-    document |= {key: of_legs for key, of_legs in optional.items() if any(map(_is_there, of_legs))}
+    document |= {key: of_legs for key, of_legs in optional.items() if any(map(_is_given, of_legs))}
     return document | motors
 
 
 class _Cells:
-    """The cells of a table by row: None where they are empty."""
+    """The cells of a table by row; None if empty."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -152,22 +151,22 @@ class _Cells:
         return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
 
     def vectors(self, name: str) -> list[Any]:
-        found = zip(*(self.numbers(f"{name}_{i}") for i in _XYZ), strict=True)
-        return [None if vector == (None,) * 3 else list(vector) for vector in found]
+        vectors = zip(*(self.numbers(f"{name}_{i}") for i in _XYZ), strict=True)
+        return [None if vector == (None,) * 3 else list(vector) for vector in vectors]
 
     def pairs(self, name: str) -> list[Any]:
-        found = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
-        return [None if pair == (None, None) else list(pair) for pair in found]
+        pairs = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
+        return [None if pair == (None, None) else list(pair) for pair in pairs]
 
 
-def _is_there(value: Any) -> bool:
+def _is_given(value: Any) -> bool:
     return value is not None
 
 
 def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict[str, Any]:
-    """Return the motors on which legs hang, and their readings at home.
+    """Return the motors that carry legs, and their readings at home.
 
-    What is said of a motor may stand in any row of a leg that hangs on it, or in several.
+    The numbers of a motor may be in any row of a leg that it carries, or in several.
     """
     columns = {
         **{key: cells.vectors(key) for key in MOTIONS},
@@ -207,7 +206,7 @@ def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict
 
 
 def _shared(table: Table, name: str) -> str | None:
-    """Return what a column says that has the same text in all rows, None for an empty one."""
+    """Return the text of a column that is the same in all rows, None for an empty column."""
     stated = sorted(set(filter(None, table.text(name))))
     if len(stated) > 1:
         raise DatasetError(
@@ -231,8 +230,8 @@ def _unit(table: Table, given: str | None) -> str:
 def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     """Return a table with a row for each leg under the names of its columns.
 
-    ``names`` are those of the columns. Headings that mean nothing stay as they are, in small
-    letters, and a column ``unit`` is added where headings of joints have one.
+    ``names`` are the names of the columns. Unknown headings stay, in lower case, and a column
+    ``unit`` is added if headings of joints state one.
     """
     lines = _with_headings(lines, path)
     number, header = lines[0]
@@ -247,17 +246,19 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     if {"x", "y"} <= set(keys) and len(lines) > 1:
         lines = _from_points(lines, keys, path)
         keys = [split_heading(text)[0] for text in lines[0][1]]
-    found = [_coordinate(key) for key in keys]
-    sides = _sides(side for side, *_ in filter(None, found))
-    if any(one is not None and one[1] for one in found):
-        lines = _from_one_row(lines, found, sides, path)
+    coordinates = [_coordinate(key) for key in keys]
+    sides = _sides(side for side, *_ in filter(None, coordinates))
+    if any(coordinate is not None and coordinate[1] for coordinate in coordinates):
+        lines = _from_one_row(lines, coordinates, sides, path)
         header = lines[0][1]
     else:
         plain = {split_heading(name)[0]: name for name in names}
         plain |= {word: name for name, words in _OTHER.items() for word in words}
         header = [
-            f"{sides[one[0]]}_{one[2]}" if one else plain.get(key, text.lower())
-            for one, key, text in zip(found, keys, lines[0][1], strict=True)
+            f"{sides[coordinate[0]]}_{coordinate[2]}"
+            if coordinate
+            else plain.get(key, text.lower())
+            for coordinate, key, text in zip(coordinates, keys, lines[0][1], strict=True)
         ]
     below = lines[1:]
     if "leg" in header and all(
@@ -275,7 +276,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
 
 
 def _with_headings(lines: Lines, path: object) -> Lines:
-    """Return lines with headings: a list of named points needs none."""
+    """Return lines with headings, which a list of named points may omit."""
     first = lines[0][1]
     if sum(is_number(text) for text in first) < 2:
         return lines
@@ -289,7 +290,7 @@ def _with_headings(lines: Lines, path: object) -> Lines:
 
 
 def _coordinate(key: str) -> tuple[str, str, str] | None:
-    """Return side, number ("" without) and coordinate of the heading of a joint."""
+    """Return side, number ("" if none) and coordinate of the heading of a joint."""
     if match := _COORDINATE.fullmatch(key):
         return None if match[2] and match[4] else (match[1], match[2] or match[4], match[3])
     if match := _COORDINATE_FIRST.fullmatch(key):
@@ -298,18 +299,18 @@ def _coordinate(key: str) -> tuple[str, str, str] | None:
 
 
 def _sides(words: Iterable[str]) -> dict[str, str]:
-    """Return which side each word means: B is the platform beside A."""
+    """Return the side of each word; B is the platform if there is an A."""
     side_of = {word: side for side, all_words in SIDES.items() for word in all_words}
     return side_of | {"b": "platform" if "a" in set(words) else "base"}
 
 
 def _from_one_row(
     lines: Lines,
-    found: Sequence[tuple[str, str, str] | None],
+    coordinates: Sequence[tuple[str, str, str] | None],
     sides: dict[str, str],
     path: object,
 ) -> Lines:
-    """Return a row for each leg of a table with all joints in one row."""
+    """Return a row for each leg, from a table with all joints in one row."""
     (number, header), rows = lines[0], lines[1:]
     if len(rows) != 1 or any(len(cells) != len(header) for _, cells in rows):
         raise DatasetError(
@@ -320,18 +321,19 @@ def _from_one_row(
     cells = rows[0][1]
     joints: dict[int, dict[str, str]] = {}
     others = {}
-    for one, text, cell in zip(found, header, cells, strict=True):
-        if one is not None and one[1]:
-            joints.setdefault(int(one[1]), {})[f"{sides[one[0]]}_{one[2]}"] = cell
+    for coordinate, text, cell in zip(coordinates, header, cells, strict=True):
+        if coordinate is not None and coordinate[1]:
+            side, leg, letter = coordinate
+            joints.setdefault(int(leg), {})[f"{sides[side]}_{letter}"] = cell
         else:
             others[text.lower()] = cell
     return _rows(joints, others, (number, rows[0][0]))
 
 
 def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
-    """Return a row for each leg of a table with a row for each joint.
+    """Return a row for each leg, from a table with a row for each joint.
 
-    A joint is named by one column, or by two: its side, and the number of the leg.
+    A joint is named in one column, or in two: side and number of the leg.
     """
     number, header = lines[0]
     axes = {key: i for i, key in enumerate(keys) if key in _XYZ}
@@ -353,9 +355,9 @@ def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
         named.append((" ".join(words), cells, matches[0] if matches else None))
     wrong = [name for name, _, match in named if match is None]
     if wrong:
-        found = describe(wrong[0]) if wrong[0].strip() else "no name"
+        stated = describe(wrong[0]) if wrong[0].strip() else "no name"
         raise DatasetError(
-            f"{path}: the joints could not be read: found {found} in a "
+            f"{path}: the joints could not be read: found {stated} in a "
             "table with a row for each joint, needed names of side and number such as B1 and P1, "
             "or base1 and platform1; correct it."
         )

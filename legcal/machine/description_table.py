@@ -1,9 +1,9 @@
-"""The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states.
+"""The table of a machine: YAML or CSV, read strictly, lengths in its stated unit.
 
-A CSV becomes the mapping that the same table would be in YAML (:func:`read_columns`); the mapping
-is validated as a :class:`TableFile`, whose entries are checked against each other before they
-become a :class:`Description` in metres, whose legs are checked against their types. An entry is
-one value for all legs, or a list with one (or null) for each leg.
+A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`); the mapping is
+validated as a :class:`TableFile`, whose entries are checked against each other and converted to a
+:class:`Description` in metres, whose legs are checked against their types. An entry is one value
+for all legs, or a list with one (or null) for each leg.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,7 +42,7 @@ from legcal.machine.description import (
     legs_in_words,
     look_like_base,
 )
-from legcal.machine.description_csv import MAX_NUMBER, MOTIONS, UNITS, WHAT, read_columns
+from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, UNITS, read_columns
 from legcal.machine.leg import MAX_LEGS, LegKind
 
 
@@ -63,7 +63,7 @@ def _is_radius(value: Any) -> bool:
 
 
 def _is_pair(value: object) -> bool:
-    """Say whether a value is one pair of readings."""
+    """Return whether a value is one pair of readings."""
     return isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)
 
 
@@ -76,14 +76,14 @@ _POSITIVE = {**_NUMBER, "exclusiveMinimum": 0}
 _ROW = {"type": "array", "items": _NUMBER}
 
 
-def _schema_of_legs(one: dict[str, Any]) -> WithJsonSchema:
-    """Return the JSON Schema of what :func:`_of_legs` takes."""
-    of_each = {"type": "array", "items": {"anyOf": [one, {"type": "null"}]}}
-    return WithJsonSchema({"anyOf": [one, of_each]})
+def _schema_per_leg(of_leg: dict[str, Any]) -> WithJsonSchema:
+    """Return the JSON Schema of the input of :func:`_value_per_leg`."""
+    of_each = {"type": "array", "items": {"anyOf": [of_leg, {"type": "null"}]}}
+    return WithJsonSchema({"anyOf": [of_leg, of_each]})
 
 
-def _of_legs(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
-    """Return a validator of one value for all legs, or of a list with one (or null) for each."""
+def _value_per_leg(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
+    """Return a validator of one value for all legs, or a list with one (or null) for each."""
 
     def check(value: Any) -> Any:
         of_each = isinstance(value, list) and all(x is None or fits(x) for x in value)
@@ -127,10 +127,10 @@ def _directions(value: Any) -> Any:
 
 def _kinds(value: Any) -> Any:
     entries = value if isinstance(value, list) else [value]
-    known = [kind.value for kind in LegKind]
+    names = [kind.value for kind in LegKind]
     for kind in entries:
-        if kind is not None and kind not in known:
-            needed = f"{', '.join(known)}, one for all legs or a list"
+        if kind is not None and kind not in names:
+            needed = f"{', '.join(names)}, one for all legs or a list"
             raise BadValue(describe(kind), needed, "correct it")
     return value
 
@@ -158,28 +158,28 @@ Points = Annotated[
 Directions = Annotated[
     list[Any],
     BeforeValidator(_directions),
-    _schema_of_legs({**_ROW, "minItems": 3, "maxItems": 3}),
+    _schema_per_leg({**_ROW, "minItems": 3, "maxItems": 3}),
 ]
 Lengths = Annotated[
     Any,
-    _of_legs(
+    _value_per_leg(
         _is_number, f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"
     ),
-    _schema_of_legs(_NUMBER),
+    _schema_per_leg(_NUMBER),
 ]
 Travel = Annotated[
     Any,
-    BeforeValidator(_lower_first),  # the last one is applied first
-    _of_legs(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
-    _schema_of_legs({**_ROW, "minItems": 2, "maxItems": 2}),
+    BeforeValidator(_lower_first),  # validators run from the last to the first
+    _value_per_leg(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
+    _schema_per_leg({**_ROW, "minItems": 2, "maxItems": 2}),
 ]
 Radius = Annotated[
     Any,
-    _of_legs(
+    _value_per_leg(
         _is_radius,
         "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
     ),
-    _schema_of_legs(
+    _schema_per_leg(
         {
             "anyOf": [
                 _POSITIVE,
@@ -227,17 +227,17 @@ Direction = Annotated[
 
 
 class ActuatorEntry(FileSchema):
-    """A motor that rods hang on: a carriage that slides, or an arm that turns, in the base link."""
+    """A motor that carries rods: a sliding carriage or a turning arm, in the base link."""
 
     direction: Direction | None = None
     point: Vector | None = None
     axis: Direction | None = None
     travel: Ends | None = None
     travel_deg: Ends | None = None
-    travel_us: Ends | None = None  # of a hobby servo, with the two numbers of its pulses
+    travel_us: Ends | None = None  # of a hobby servo, with centre_us and us_per_deg
     centre_us: Number | None = None
     us_per_deg: Number | None = None
-    arm_radius: Annotated[Number, Field(gt=0.0)] | None = None  # of an arm that is a cylinder
+    arm_radius: Annotated[Number, Field(gt=0.0)] | None = None  # of a cylindrical arm
 
     @property
     def turns(self) -> bool:
@@ -246,11 +246,11 @@ class ActuatorEntry(FileSchema):
 
     @property
     def pulses(self) -> Pulses | None:
-        """The pulses of a hobby servo. Raises ValueError if what is stated is none."""
+        """The pulses of a hobby servo. Raises ValueError if its numbers are implausible."""
         return Pulses.stated(self.centre_us, self.us_per_deg, turns=self.turns)
 
     def problem(self, unit: str) -> str | None:
-        """Return what does not fit together, None if all does; *unit* is that of lengths."""
+        """Return the contradiction between the entries, None if there is none."""
         given = [key for key in MOTIONS if getattr(self, key) is not None]
         if given not in (["direction"], ["point", "axis"]):
             return (
@@ -267,16 +267,16 @@ class ActuatorEntry(FileSchema):
         right = ["travel_deg", "travel_us"] if self.turns else ["travel"]
         if len(travels) == 1 and travels[0] in right and (travels != ["travel_us"] or pulses):
             return None
-        what = f"a carriage, in {unit}"
+        reading = f"a carriage, in {unit}"
         if self.turns:
-            what = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
+            reading = "an arm, in degrees, or travel_us with centre_us and us_per_deg of a servo"
         return (
             f"found {' and '.join(travels) or 'no travel'}, needed {right[0]}, the lowest and "
-            f"highest reading of {what}; correct it."
+            f"highest reading of {reading}; correct it."
         )
 
     def travel_in_metres(self, unit: str) -> tuple[float, float]:
-        """Return the lowest and the highest reading [m or rad]; *unit* is that of lengths."""
+        """Return the lowest and highest reading [m or rad]; *unit* is the unit of lengths."""
         if self.travel_us and (pulses := self.pulses):
             low, high = sorted(pulses.angles(np.array(self.travel_us)).tolist())
             return low, high
@@ -304,7 +304,7 @@ class TableFile(FileSchema):
     travel: Travel = None
     radius: Radius = None
     kinds: Annotated[
-        Any, BeforeValidator(_kinds), _schema_of_legs({"enum": [kind.value for kind in LegKind]})
+        Any, BeforeValidator(_kinds), _schema_per_leg({"enum": [kind.value for kind in LegKind]})
     ] = None
     base_axes: Directions | None = None
     platform_axes: Directions | None = None
@@ -323,7 +323,7 @@ class TableFile(FileSchema):
 
     @property
     def motors_of_legs(self) -> list[str | None]:
-        """The motor that each leg hangs on: as stated, or in the order of the motors."""
+        """The motor that carries each leg: as stated, or in the order of the motors."""
         n, motors = len(self.base_joints), list(self.actuators or ())
         if self.hangs_on is None:
             return [*motors] if len(motors) == n else [None] * n
@@ -338,7 +338,7 @@ OPTIONS = {
     "home": "--height",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
-_SAME = 1e-6  # of the span of the joints: so near, joints are one
+_SAME = 1e-6  # largest distance of coincident joints, relative to the span of the joints
 
 
 def read_description(
@@ -347,52 +347,53 @@ def read_description(
     name: str | None = None,
     given: Mapping[str, Any] | None = None,
 ) -> Description:
-    """Return the machine that a table describes.
+    """Return the machine described by a table.
 
-    ``given`` are entries beside the table, in its unit, which it must not have itself.
+    ``given`` holds entries from the command line, in the unit of the table, which must not have
+    them.
     """
     given = {} if given is None else given
     try:
         if path.suffix.lower() == ".csv":
-            found = read_columns(path, unit)
-            found["name"] = name or found["name"]
-            if not is_plain_name(found["name"]) and name is None:
+            table = read_columns(path, unit)
+            table["name"] = name or table["name"]
+            if not is_plain_name(table["name"]) and name is None:
                 raise DatasetError(
                     f"{path}: the model could not be named after the file: found "
-                    f"{describe(found['name'])}, needed letters, digits, '-', '_' and '.'; "
+                    f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
                     "give it a name with --name NAME."
                 )
         else:
-            found = read_yaml(path, WHAT)
-            found = {key: value for key, value in found.items() if value is not None}
+            table = read_yaml(path, FILE_KIND)
+            table = {key: value for key, value in table.items() if value is not None}
             if name is not None:
-                found["name"] = name
+                table["name"] = name
             if unit is not None:
-                found.setdefault("unit", unit)
+                table.setdefault("unit", unit)
     except DatasetError as error:
         raise ModelError(error.facts) from error
-    _refuse_twice(path, found, given)
-    if "version" in found and "legcal_table" not in found:
+    _refuse_twice(path, table, given)
+    if "version" in table and "legcal_table" not in table:
         raise ModelError(
-            f"{path}: the table could not be read: found version: {found['version']}, needed "
+            f"{path}: the table could not be read: found version: {table['version']}, needed "
             "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
             "place."
         )
-    if unit is not None and found.get("unit", unit) != unit:
+    if unit is not None and table.get("unit", unit) != unit:
         raise ModelError(
             f"{path}: the unit could not be decided: found --unit {unit} and "
-            f"{describe(found['unit'])} in the table, needed one of them; leave out --unit."
+            f"{describe(table['unit'])} in the table, needed one of them; leave out --unit."
         )
-    return described_machine({**found, **given}, path)
+    return described_machine({**table, **given}, path)
 
 
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
-    """Return the machine of a table as YAML has it; messages name its source.
+    """Return the machine of a table (as in YAML); messages name its source.
 
     Raises
     ------
     ModelError
-        With one sentence for each entry that cannot be, or does not fit the others.
+        With one sentence for each entry that is impossible or contradicts others.
     """
     try:
         file = validate(TableFile, table, source)
@@ -410,13 +411,13 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     return description
 
 
-def _refuse_twice(path: Path, found: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Refuse entries that the table has and the command too."""
+def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Refuse entries that are both in the table and on the command line."""
     twice = [
-        f"{OPTIONS[key]} beside {key if key in found else other}"
+        f"{OPTIONS[key]} beside {key if key in table else other}"
         for key in given
         for other in (key, *("types" for _ in [0] if key == "type"))
-        if _says_something(found.get(other))
+        if _is_given(table.get(other))
     ]
     if twice:
         raise ModelError(
@@ -425,28 +426,28 @@ def _refuse_twice(path: Path, found: Mapping[str, Any], given: Mapping[str, Any]
         )
 
 
-def _says_something(value: Any) -> bool:
-    """Say whether an entry of a table, or of one of its legs, is there."""
+def _is_given(value: Any) -> bool:
+    """Return whether an entry of a table, or any of its list, is not null."""
     return any(x is not None for x in value) if isinstance(value, list) else value is not None
 
 
 def in_metres(value: float, unit: str) -> float:
-    """Return a length in metres: the float nearest to its decimal digits, whatever the unit."""
+    """Return a length in metres: the float nearest to its decimal digits in any unit."""
     return float(Decimal(repr(float(value))).scaleb(UNITS[unit]))
 
 
 def _types(file: TableFile, n: int) -> list[LegType]:
-    """Return the type of each leg."""
+    """Return the types of the legs."""
     texts = file.types or [(file.type or "").split("-")[-1]] * n
-    return [found for text in texts if (found := leg_type(text)) is not None]
+    return [type_ for text in texts if (type_ := leg_type(text)) is not None]
 
 
 def _conflicting_entries(file: TableFile, source: str) -> list[str]:
-    """Return which entries of a table do not fit together: counts, names, types."""
+    """Return the contradictions between counts, names and types of a table."""
     if (file.type is None) == (file.types is None):
-        found = "both" if file.type else "neither"
+        stated = "both" if file.type else "neither"
         return [
-            f"{source}: the legs could not be read: found {found} of type and types, needed "
+            f"{source}: the legs could not be read: found {stated} of type and types, needed "
             "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS."
         ]
     n = len(file.base_joints)
@@ -503,18 +504,20 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_actuators(file: TableFile, source: str) -> list[str]:
-    """Return what does not fit together of motors that rods hang on, and of these rods."""
-    names, motors, known = file.leg_names, file.motors_of_legs, file.actuators or {}
+    """Return the contradictions between motors and the rods that they carry."""
+    names, motors, actuators = file.leg_names, file.motors_of_legs, file.actuators or {}
     problems = [
         f"{source}: actuators.{name} could not be used: {problem}"
-        for name, entry in known.items()
+        for name, entry in actuators.items()
         if (problem := entry.problem(file.unit)) is not None
     ]
     for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
         where = f"{source}: leg '{leg}' could not be used"
-        if motor is not None and motor not in known:
-            found = f"'{motor}' in hangs_on, which is not among actuators; "
-            problems.append(f"{where}: found {found}{closest(motor, list(known) or ['none'])}")
+        if motor is not None and motor not in actuators:
+            missing = f"'{motor}' in hangs_on, which is not among actuators; "
+            problems.append(
+                f"{where}: found {missing}{closest(motor, list(actuators) or ['none'])}"
+            )
         elif (motor is None) is not (type_.actuator is None):
             on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
             problems.append(
@@ -522,21 +525,22 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
                 "types that begin with the motor of a rod (PSS, RSS, PRS), and for no others; "
                 "correct them."
             )
-        elif motor is not None and known[motor].turns is not (
+        elif motor is not None and actuators[motor].turns is not (
             type_.actuator is ActuatorKind.REVOLUTE
         ):
-            moves = "turns" if known[motor].turns else "slides"
+            moves = "turns" if actuators[motor].turns else "slides"
             problems.append(
                 f"{where}: found the type {type_} on '{motor}', which {moves}, needed a type that "
-                f"begins with {'R' if known[motor].turns else 'P'}; correct the type or the motor."
+                f"begins with {'R' if actuators[motor].turns else 'P'}; correct the type or the "
+                "motor."
             )
     problems += [
         f"{source}: actuators.{name} could not be used: found no leg that hangs on it, needed one "
         "in hangs_on; leave it out, or name it there."
-        for name in known
+        for name in actuators
         if name not in motors
     ]
-    lengths = _of_each(file.lengths, len(names))
+    lengths = _entries_per_leg(file.lengths, len(names))
     lacking = [
         leg
         for leg, motor, length in zip(names, motors, lengths, strict=False)
@@ -551,13 +555,13 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
 
 
 def _actuators(file: TableFile) -> dict[str, Actuator]:
-    """Return the motors that rods hang on, in the base link."""
-    found, motors = {}, file.motors_of_legs
+    """Return the motors that carry rods, in the base link."""
+    actuators, motors = {}, file.motors_of_legs
     for name, entry in (file.actuators or {}).items():
         along = np.array(entry.axis or entry.direction, dtype=float)
         A = [file.base_joints[j] for j, motor in enumerate(motors) if motor == name]
         at = entry.point or np.mean(A, axis=0).tolist()
-        found[name] = Actuator(
+        actuators[name] = Actuator(
             name,
             ActuatorKind.REVOLUTE if entry.turns else ActuatorKind.PRISMATIC,
             np.asarray(along / np.linalg.norm(along)),
@@ -570,12 +574,12 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
             joints = np.array([[in_metres(x, file.unit) for x in joint] for joint in A])
             radius = in_metres(entry.arm_radius, file.unit)
             first = file.leg_names[motors.index(name)]
-            found[name] = found[name].with_arm(joints, radius, first)
-    return found
+            actuators[name] = actuators[name].with_arm(joints, radius, first)
+    return actuators
 
 
 def _home_readings(file: TableFile) -> dict[str, float]:
-    """Return the readings of motors at home that a table states [m or rad]."""
+    """Return the stated readings of motors at home [m or rad]."""
     return {
         **{name: in_metres(q, file.unit) for name, q in (file.home_readings or {}).items()},
         **{name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
@@ -583,13 +587,13 @@ def _home_readings(file: TableFile) -> dict[str, float]:
 
 
 def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
-    """Return which readings at home are of no motor of their kind."""
+    """Return the problems of home readings without a motor of their kind."""
     problems = []
     for key, turns in (("home_readings", False), ("home_readings_deg", True)):
         right = [name for name, entry in (file.actuators or {}).items() if entry.turns is turns]
-        what = "arm, in degrees" if turns else f"carriage, in {file.unit}"
+        motor = "arm, in degrees" if turns else f"carriage, in {file.unit}"
         problems += [
-            f"{source}: {key}.{name} could not be used: found no such {what}, needed "
+            f"{source}: {key}.{name} could not be used: found no such {motor}, needed "
             f"{', '.join(right) or 'one among actuators'}; {closest(name, right or ['none'])}"
             for name in getattr(file, key) or {}
             if name not in right
@@ -598,7 +602,7 @@ def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_home(file: TableFile, source: str) -> list[str]:
-    """Return what does not fit together in the block ``home``."""
+    """Return the contradictions in the block ``home``."""
     problems = []
     home = file.home
     if home is None:
@@ -625,24 +629,24 @@ def _wrong_home(file: TableFile, source: str) -> list[str]:
 
 
 def _wrong_lengths(file: TableFile, source: str) -> list[str]:
-    """Return lengths of legs of which one is missing, too much or wrong."""
+    """Return the problems of shortest and longest lengths: missing, redundant or impossible."""
     problems = []
     n = len(file.base_joints)
     for name, low, high, _, travel in zip(
-        file.leg_names, *(_of_each(value, n) for value in _laws(file)), strict=False
+        file.leg_names, *(_entries_per_leg(value, n) for value in _laws(file)), strict=False
     ):
         if low is None and high is None:
             continue
-        found = ""
+        conflict = ""
         if low is None or high is None:
-            found = f"{'max' if low is None else 'min'}_length alone"
+            conflict = f"{'max' if low is None else 'min'}_length alone"
         elif not low < high:
-            found = f"min_length {low:g} and max_length {high:g}"
+            conflict = f"min_length {low:g} and max_length {high:g}"
         elif travel is not None:
-            found = "travel beside min_length and max_length"
-        if found:
+            conflict = "travel beside min_length and max_length"
+        if conflict:
             problems.append(
-                f"{source}: min_length and max_length could not be used: found {found} of leg "
+                f"{source}: min_length and max_length could not be used: found {conflict} of leg "
                 f"'{name}', needed the shortest and the longest length, in place of travel; "
                 "correct them."
             )
@@ -651,18 +655,18 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
 
 
 def _laws(file: TableFile) -> tuple[Any, ...]:
-    """Return what a table says of lengths: shortest, longest, at reading zero, travel."""
+    """Return the entries of the length law: shortest, longest, at reading zero, travel."""
     travel = [file.travel] * len(file.base_joints) if _is_pair(file.travel) else file.travel
     return file.min_length, file.max_length, file.offsets, travel
 
 
-def _of_each(value: Any, n: int) -> list[Any]:
-    """Return an entry for each leg."""
+def _entries_per_leg(value: Any, n: int) -> list[Any]:
+    """Return a list with an entry for each leg."""
     return value if isinstance(value, list) else [value] * n
 
 
 def _useless_entries(file: TableFile, source: str) -> list[str]:
-    """Return which entries are for legs that have no use for them."""
+    """Return the problems of entries for legs whose type does not have them."""
     names = file.leg_names
     has_slider = [leg.has_slider for leg in _types(file, len(names))]
     problems = []
@@ -689,7 +693,7 @@ def _useless_entries(file: TableFile, source: str) -> list[str]:
 
 
 def _description(file: TableFile, source: str) -> Description:
-    """Return the machine of a table, its lengths in metres."""
+    """Return the machine of a table, in metres."""
     n = len(file.base_joints)
 
     def metres(value: Any) -> Any:
@@ -698,10 +702,10 @@ def _description(file: TableFile, source: str) -> Description:
         return None if value is None else in_metres(value, file.unit)
 
     def per_leg(value: Any) -> list[Any]:
-        return _of_each(value, n)
+        return _entries_per_leg(value, n)
 
     names, actuators, motors = file.leg_names, _actuators(file), file.motors_of_legs
-    laws = [_of_each(value, n) for value in _laws(file)]
+    laws = [_entries_per_leg(value, n) for value in _laws(file)]
     notes = list[str]()
     legs = []
     for j, (name, kind_of_leg, kind, radius) in enumerate(
@@ -718,11 +722,14 @@ def _description(file: TableFile, source: str) -> Description:
             if offset is None and kind is LegKind.ACTUATED:
                 offset = low
                 notes = [
-                    "Readings are taken to be zero at the shortest length of a leg (min_length): "
-                    "give offsets, the length at reading zero, if the encoders count otherwise."
+                    "Readings are assumed to be zero at the shortest length of a leg (min_length): "
+                    "give offsets, the length at reading zero, if they are not."
                 ]
-            limits = [_less(low, offset or 0.0), _less(high, offset or 0.0)]
-        reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
+            limits = [
+                _decimal_difference(low, offset or 0.0),
+                _decimal_difference(high, offset or 0.0),
+            ]
+        reads_length = kind is LegKind.PASSIVE and offset is None  # a single pair means readings
         limits = metres(limits)
         if constant or (reads_length and _is_pair(file.travel)):
             limits = None
@@ -749,22 +756,21 @@ def _description(file: TableFile, source: str) -> Description:
     return described
 
 
-def _less(one: float, other: float) -> float:
-    """Return a difference by its decimal digits."""
-    return float(Decimal(repr(float(one))) - Decimal(repr(float(other))))
+def _decimal_difference(minuend: float, subtrahend: float) -> float:
+    return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 
 def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
-    """Return the radii of tube and rod [m]."""
-    both = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
+    radii = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
     tube, rod = (
-        None if both.get(part) is None else in_metres(both[part], unit) for part in ("tube", "rod")
+        None if radii.get(part) is None else in_metres(radii[part], unit)
+        for part in ("tube", "rod")
     )
     return tube, rod
 
 
 def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
-    """Return one direction of a list, of length one."""
+    """Return the unit vector of one direction of a list, None if it has none."""
     if axes is None or axes[j] is None:
         return None
     axis = np.array(axes[j], dtype=float)
@@ -772,7 +778,6 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
 
 
 def _home(file: TableFile) -> Home | None:
-    """Return the home of a table."""
     if file.home is None or file.home.xyz is None:
         return None
     xyz = tuple(in_metres(x, file.unit) for x in file.home.xyz)
@@ -782,15 +787,14 @@ def _home(file: TableFile) -> Home | None:
 
 
 def _turn(home: HomeEntry) -> Rotation:
-    """Return the rotation of a home."""
     if home.quat_xyzw is not None:
         return Rotation.from_quat(home.quat_xyzw)
     return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
 def _impossible_legs(described: Description) -> list[str]:
-    """Return what legs lack or cannot have by their types, and which legs coincide."""
-    lacking: dict[str, list[str]] = {}  # names of the legs for each thing that is wrong
+    """Return the contradictions between legs and their types, and coincident legs."""
+    lacking: dict[str, list[str]] = {}  # names of legs by problem
     for leg in described.legs:
         if leg.kind is LegKind.ACTUATED and leg.offset is None:
             lacking.setdefault(
@@ -822,24 +826,24 @@ def _impossible_legs(described: Description) -> list[str]:
                     [],
                 ).append(leg.name)
     problems = [
-        f"{described.source}: {legs_in_words(names)} could not be used: found {what}"
-        for what, names in lacking.items()
+        f"{described.source}: {legs_in_words(names)} could not be used: found {mistake}"
+        for mistake, names in lacking.items()
     ]
-    # Legs that begin and end in the same two points, and joints all in one point.
+    # Coincident legs, and joints that all coincide.
     legs = described.legs
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
-    for j, one in enumerate(legs):
-        for two in legs[j + 1 :]:
+    for j, first in enumerate(legs):
+        for second in legs[j + 1 :]:
             gap = max(
-                float(np.linalg.norm(one.A_base - two.A_base)),
-                float(np.linalg.norm(one.B_platform - two.B_platform)),
+                float(np.linalg.norm(first.A_base - second.A_base)),
+                float(np.linalg.norm(first.B_platform - second.B_platform)),
             )
             if gap <= _SAME * max(spans):
                 problems.append(
-                    f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
-                    "found both between the same two points, needed different joints; correct "
-                    "their rows."
+                    f"{described.source}: legs '{first.name}' and '{second.name}' could not be "
+                    "used: found both between the same two points, needed different joints; "
+                    "correct their rows."
                 )
     if min(spans) <= _SAME * max(spans):
         problems.append(

@@ -1,4 +1,4 @@
-"""What deserves attention in a machine that was loaded, one sentence each."""
+"""Notes on a loaded machine, one sentence each."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.ties import ties_in_words
 
-_AT_MIDDLE = 1e-6  # of the travel
-_MIN_SINGULARITY = 1e-4  # singularity measure: less than that is the rounding of a file
+_AT_MIDDLE = 1e-6  # largest distance from mid-travel, relative to the travel
+_MIN_SINGULARITY = 1e-4  # singularity measure below which it is the rounding of a file
 
 
 def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
-    """Return what deserves attention in a mechanism, one sentence each."""
+    """Return the notes on a mechanism, one sentence each."""
     notes = []
     q = readings_at(machine, machine.home)
     if not home_is_given:
@@ -21,12 +21,12 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         away = [(q[j] - 0.5 * sum(ends)) / np.ptp(ends) for j, ends in travels.items()]
         middle = "with all legs at mid-travel"
         if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
-            middle = "with all motors as near mid-travel as they are together"
+            middle = "with all motors as near to mid-travel as possible"
         xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
         quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
             f"{machine.urdf.wording.no_home}: a pose {middle} was taken, xyz "
-            f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
+            f"[{xyz}], quat_xyzw [{quat}]; add it to the file if it is the right assembly."
         )
     outside = legs_outside(machine)
     for name, reading, travel in dict.fromkeys(
@@ -42,31 +42,31 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
 
 
 def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, ...]:
-    """Return what of the block ``legcal`` was proposed because the file does not have it."""
+    """Return the entries of the block ``legcal`` that were proposed, as notes."""
     frame = ", ".join(machine.leg_names[j] for j in machine.frame_legs)
     if written is None:
         return (
             f"the file has no block legcal: base '{machine.base}', platform "
             f"'{machine.platform}', legs {', '.join(machine.leg_names)} and base_frame "
-            f"[{frame}] were taken from its bodies; write them down to choose others.",
+            f"[{frame}] were taken from its bodies; add the block to choose others.",
         )
     if written.base_frame is None:
         return (
-            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
-            "it down to choose others.",
+            f"legcal.base_frame is not given: [{frame}] was taken, the legs with the largest span "
+            "of joints; add it to choose others.",
         )
     return ()
 
 
 def singularity_note(machine: Machine) -> str | None:
-    """Return that the motors do not hold the platform at home, None where they do."""
+    """Return a note if the motors do not hold the platform at home, else None."""
     if not 0 < machine.mobility <= len(machine.motors):
         return None
     measure = singularity(machine, machine.home)
     if measure > _MIN_SINGULARITY:
         return None
     return (
-        "the mechanism is singular at home: the platform moves there although all motors stand "
+        "the mechanism is singular at home: the platform can move there with all motors locked "
         f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
         f"{machine.urdf.wording.correct_home}, or the joints if they make similar figures on base "
         "and platform."
@@ -74,7 +74,7 @@ def singularity_note(machine: Machine) -> str | None:
 
 
 def _unseen_notes(machine: Machine) -> list[str]:
-    """Return which legs show no cylinder."""
+    """Return notes on legs without visible cylinder."""
     unseen = [leg.name for leg in machine.legs if not leg.cylinders]
     if not unseen:
         return []
@@ -87,7 +87,7 @@ def _unseen_notes(machine: Machine) -> list[str]:
 
 
 def _motor_notes(machine: Machine) -> list[str]:
-    """Return where forward kinematics has too few motors, or too many, or a singular start."""
+    """Return notes on too few or too many motors, and on a singular home."""
     notes = []
     if machine.mobility == 0:
         return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
@@ -101,28 +101,28 @@ def _motor_notes(machine: Machine) -> list[str]:
     elif machine.is_redundant:
         notes.append(
             f"there are more motors than the pose needs: mobility {machine.mobility}, motors "
-            f"{n_motors}; the pose at readings is that of least squares."
+            f"{n_motors}; the pose at readings is a least-squares pose."
         )
     singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular]
 
 
 def _spin_notes(machine: Machine) -> list[str]:
-    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
+    """Return notes on idle spins: legs with an S joint at both ends, redundant revolutes."""
     notes = []
-    both = sum(
+    n_spinning = sum(
         leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
     )
-    if both:
+    if n_spinning:
         legs, spin = "1 leg has", "spins about itself"
-        if both > 1:
-            legs, spin = f"{both} legs have", "spin about themselves"
+        if n_spinning > 1:
+            legs, spin = f"{n_spinning} legs have", "spin about themselves"
         notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(leg.idle_spins for leg in machine.legs) - both
+    others = sum(leg.idle_spins for leg in machine.legs) - n_spinning
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(
-            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
-            "as mobility."
+            f"{joints} the motion of an S joint of the leg, or of another revolute; this is not "
+            "counted as mobility."
         )
     return notes

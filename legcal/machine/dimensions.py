@@ -1,7 +1,7 @@
 """The options of ``legcal new`` that describe a machine; the command line takes them from here.
 
-Nothing but the standard library is imported here, so that help and completion answer at once.
-:func:`legcal.machine.family.description_of` makes a machine of them.
+This module imports the standard library only, so that help and completion are fast.
+:func:`legcal.machine.family.description_of` builds the machine.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _FAMILY = "Dimensions of --family"
 
 @dataclass(frozen=True, kw_only=True)
 class Dimensions:
-    """Numbers beside a table, or a family and its dimensions; None if not given.
+    """Numbers given beside a table, or a family and its dimensions; None if not given.
 
     Lengths are in ``unit``.
     """
@@ -51,6 +51,6 @@ class Dimensions:
     )
 
     def stated(self) -> dict[str, Any]:
-        """Return what is given, by its name."""
-        found = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: value for name, value in found.items() if value is not None}
+        """Return the given dimensions by name."""
+        dimensions = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in dimensions.items() if value is not None}

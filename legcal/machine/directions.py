@@ -1,4 +1,4 @@
-"""Directions of the parameter space: what they do to the platform, a sparse basis, and words."""
+"""Directions in parameter space: their platform motion, a sparse basis, and names in words."""
 
 import re
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ from scipy.linalg import qr
 from legcal.geometry.types import Array
 from legcal.machine.parameter_id import ParameterId
 
-SHOWN = 0.02  # of the largest component
+SHOWN = 0.02  # least component named in words, relative to the largest
 
 
 def split_by_motion(
     motion: Array | None, basis: Array, length: float, harmless: float
 ) -> tuple[Array, Array]:
-    """Return bases (a, p), (b, p) of directions that move the platform and of those that do not.
+    """Return bases (a, p), (b, p) of the directions that move the platform, and the others.
 
     *motion* (k, 6, p) is rotation [rad] and displacement [m] of the platform at k poses by each
-    parameter, all in metres; None where the motors do not determine the pose, and everything
-    counts. *basis* (w, p) is orthonormal; rotations become displacements by the mean leg *length*
-    [m]; motion below *harmless*, a part of the change of the parameters, counts as none.
+    parameter, all in metres; None if the motors do not determine the pose: then all directions
+    count. *basis* (w, p) is orthonormal; rotations are converted to displacements by the mean leg
+    *length* [m]; motion below *harmless*, relative to the change of the parameters, counts as none.
     """
     if motion is None or len(basis) == 0:
         return basis, basis[:0]
@@ -33,7 +33,7 @@ def split_by_motion(
 
 
 def sparse_basis(basis: Array) -> Array:
-    """Return a basis of the same space in which each direction has a parameter for itself."""
+    """Return a basis of the same space in which each direction has a parameter of its own."""
     if len(basis) == 0:
         return basis
     _, upper, order = qr(basis, mode="economic", pivoting=True)
@@ -45,7 +45,7 @@ def sparse_basis(basis: Array) -> Array:
     return np.asarray(sparse[np.argsort(first, kind="stable")])
 
 
-_MAX_GROUPS = 4  # of joints in one direction
+_MAX_GROUPS = 4  # groups of joints named in one direction
 _NOUN = {
     "base": ("base joint", "base joints"),
     "platform": ("platform joint", "platform joints"),
@@ -70,14 +70,14 @@ _NOUN_OF_ACTUATOR = {
 
 
 def list_in_words(words: Sequence[str]) -> str:
-    """Return words as a list in a sentence."""
+    """Return words joined as a list in a sentence."""
     if len(words) < 2:
         return "".join(words)
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
-    """Return what to call each leg after the word leg: its number where its name is one."""
+    """Return the label of each leg after the word "leg": its number if its name is one."""
     numbers = [re.fullmatch(r"[Ll]eg[_-]?(\d+)", name) for name in leg_names]
     labels = {
         name: match.group(1) if match else name
@@ -87,7 +87,7 @@ def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
 
 
 def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
-    """Return in words which parameters change together: ``z of platform joints 2 and 4 together``.
+    """Return the parameters of a direction in words: ``z of platform joints 2 and 4 together``.
 
     Others are ``offset of leg 3``, ``direction of rail1`` and ``fx of camera c1``.
     """
@@ -96,18 +96,18 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
 
 
 def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
-    """Return parameters in words, those of one kind together: ``z of platform joints 2 and 4``."""
+    """Return parameters in words, grouped by kind: ``z of platform joints 2 and 4``."""
     coordinates: dict[tuple[str, str], list[str]] = {}
     for name in parameters:
         owner, kind, which = _split(name, leg_names)
         coordinates.setdefault((kind, owner), []).append(which)
     groups: dict[tuple[str, str], list[str]] = {}
-    for (kind, owner), found in coordinates.items():
-        axes = list_in_words(sorted(found))
-        if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # a tube and a rod; two angles
+    for (kind, owner), letters in coordinates.items():
+        axes = list_in_words(sorted(letters))
+        if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # tube and rod, two angles
             axes = ""
         elif kind.endswith("_axis"):
-            axes = f"angle{'s' * (len(found) > 1)} {axes}"
+            axes = f"angle{'s' * (len(letters) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(owner)
     phrases = []
     for (kind, axes), owners in groups.items():
@@ -121,17 +121,17 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
 
 
 def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
-    """Return what to call legs, in their order, or cameras."""
+    """Return the labels of legs, in their order, or of cameras."""
     labels = leg_labels(leg_names)
     legs = [labels[name] for name in leg_names if name in owners]
     return [*legs, *(owner for owner in owners if owner not in leg_names)]
 
 
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
-    """Return owner, kind and component of a parameter as sentences group them.
+    """Return owner, kind and component of a parameter, for words.
 
-    The owner of the size of a board is its link, and an intrinsic parameter of a camera is the
-    component of no kind.
+    The owner of the size of a board is its link; an intrinsic parameter is a component of a camera,
+    without kind.
     """
     if name in _BOARDS:
         return _BOARDS[name], "board", ""

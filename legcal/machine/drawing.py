@@ -1,4 +1,4 @@
-"""What pictures show of a machine: at home from above and from the side, motors as lines."""
+"""The content of pictures of a machine: at home from above and from the side, motors as lines."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 BASE_COLOUR, PLATFORM_COLOUR, LEG_COLOUR = "#333333", "#1f66b0", "#b9b9b9"
 MOTOR_COLOUR = "#8a6d3b"  # arms, carriages and rails
 AXIS_COLOURS = ("#c62828", "#2e7d32", "#1565c0")  # x, y, z
-_PANEL = (5.0, 5.0)  # [inch]
-_ARM = 0.1  # of the size of the machine: the axes of a frame
-_CARRIAGE = 0.06  # of its travel: the length of a carriage
-_RING = 140.0  # [pt^2]: around joints that define R_b and R_e
+_PANEL = (5.0, 5.0)  # size of a panel [inch]
+_ARM = 0.1  # length of the axes of a frame, relative to the machine
+_CARRIAGE = 0.06  # length of a carriage, relative to its travel
+_RING = 140.0  # area of rings around joints that define R_b and R_e [pt^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ class Panel:
     """A machine seen along an axis of its base link, in the coordinates of the other two [m]."""
 
     title: str
-    is_plan: bool  # from above
+    is_plan: bool  # seen from above
     A: Array  # (n_legs, 2) joints of the base
     B: Array  # (n_legs, 2) joints of the platform at home
     frames: tuple[tuple[str, Array], ...]  # R_b and R_e: (4, 2) origin, and x, y, z from it
-    rim: Array  # (n, 2) what the base is drawn about: its joints, or where its motors stand
+    rim: Array  # (n, 2) outline of the base: its joints, or the positions of its motors
     standing: Array  # (n_motors, 2, 2) ends of rails and axes
     moving: Array  # (m, 2, 2) ends of arms, of carriages, and of bars between their joints
 
@@ -50,9 +50,9 @@ class MotorLines(NamedTuple):
 
 
 def motor_lines(legs: Sequence[Leg], A: Array) -> MotorLines:
-    """Return the motors of legs, with joints at A where these are, (k, n_legs, 3), in their frame.
+    """Return the motors of legs at joint positions A (k, n_legs, 3), in the frame of the legs.
 
-    Machines whose joints at A do not move have none. The sizes of carriages and axes are for show.
+    Machines with fixed joints A have none. The sizes of carriages and axes are only for display.
     """
     on, k = actuator_index(legs), len(A)
     anchors, standing, moving = list[Array](), list[Array](), list[Array]()
@@ -85,29 +85,29 @@ def motor_lines(legs: Sequence[Leg], A: Array) -> MotorLines:
 
 
 def corners_of_base(A: Array, anchors: Array) -> Array:
-    """Return what the base is drawn about: where three motors or more stand, else its joints A."""
+    """Return the corners of the base: its motors if there are three or more, else its joints A."""
     return anchors if len(anchors) > 2 else A
 
 
 def around(joints: Array) -> Array:
-    """Return joints (n, 2) in the order of their angles about their middle."""
+    """Return joints (n, 2) ordered by angle about their centroid."""
     away = joints - joints.mean(axis=0)
     return np.asarray(joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))])
 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """What a picture of a machine shows."""
+    """The content of a picture of a machine."""
 
     name: str
     leg_names: tuple[str, ...]
     frame_legs: tuple[int, ...]
-    radii: tuple[float, ...]  # the largest of what is seen of each leg [m]; zero without any
+    radii: tuple[float, ...]  # largest visible radius of each leg [m]; zero without cylinders
     panels: tuple[Panel, ...]  # from above (y up), and in space from the side (z up)
 
 
 def sketch_of(machine: Machine) -> Sketch:
-    """Return what pictures of a machine at home show."""
+    """Return the sketch of a machine at home."""
     B = machine.home.apply(machine.B_platform)
     A = B - vectors_A_to_B(machine, machine.home)
     motors = motor_lines(machine.legs, A[None])
@@ -153,7 +153,6 @@ def plot_machine(machine: Machine) -> Figure:
 
 
 def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:
-    """Draw one panel."""
     A, B = 1e3 * panel.A, 1e3 * panel.B
     size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
     for joints, colour in ((1e3 * panel.rim, BASE_COLOUR), (B, PLATFORM_COLOUR)):
@@ -181,7 +180,7 @@ def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:
         at = 1e3 * origin
         for k, (arm, colour) in enumerate(zip(arms, AXIS_COLOURS, strict=True)):
             end = at + _ARM * size * arm
-            if np.linalg.norm(arm) < 0.05:  # towards the eye
+            if np.linalg.norm(arm) < 0.05:  # towards the viewer
                 continue
             ax.annotate("", end, at, arrowprops={"arrowstyle": "->", "color": colour})
             ax.annotate(f"{name} x" if k == 0 else "xyz"[k], end, color=colour, fontsize="small")

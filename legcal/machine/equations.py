@@ -2,16 +2,15 @@
 
 An equation is measured (the length of an actuated leg) or a constraint of the machine alone (the
 length of a rod, a revolute axis, a twist, the plane of a planar machine). Steps of a pose are a
-rotation about the origin of the platform's frame [rad] and a displacement [m], both in the frame of
-the base. The rows of :func:`leg_equations` are those of the paper; :func:`pose_equations`
-multiplies rows without a unit by the leg length, so that all are lengths. Which equations a leg has
-follows from its joints (:class:`legcal.machine.leg.JointType`); each is one function here, which
-gives the residual and its gradients by the vector from A to B and by the axes.
+rotation about the origin of the platform frame [rad] and a displacement [m], both in the base
+frame. The rows of :func:`leg_equations` are as in the paper; :func:`pose_equations` multiplies
+dimensionless rows by the leg length, so that all are lengths. The joints of a leg determine its
+equations (:class:`legcal.machine.leg.JointType`); each is one function here that returns the
+residual and its gradients by the vector from A to B and by the axes.
 
 The joint at A of a rod on an actuator moves with its reading, and with it all equations of the rod
-(:func:`pose_equations` with ``q``). Where no readings are given they are eliminated: one
-combination of the equations of all rods on an actuator tells its reading, the others are
-constraints.
+(:func:`pose_equations` with ``q``). Readings that are not given are eliminated: one combination of
+the equations of all rods on an actuator determines its reading, the others are constraints.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ from legcal.machine.rods import (
 class PoseEquations:
     """Equations at k poses, m rows each."""
 
-    values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
+    values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, which equals s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 21) by the numbers of the row's leg (LegColumns), axes by turns about
-    # their normal_basis, exact where residuals are zero; or (k, m, 0)
+    by_local: Array  # (k, m, 21) derivative by the numbers of the row's leg (LegColumns), axes by
+    # rotations about their normal_basis, exact at zero residuals; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
-    kinds: tuple[EquationKind, ...]  # (m,) what each row is about
+    kinds: tuple[EquationKind, ...]  # (m,) kind of each row
     measured: BoolArray  # (m,) rows of readings; the others are constraints
-    by_q: Array  # (k, m, n) by readings of actuators; or (k, m, 0)
+    by_q: Array  # (k, m, n) derivative by readings of actuators; or (k, m, 0)
 
     def of(self, rows: BoolArray) -> PoseEquations:
         """Return some of the rows."""
@@ -68,9 +67,8 @@ class PoseEquations:
     def by_parameters(self, parametrization: Parametrization) -> Array:
         """Return the derivatives by parameters, (k, m, p)."""
         k, m, _ = self.by_local.shape
-        wide = np.zeros(
-            (k, m, len(parametrization) + 1)
-        )  # the last one for numbers that are no parameters
+        # The last column collects numbers that are no parameters.
+        wide = np.zeros((k, m, len(parametrization) + 1))
         wide[:, np.arange(m)[:, None], parametrization.place[self.leg]] = self.by_local
         return wide[..., :-1]
 
@@ -81,11 +79,11 @@ def pose_equations(
     """Return the equations of legs at poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
 
     *q* (k, n) are the readings of actuators [m, rad], in the order of
-    :func:`~legcal.machine.rods.actuators_of`; all rows of their rods then count as measured: they
-    hold at these readings. Without *q* they are at those of
-    :func:`~legcal.machine.rods.readings_of_rods`, one row for each actuator measured and the others
-    constraints, and derivatives by parameters are not to be had. Without *by_local* these have no
-    columns, which takes two thirds of the time.
+    :func:`~legcal.machine.rods.actuators_of`; all rows of their rods then count as measured, since
+    they hold at these readings. Without *q* the actuators are at
+    :func:`~legcal.machine.rods.readings_of_rods`; one row per actuator is measured, the others are
+    constraints, and there are no derivatives by parameters. Without *by_local* there are none
+    either, and the call takes two thirds of the time.
     """
     on = actuator_index(legs)
     if q is None and max(on, default=-1) >= 0:
@@ -93,24 +91,26 @@ def pose_equations(
         return _without_readings(legs, there)
     if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
         return _lengths(legs, R, t, by_local, q)
-    groups: dict[tuple[object, ...], list[int]] = {}  # legs alike at once, those on actuators alone
+    groups: dict[tuple[object, ...], list[int]] = {}  # of similar legs; those on actuators alone
     for j, leg in enumerate(legs):
-        own = j if on[j] >= 0 else -1
+        alone = j if on[j] >= 0 else -1
         joints = leg.base_joint, leg.platform_joint
-        groups.setdefault((own, leg.kind, *joints, *leg.equations), []).append(j)
+        groups.setdefault((alone, leg.kind, *joints, *leg.equations), []).append(j)
     parts: dict[int, PoseEquations] = {}
     for alike in groups.values():
         leg, a = legs[alike[0]], on[alike[0]]
         at = None if q is None or a < 0 else q[:, a]
-        length, *found, by_own = _of_alike([legs[j] for j in alike], R, t, by_local, at)
-        by_q = np.zeros((*found[0].shape, 0 if q is None else q.shape[1]))
+        length, *equations, by_reading = _equations_of_similar(
+            [legs[j] for j in alike], R, t, by_local, at
+        )
+        by_q = np.zeros((*equations[0].shape, 0 if q is None else q.shape[1]))
         if at is not None:
-            by_q[..., a] = by_own[..., 0]
+            by_q[..., a] = by_reading[..., 0]
         rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
         kinds = leg.equations[rows]
         is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
         arm = np.where(is_length, 1.0, length[..., None])
-        values, by_pose, local, by_q = (x[:, :, rows] for x in (*found, by_q))
+        values, by_pose, local, by_q = (x[:, :, rows] for x in (*equations, by_q))
         values = arm * values
         by_pose, local, by_q = (arm[..., None] * x for x in (by_pose, local, by_q))
         measured = _measured(leg)[rows]
@@ -128,23 +128,23 @@ def pose_equations(
 
 
 def n_pose_constraints(legs: Sequence[Leg]) -> int:
-    """Return how many equations of legs hold whatever the readings are."""
+    """Return the number of equations of legs that hold at any readings."""
     return sum(leg.n_constraints for leg in legs) - len(actuators_of(legs))
 
 
-def _without_readings(legs: Sequence[Leg], found: PoseEquations) -> PoseEquations:
+def _without_readings(legs: Sequence[Leg], equations: PoseEquations) -> PoseEquations:
     """Return the equations of legs with the readings of all actuators eliminated.
 
-    The rows in which a reading stands are turned (by a reflection) so that it stands only in that
-    of the first rod on the actuator, which is measured then; the others are constraints.
+    A reflection of the rows of an actuator leaves its reading in the row of the first rod only,
+    which is then measured; the others are constraints.
     """
-    values, measured = found.values.copy(), found.measured.copy()
-    slopes = np.concatenate([found.by_pose, found.by_q], axis=2)  # turned together
-    on = np.array(actuator_index(legs))[found.leg]
-    is_first = np.diff(found.leg, prepend=-1) != 0
+    values, measured = equations.values.copy(), equations.measured.copy()
+    slopes = np.concatenate([equations.by_pose, equations.by_q], axis=2)  # reflected together
+    on = np.array(actuator_index(legs))[equations.leg]
+    is_first = np.diff(equations.leg, prepend=-1) != 0
     for a, first in enumerate(first_rods(legs)):
         rows = np.flatnonzero(on == a)
-        pivot = int(np.argmax(is_first[rows] & (found.leg[rows] == first)))
+        pivot = int(np.argmax(is_first[rows] & (equations.leg[rows] == first)))
         measured[rows] = np.arange(len(rows)) == pivot
         if len(rows) == 1:
             continue
@@ -159,42 +159,42 @@ def _without_readings(legs: Sequence[Leg], found: PoseEquations) -> PoseEquation
         values[:, rows] -= v * (scale * np.einsum("kr,kr->k", v, values[:, rows]))[:, None]
     none = np.zeros((*values.shape, 0))
     return PoseEquations(
-        values, slopes[:, :, :6], none, found.leg, found.kinds, measured, slopes[:, :, 6:]
+        values, slopes[:, :, :6], none, equations.leg, equations.kinds, measured, slopes[:, :, 6:]
     )
 
 
 def posture_constraints(
     legs: Sequence[Leg], R: Array, t: Array, q: Array, *, by_local: bool = False
 ) -> PoseEquations:
-    """Return what holds at poses and readings q (k, n) of actuators, whatever was measured."""
-    found = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
+    """Return the constraints at poses and readings q (k, n) of actuators, without leg readings."""
+    equations = pose_equations(legs, R, t, by_local=by_local, q=q if q.shape[1] else None)
     hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
-    return found.of(~found.measured | hangs[found.leg])
+    return equations.of(~equations.measured | hangs[equations.leg])
 
 
 def equations_at_readings(
     legs: Sequence[Leg], R: Array, t: Array, lengthening: Array, *, by_local: bool = False
 ) -> PoseEquations:
-    """Return what legs miss at poses and readings, if asked with derivatives by parameters.
+    """Return the residuals of legs at poses and readings, optionally with parameter derivatives.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad]; rows
-    of readings that are not known (NaN) are zero.
+    of unknown readings (NaN) are zero.
     """
     on = actuator_index(legs)
     rods = [on.index(a) for a in range(max(on, default=-1) + 1)]
     q = np.nan_to_num(np.broadcast_to(lengthening[:, rods], (len(t), len(rods))))
-    found = pose_equations(legs, R, t, by_local=by_local, q=q if rods else None)
-    wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
-    known = np.isfinite(wanted)
-    hangs = np.array(on)[found.leg] >= 0
+    equations = pose_equations(legs, R, t, by_local=by_local, q=q if rods else None)
+    wanted = np.where(equations.measured, lengthening[:, equations.leg], 0.0)
+    is_read = np.isfinite(wanted)
+    hangs = np.array(on)[equations.leg] >= 0
     return PoseEquations(
-        np.where(known, found.values - np.where(hangs, 0.0, wanted), 0.0),
-        found.by_pose * known[..., None],
-        found.by_local,
-        found.leg,
-        found.kinds,
-        found.measured,
-        found.by_q,
+        np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
+        equations.by_pose * is_read[..., None],
+        equations.by_local,
+        equations.leg,
+        equations.kinds,
+        equations.measured,
+        equations.by_q,
     )
 
 
@@ -206,19 +206,19 @@ def leg_equations(
     by_local: bool = True,
     q: Array | None = None,
 ) -> PoseEquations:
-    """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as the paper has them.
+    """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as in the paper.
 
-    Rows but that of the length have no unit; a passive leg has the row of its length too. Of a rod
-    on an actuator *q* (k,) are its readings, zero if they are not given.
+    All rows but the length are dimensionless; a passive leg has a length row, too. For a rod on an
+    actuator *q* (k,) are the readings, zero by default.
     """
-    _, *found = _of_alike([leg], R, t, by_local, q)
-    values, by_pose, local, by_q = (x[:, 0] for x in found)
+    _, *equations = _equations_of_similar([leg], R, t, by_local, q)
+    values, by_pose, local, by_q = (x[:, 0] for x in equations)
     owner = np.zeros(len(leg.equations), dtype=np.intp)
     return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
 
 
 def _measured(leg: Leg) -> BoolArray:
-    """Return which equations of a leg are about its reading, (m,)."""
+    """Return which equations of a leg contain its reading, (m,)."""
     return np.array(
         [
             leg.actuator is not None
@@ -228,17 +228,17 @@ def _measured(leg: Leg) -> BoolArray:
     )
 
 
-def _of_alike(
+def _equations_of_similar(
     legs: Sequence[Leg],
     R: Array,
     t: Array,
     by_local: bool,
     q: Array | None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the equations of n legs with the same joints and equations; n is 1 where one moves.
+    """Return the equations of n legs with the same joints and equations; n is 1 for moving A.
 
-    They are lengths (k, n), and of m rows values (k, n, m) and derivatives (k, n, m, 6) by the
-    pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the reading q (k,).
+    The result is lengths (k, n), and for m rows values (k, n, m) and derivatives (k, n, m, 6) by
+    the pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the reading q (k,).
     """
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
     actuator, moved = legs[0].actuator, None
@@ -278,7 +278,7 @@ def _of_alike(
 
 
 def _back(moved: JointMotion | None, vectors: Array) -> Array:
-    """Turn gradients (k, ..., 3) by moved points into gradients by the points at reading 0."""
+    """Convert gradients (k, ..., 3) by moved points into gradients by the points at reading 0."""
     return vectors if moved is None else np.einsum("kij,k...i->k...j", moved.by_A, vectors)
 
 
@@ -291,9 +291,9 @@ def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
 
 
 def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
-    """Return the derivative (k,) of a row by the reading; write those by the actuator's numbers.
+    """Return the derivative (k,) of a row by the reading; write those by numbers of the actuator.
 
-    They go into *local* (k, 21), which may have no columns.
+    The latter go into *local* (k, 21), which may have no columns.
     """
     by_leg = row.by_leg[:, 0]
     by_q, columns = -_dot(moved.by_q, by_leg), ActuatorColumns
@@ -314,16 +314,18 @@ def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) 
 
 
 def least_squares_equations(
-    found: PoseEquations,
+    equations: PoseEquations,
     n_dependent: int = 0,  # constraints that follow from the others where all hold
 ) -> tuple[Array, Array]:
-    """Return equations (k, m) and derivatives (k, m, 6) that hold where readings miss least.
+    """Return equations (k, m) and derivatives (k, m, 6) of the least squares of reading residuals.
 
-    They are the constraints as they are, and of the residuals of readings what no small motion that
-    the constraints leave can undo; steps to their root are those of Gauss-Newton with the
-    constraints exact.
+    They are the constraints, and the projection of the reading residuals onto motions that the
+    constraints allow; steps to their root are Gauss-Newton steps with exact constraints.
     """
-    constraints, J = found.by_pose[:, ~found.measured], found.by_pose[:, found.measured]
+    constraints, J = (
+        equations.by_pose[:, ~equations.measured],
+        equations.by_pose[:, equations.measured],
+    )
     _, size, along = np.linalg.svd(constraints, full_matrices=False)
     counts = size > _DEPENDENT * size[:, :1]
     counts[:, max(constraints.shape[1] - n_dependent, 0) :] = False
@@ -331,50 +333,50 @@ def least_squares_equations(
     left = J - J @ np.swapaxes(along, 1, 2) @ along
     U, singular, _ = np.linalg.svd(left, full_matrices=False)
     U = np.swapaxes(U * (singular > _SINGULAR * singular[:, :1])[:, None], 1, 2)
-    residual = (U @ found.values[:, found.measured, None])[..., 0]
+    residual = (U @ equations.values[:, equations.measured, None])[..., 0]
     return (
-        np.concatenate([found.values[:, ~found.measured], residual], axis=1),
+        np.concatenate([equations.values[:, ~equations.measured], residual], axis=1),
         np.concatenate([constraints, U @ J], axis=1),
     )
 
 
 def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
-    """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
-    found = pose_equations(machine.legs, R, t, by_local=False)
-    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
+    """Return all equations of a machine, with its plane, at poses of its links (no by_local)."""
+    equations = pose_equations(machine.legs, R, t, by_local=False)
+    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def machine_equations_at(machine: Machine, R: Array, t: Array, readings: Array) -> PoseEquations:
-    """Return what they miss at readings of the motors (k, n_motors) [m or rad]."""
+    """Return these equations as residuals at readings of the motors (k, n_motors) [m or rad]."""
     motors = machine.sign * machine.at_readings(readings)
-    found = equations_at_readings(machine.legs, R, t, motors)
-    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
+    equations = equations_at_readings(machine.legs, R, t, motors)
+    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
-    """Return the same at one pose."""
+    """Return the equations of a machine at one pose."""
     matrix = T_base_platform.as_matrix()[None]
     return machine_equations(machine, matrix[:, :3, :3], matrix[:, :3, 3])
 
 
 def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
-    """Return the constraints at one pose."""
+    """Return the constraints of a machine at one pose."""
     equations = equations_at(machine, T_base_platform)
     return equations.of(~equations.measured)
 
 
 def is_constrained(machine: Machine) -> bool:
-    """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
+    """Return whether the machine forbids some poses at any lengths of its sliders."""
     return not machine.spatial or n_pose_constraints(machine.legs) > 0
 
 
 def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
-    """Return which of the six components of a platform's motion in R_b are possible at all."""
+    """Return the possible components of a platform motion in R_b, as indices of the six."""
     return (0, 1, 2, 3, 4, 5) if is_spatial(frame_legs) else (2, 3, 4)
 
 
-_SINGULAR = 1e-9  # of the largest singular value
-_DEPENDENT = 1e-7  # the same of constraints, some of which may say what others do
+_SINGULAR = 1e-9  # least singular value of equations, relative to the largest
+_DEPENDENT = 1e-7  # the same for constraints, some of which may be dependent
 
 
 def pose_sensitivity(
@@ -384,11 +386,11 @@ def pose_sensitivity(
     R: Array,
     t: Array,
 ) -> Array:
-    """Return how parameters move R_e in R_b at given readings, (k, 6, p): rotation, displacement.
+    """Return the motion (k, 6, p) of R_e in R_b by parameters at readings: rotation, displacement.
 
-    The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Of redundant
-    motors the squares of the lengths are least, with the constraints exact; where constraints alone
-    are more than freedoms (a 3-UPU that only translates) those of all equations.
+    The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. With redundant
+    motors the squares of the lengths are minimised, with exact constraints; if the constraints
+    alone outnumber the freedoms (a 3-UPU that only translates), the squares of all equations.
 
     Raises
     ------
@@ -424,7 +426,7 @@ def pose_sensitivity(
 
 
 def is_overdetermined(equations: PoseEquations, columns: Sequence[int]) -> bool:
-    """Say whether there are more readings than the constraints leave freedoms at the first pose."""
+    """Return whether readings outnumber the freedoms that constraints leave at the first pose."""
     n_constraints, n_read = int(np.sum(~equations.measured)), int(equations.measured.sum())
     if n_read + n_constraints <= len(columns):
         return False
@@ -442,11 +444,11 @@ _WORDS = {
     EquationKind.TWIST: "twisted at its end",
     EquationKind.PLANE: "out of its plane",
 }
-_TOLERANCE = 2.5e-9  # mean leg lengths
+_TOLERANCE = 2.5e-9  # residual of a constraint that counts as zero, in mean leg lengths
 
 
 def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
-    """Return the row with the largest residual at the first pose: who (verb) how far how."""
+    """Return the row with the largest residual at the first pose, in words with *verb*."""
     row = int(np.argmax(np.abs(equations.values[0])))
     leg, how = equations.leg[row], _WORDS[equations.kinds[row]]
     who = "the platform" if leg < 0 else f"leg '{machine.leg_names[leg]}'"
@@ -454,10 +456,10 @@ def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -
 
 
 def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> str | None:
-    """Return which constraint a pose does not meet, in words; None where it meets all.
+    """Return the constraint that a pose violates, in words; None if it meets all.
 
-    A residual counts as zero up to a nanometre, or up to that of the machine at home where
-    its axes are a little off (they may be, by up to a milliradian).
+    A residual counts as zero up to a nanometre, or up to the residual of the machine at home, since
+    its axes may be off by up to a milliradian.
     """
     if not is_constrained(machine):
         return None
@@ -494,9 +496,9 @@ def _lengths(
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
     if q is not None and hung:
-        carried, own = list(hung), [on[j] for j in hung]
+        carried, columns = list(hung), [on[j] for j in hung]
         by_reading = carried_at_A(tuple(legs)).by_reading(q)[:, carried]
-        by_q[:, carried, own] = -np.sum(by_reading * u[:, carried], axis=2)
+        by_q[:, carried, columns] = -np.sum(by_reading * u[:, carried], axis=2)
     for j, motion in moved.items():
         local[:, j, LegColumns.A] = -_back(motion, u[:, j])
         _write_actuator(motion, u[:, j], local[:, j])
@@ -512,7 +514,7 @@ def _lengths(
 
 
 def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
-    """Return the three equations that keep a platform in its plane, tilts at a mean leg's end."""
+    """Return the three equations of a planar platform, tilts as lengths at a mean leg's end."""
     normal = machine.T_base_Rb.as_matrix()[:3, 2]
     carried = R @ machine.T_platform_Re.as_matrix()[:3, 2]
     arms = machine.B_platform @ np.swapaxes(R, 1, 2)
@@ -532,7 +534,7 @@ def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
 
 
 def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
-    """Return the rows of several together."""
+    """Return the concatenated rows of several sets."""
     return PoseEquations(
         np.concatenate([part.values for part in parts], axis=1),
         np.concatenate([part.by_pose for part in parts], axis=1),
@@ -545,7 +547,7 @@ def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
 
 
 class VectorOps(NamedTuple):
-    """Products of vectors: of arrays (..., 3) in numpy, or of symbols, as CasADi has them."""
+    """Vector products: of arrays (..., 3) in numpy, or of CasADi symbols."""
 
     dot: Callable[[Any, Any], Any]
     cross: Callable[[Any, Any], Any]
@@ -555,12 +557,12 @@ class VectorOps(NamedTuple):
 
 
 def axis_in_leg(joint: JointType, axis: Any, u: Any, ops: VectorOps) -> Any:
-    """Return the axis of a joint that stays in the leg, from the one in base or platform."""
+    """Return the axis of a joint that is fixed in the leg, from its axis in base or platform."""
     return ops.unit(ops.cross(axis, u)) if joint.inner_is_across else axis
 
 
 def twist_residual(p: Any, w: Any, u: Any, twist: Any, ops: VectorOps) -> Any:
-    """Return sin(angle - twist), the angle about u from the axis p in the leg to the other, w."""
+    """Return sin(angle - twist), with the angle about u from axis p in the leg to axis w."""
     return ops.cos(twist) * ops.dot(u, ops.cross(p, w)) - ops.sin(twist) * ops.dot(p, w)
 
 
@@ -571,7 +573,7 @@ class _Placed(NamedTuple):
     R: Array  # (k, 3, 3)
     length: Array  # (k, n) [m]
     u: Array  # (k, n, 3)
-    moved: JointMotion | None = None  # of the joint at A, on an actuator: of one leg alone
+    moved: JointMotion | None = None  # motion of the joint at A of one leg on an actuator
 
     def axes(self, end: Literal["base", "platform"]) -> Array:
         """Return the axes of the joints at one end, (n, 3), at reading 0."""
@@ -588,7 +590,7 @@ class _Placed(NamedTuple):
         return np.asarray(vectors @ np.swapaxes(self.R, 1, 2))
 
     def by_leg(self, by_u: Array) -> Array:
-        """Return the gradient by the vector from A to B of what depends on its direction."""
+        """Return the gradient by the vector from A to B of a function of its direction."""
         across = by_u - self.u * _dot(self.u, by_u)[..., None]
         return np.asarray(across / self.length[..., None])
 
@@ -602,7 +604,7 @@ class _EquationRow(NamedTuple):
     value: Array  # (k, n)
     by_leg: Array  # (k, n, 3) by the vector from A to B
     by_base_axis: Array | None = None  # (k, n, 3)
-    tied: Array = _NOTHING  # (n, 3) a direction that is tied to the platform and to its axis
+    tied: Array = _NOTHING  # (n, 3) a direction fixed in the platform, with its axis
     by_tied: Array | None = None  # (k, n, 3), in the frame of the base
     by_q0: float = 0.0
     by_twist: Array | float = 0.0
@@ -633,7 +635,7 @@ def _component(at: _Placed, tied: Array) -> _EquationRow:
 def _twist(at: _Placed) -> _EquationRow:
     """Return sin(angle - twist) of the axes p and w in the leg, and its gradients."""
     leg, u, b = at.legs[0], at.u, at.axes("platform")
-    tau = np.array([float(one.twist or 0.0) for one in at.legs])
+    tau = np.array([float(its_leg.twist or 0.0) for its_leg in at.legs])
     tied = _basis(b)[:, 0] if leg.is_fixed_to_platform else b
     outer = at.base_axis, at.in_base(tied)
     joints = leg.base_joint, leg.platform_joint
@@ -666,32 +668,30 @@ _RESIDUALS: dict[EquationKind, Callable[[_Placed], _EquationRow]] = {
 
 
 def _given(vector: Array | None) -> Array:
-    """Return an axis that a leg with this equation has."""
+    """Return the axis, which a leg with this equation has."""
     if vector is None:
         raise ValueError("a leg whose joints need an axis was described without one")
     return vector
 
 
 def _basis(axes: Array) -> Array:
-    """Return the two directions (n, 2, 3) across axes (n, 3) of legs, needed at every pose."""
+    """Return the two directions (n, 2, 3) perpendicular to axes (n, 3) of legs, cached."""
     return _basis_of(np.ascontiguousarray(axes, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=1024)
 def _basis_of(axes: bytes) -> Array:
-    """Return the bases of axes by their numbers, not to be written to."""
+    """Return the bases of axes by their numbers, read-only."""
     basis = normal_basis(np.frombuffer(axes).reshape(-1, 3))
     basis.flags.writeable = False
     return basis
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def _unit(vectors: Array) -> Array:
-    """Return unit vectors (..., 3)."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1)[..., None])
 
 

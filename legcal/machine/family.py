@@ -1,8 +1,8 @@
-"""Machines from tables and from families; a family is a table made of a few dimensions.
+"""Machines from tables and from families; a family is a table built from a few dimensions.
 
 The hexapod has its joints in pairs on two circles. The Delta has three arms, level at reading 0,
-that sink with the reading, and two parallel rods on each. Numbers that these dimensions do not say
-are in the table that ``legcal new --template`` writes of them.
+that sink with the reading, and two parallel rods on each. For further numbers, edit the table that
+``legcal new --template`` writes.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,14 +20,14 @@ from legcal.machine.description_table import described_machine, read_description
 from legcal.machine.dimensions import Dimensions
 from legcal.option_fields import flag
 
-SPREAD = 30.0  # [deg] between the two joints of a pair of a hexapod
-SHORTEST, LONGEST = 0.8, 1.2  # lengths of legs, parts of the one at home
-TUBE, ROD = 0.03, 0.02  # radii, the same
-RADIUS_OF_ROD = 0.0125  # of a Delta, part of its length
-SPACING = 1.2  # of the two rods of an arm, in platform radii
-TRAVEL = (-30.0, 70.0)  # [deg] of arms
+SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
+SHORTEST, LONGEST = 0.8, 1.2  # range of leg lengths, relative to the length at home
+TUBE, ROD = 0.03, 0.02  # radii, relative to the length at home
+RADIUS_OF_ROD = 0.0125  # radius of rods of a Delta, relative to their length
+SPACING = 1.2  # distance of the two rods of an arm, in platform radii
+TRAVEL = (-30.0, 70.0)  # travel of arms [deg]
 _DIGITS = {"mm": 9, "m": 12}  # decimals of a length
-_BESIDE = {  # entries of a table for options that may stand beside it
+_BESIDE = {  # options that may be given beside a table, and their entries in it
     "type": "type",
     "min_length": "min_length",
     "max_length": "max_length",
@@ -37,12 +37,12 @@ _BESIDE = {  # entries of a table for options that may stand beside it
 
 
 def description_of(table: Path | None, given: Dimensions) -> Description:
-    """Return the machine that a table, with options beside it, or a family describes."""
+    """Return the machine of a table, with options beside it, or of a family."""
     stated = given.stated()
     if (table is None) == (given.family is None):
-        found = "neither" if table is None else "both"
+        sources = "neither" if table is None else "both"
         raise UsageError(
-            f"The model could not be written: found {found} of a table and --family, needed one; "
+            f"The model could not be written: found {sources} of a table and --family, needed one; "
             "give a YAML or CSV table, or --family hexapod or delta; legcal new --template writes "
             "a table to start from."
         )
@@ -63,7 +63,6 @@ def description_of(table: Path | None, given: Dimensions) -> Description:
 
 
 def _check_unit(given: Dimensions) -> None:
-    """Refuse what is no unit of lengths."""
     if given.unit not in (None, *UNITS):
         raise UsageError(
             f"The unit could not be used: found '{given.unit}', needed mm or m; correct --unit."
@@ -71,12 +70,13 @@ def _check_unit(given: Dimensions) -> None:
 
 
 def family_table(given: Dimensions) -> dict[str, Any]:
-    """Return the table of a family, as YAML has it, in the unit of the dimensions.
+    """Return the table of a family, as in YAML, in the unit of the dimensions.
 
     Raises
     ------
     UsageError
-        With one sentence for each dimension that is missing, impossible or of another family.
+        With one sentence for each dimension that is missing, impossible or belongs to another
+        family.
     """
     _check_unit(given)
     name = str(given.family).lower()
@@ -84,12 +84,12 @@ def family_table(given: Dimensions) -> dict[str, Any]:
         raise UsageError(_no_family(str(given.family)))
     family, stated, unit = FAMILIES[name], given.stated(), given.unit or "mm"
     where = f"The family {name} could not be built"
-    known = (*family.dimensions, *family.others)
+    keys = (*family.dimensions, *family.others)
     lengths = {key: value for key, value in stated.items() if isinstance(value, float | int)}
     problems = [
-        f"{where}: found {flag(key)}, needed some of {', '.join(map(flag, known))}; leave it out."
+        f"{where}: found {flag(key)}, needed some of {', '.join(map(flag, keys))}; leave it out."
         for key in stated
-        if key not in (*known, "family", "unit", "name")
+        if key not in (*keys, "family", "unit", "name")
     ]
     if lengths and given.unit is None:
         problems.append(
@@ -121,21 +121,22 @@ def family_table(given: Dimensions) -> dict[str, Any]:
     return {"legcal_table": 1, "name": given.name or name, "unit": unit, **table}
 
 
-def _no_family(found: str) -> str:
-    """Return the sentence for what is none of the families."""
+def _no_family(family: str) -> str:
+    """Return the message for an unknown family."""
     remedy = (
         "write the joints of any other machine in a table, for which legcal new --template -o DIR "
         "makes one to start from"
     )
-    if found.startswith("6-") and (of_legs := leg_type(found[2:])) and of_legs.actuator is None:
-        remedy = f"give --family hexapod --type {found[2:]}, or {remedy}"
+    if family.startswith("6-") and (of_legs := leg_type(family[2:])) and of_legs.actuator is None:
+        remedy = f"give --family hexapod --type {family[2:]}, or {remedy}"
     return (
-        f"The family could not be built: found --family {found}, needed hexapod or delta; {remedy}."
+        f"The family could not be built: found --family {family}, needed hexapod or delta; "
+        f"{remedy}."
     )
 
 
 def _hexapod(size: Mapping[str, float], unit: str) -> dict[str, Any]:
-    """Return a hexapod: platform pairs stand between base pairs."""
+    """Return the table of a hexapod, with platform pairs between base pairs."""
     digits, half = _DIGITS[unit], SPREAD * np.tile([0.5, -0.5], 3)
     A = size["base_radius"] * _ring(np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + half)
     B = size["platform_radius"] * _ring(np.repeat([60.0, 180.0, 300.0], 2) - half)
@@ -157,7 +158,7 @@ def _hexapod(size: Mapping[str, float], unit: str) -> dict[str, Any]:
 
 
 def _delta(size: Mapping[str, float], unit: str) -> dict[str, Any]:
-    """Return a Delta; without a height its arms stand at mid-travel at home."""
+    """Return the table of a Delta, at home at mid-travel if no height is given."""
     R, r, arm, rod = (
         size[key] for key in ("base_radius", "platform_radius", "arm_length", "rod_length")
     )
@@ -207,7 +208,7 @@ def _ring(degrees: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Family:
-    """Dimensions [mm] where none are given, others that may be, and the table that they make."""
+    """Default dimensions [mm], optional dimensions, and the table built from them."""
 
     dimensions: Mapping[str, float]
     others: tuple[str, ...]

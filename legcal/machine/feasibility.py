@@ -1,9 +1,8 @@
-"""Poses that a machine can take: inside its limits, without collisions, away from singularities.
+"""Feasible poses: inside limits, without collisions, away from singularities.
 
-Readings of the motors are drawn and followed from home on the closed chain. A pose counts if joints
-stay inside their limits, no leg runs through another, and no singularity is near, there and on the
-way (:class:`Feasibility`). Where motors do not determine the pose, a random walk takes the place of
-readings.
+Readings of the motors are drawn and followed from home on the closed chain. A pose is feasible if
+joints stay within their limits, no legs collide, and no singularity is near, at the pose and on the
+way (:class:`Feasibility`). If motors do not determine the pose, a random walk replaces the draws.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from legcal.machine.model import (
 from legcal.machine.redundancy import determining_readings
 from legcal.progress import Report, no_progress
 
-JITTER = 0.12  # of the travel, by which extreme readings stay away from its ends at most
+JITTER = 0.12  # largest distance of extreme readings from an end, relative to the travel
 
-_ANGLE_ROUNDING = 1e-9  # [rad]
+_ANGLE_ROUNDING = 1e-9  # tolerance of joint limits [rad]
 
-_MAX_DRAWS = 60  # for each pose
-_FULL_EXTREME, _FULL = 12, 2  # draws over all of the travel; the next are nearer to home
-_NEARER = 0.85  # each
-_BEFORE_LAST = 6  # draws before the one that reached the last pose; extremes begin at the first
-_WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home at which the pose must be feasible
-_SHORTEST = 0.25  # least step of a part of a way; what is harder to reach does not count
-_MAX_FAILED_POSES = 5  # one after the other
+_MAX_DRAWS = 60  # draws per pose
+_FULL_EXTREME, _FULL = 12, 2  # draws over the whole travel; the next ones are nearer to home
+_NEARER = 0.85  # distance from home of a further draw, relative to the one before
+_BEFORE_LAST = 6  # a pose starts so many draws before the last successful one (extremes at 0)
+_WAY = (0.25, 0.5, 0.75, 1.0)  # fractions of the way from home checked for feasibility
+_SHORTEST = 0.25  # least step within a fraction of the way; harder poses are dropped
+_MAX_FAILED_POSES = 5  # consecutive failures before giving up
 
 
 class Cause(StrEnum):
-    """What keeps a machine from a pose."""
+    """The kinds of obstacles between a machine and a pose."""
 
     LIMITS = "the limits of joints"
     LENGTHS = "legs that cannot have such lengths at the same time"
@@ -60,7 +59,7 @@ class Cause(StrEnum):
 
 
 Obstacle = tuple[Cause, str]
-"""A cause, and what it is in detail."""
+"""A cause and its details in words."""
 
 _REMEDIES = {
     Cause.LIMITS: "check legcal.home and the limits of the joints",
@@ -71,7 +70,7 @@ _REMEDIES = {
 
 
 def near_ends(end: IntArray, draws: Array) -> Array:
-    """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it."""
+    """Return positions in the travel near given ends of it; 0 is the shortest, 1 the longest."""
     return np.asarray(np.abs(end - JITTER * draws))
 
 
@@ -89,9 +88,9 @@ def feasible_poses(
     extreme: bool,  # every motor near an end of its travel
     progress: Report = no_progress,
 ) -> Configurations:
-    """Return random poses that a machine can take and is led to from home.
+    """Return random feasible poses, each followed from home.
 
-    Raises DidNotConverge if too few are found, and ModelError if home is beyond a limit.
+    Raises DidNotConverge if there are too few, and ModelError if home is beyond a limit.
     """
     obstacles: Counter[Obstacle] = Counter()
     draws = (
@@ -99,45 +98,45 @@ def feasible_poses(
         if machine.is_determined
         else _walked(machine, rng, obstacles)
     )
-    found: list[Array] = []
+    configurations: list[Array] = []
     failed = 0
     progress("Poses", 0, n_poses)
-    while len(found) < n_poses and failed < _MAX_FAILED_POSES:
+    while len(configurations) < n_poses and failed < _MAX_FAILED_POSES:
         configuration = next(draws)
         if configuration is None:
             failed += 1
         else:
             failed = 0
-            found.append(configuration)
-            progress("Poses", len(found), n_poses)
-    if len(found) < n_poses:
+            configurations.append(configuration)
+            progress("Poses", len(configurations), n_poses)
+    if len(configurations) < n_poses:
         causes: Counter[Cause] = Counter()
         for (cause, _), count in obstacles.items():
             causes[cause] += count
         (main, _), *_others = causes.most_common()
-        what = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
+        excluded = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
         raise DidNotConverge(
             Problem(
                 f"{n_poses} poses could not be drawn",
-                f"{len(found)} that the machine reaches in "
-                f"{obstacles.total() + len(found)} draws, others excluded {what}",
+                f"{len(configurations)} that the machine reaches in "
+                f"{obstacles.total() + len(configurations)} draws, others excluded {excluded}",
                 "all",
                 _REMEDIES[main],
                 str(machine.yaml_path),
             )
         )
-    return poses_at(machine, found)
+    return poses_at(machine, configurations)
 
 
 def _counted(cause: Cause, n: int, obstacles: Counter[Obstacle]) -> str:
-    """Return how often a cause excluded a draw, and what it most often was in detail."""
-    most = max((count, detail) for (one, detail), count in obstacles.items() if one is cause)
+    """Return the number of draws that a cause excluded, with its most frequent details."""
+    most = max((count, detail) for (reason, detail), count in obstacles.items() if reason is cause)
     detail = f" ({most[0]} times {most[1]})" if most[1] != cause else ""
     return f"{n} times by {cause}{detail}"
 
 
 class Feasibility:
-    """What keeps a closed configuration from being a pose: limits, singularities, collisions."""
+    """The feasibility of closed configurations: limits, singularities, collisions."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -158,7 +157,7 @@ class Feasibility:
         pairs = np.stack(np.triu_indices(len(cylinders), 1))
         self._pairs = pairs[:, self._leg[pairs[0]] != self._leg[pairs[1]]]
         self._clearance = radius[self._pairs].sum(axis=0)
-        apart = ~self._touching(machine.home)  # cylinders that touch at home are built so
+        apart = ~self._touching(machine.home)  # cylinders that touch at home do so by design
         self._pairs, self._clearance = self._pairs[:, apart], self._clearance[apart]
         problem = self._beyond_limits(machine.home_configuration)
         if problem is not None:
@@ -173,15 +172,15 @@ class Feasibility:
             )
 
     def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:
-        """Return what makes a closed configuration infeasible, in words, None if nothing does.
+        """Return the obstacle of an infeasible closed configuration in words, None if feasible.
 
-        The travel of motors is left out where their readings have been checked already.
+        The travel of motors is checked only if *of_motors*.
         """
-        found = self.obstacle(configuration, of_motors=of_motors)
-        return None if found is None else found[1]
+        obstacle = self.obstacle(configuration, of_motors=of_motors)
+        return None if obstacle is None else obstacle[1]
 
     def obstacle(self, configuration: Array, *, of_motors: bool = True) -> Obstacle | None:
-        """Return the same with its cause."""
+        """Return the obstacle of a closed configuration with its cause, None if feasible."""
         machine = self._machine
         outside = beyond_travel(machine, configuration)
         if not of_motors:
@@ -197,17 +196,17 @@ class Feasibility:
             return Cause.SINGULARITY, Cause.SINGULARITY.value
         collision = self.collision(T)
         if collision is not None:
-            one, two = collision
-            return Cause.COLLISION, f"legs '{one}' and '{two}' run through each other"
+            first, second = collision
+            return Cause.COLLISION, f"legs '{first}' and '{second}' collide"
         return None
 
     def led(
         self, here: Array, readings: Array, parts: Sequence[float], *, on_the_chain: bool = False
     ) -> Array | Obstacle:
-        """Return the configuration at readings (n_motors,) after a straight way, or its obstacle.
+        """Return the configuration at readings (n_motors,) after a straight path, or its obstacle.
 
-        The machine is looked at in *parts* of the way from configuration *here*, the last of
-        which is 1; *on_the_chain* is that of :func:`follow`.
+        Feasibility is checked at the fractions *parts* of the path from configuration *here* (the
+        last is 1); *on_the_chain* as in :func:`follow`.
         """
         first = here[slider_columns(self._machine, self._machine.motors)[0]]
         for part in parts:
@@ -222,28 +221,28 @@ class Feasibility:
         return here
 
     def collision(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
-        """Return the first two legs that run through each other at a pose, None if none do."""
+        """Return the names of the first two colliding legs at a pose, None if none collide."""
         touching = np.flatnonzero(self._touching(T_base_platform))
         if not len(touching):
             return None
-        one, two = self._leg[self._pairs[:, touching[0]]]
-        return self._machine.leg_names[one], self._machine.leg_names[two]
+        first, second = self._leg[self._pairs[:, touching[0]]]
+        return self._machine.leg_names[first], self._machine.leg_names[second]
 
     def _touching(self, T_base_platform: RigidTransform) -> BoolArray:
-        """Return which pairs of cylinders are nearer than the sum of their radii."""
+        """Return which pairs of cylinders are closer than the sum of their radii."""
         vectors = vectors_A_to_B(self._machine, T_base_platform)
         lengths = np.linalg.norm(vectors, axis=1)
         u = (vectors / lengths[:, None])[self._leg]
         along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
         B = B_at(self._machine, T_base_platform.as_matrix()[None])[0]
         start = (B - vectors)[self._leg] + along[:, :1] * u
-        one, two = self._pairs
+        first, second = self._pairs
         span = np.diff(along, axis=1) * u
-        distance = segment_distance(start[one], span[one], start[two], span[two])
+        distance = segment_distance(start[first], span[first], start[second], span[second])
         return np.asarray(distance < self._clearance)
 
     def _beyond_limits(self, configuration: Array) -> str | None:
-        """Return which revolute joint is outside its limits, whole turns not counted."""
+        """Return the revolute joint outside its limits (modulo full turns) in words, or None."""
         lower, upper = self._limits.T
         angles = configuration[self._columns]
         above = np.mod(angles - lower + _ANGLE_ROUNDING, 2.0 * np.pi) - _ANGLE_ROUNDING
@@ -258,15 +257,15 @@ class Feasibility:
 def _followed(
     machine: Machine, rng: np.random.Generator, obstacles: Counter[Obstacle], *, extreme: bool
 ) -> Iterator[Array | None]:
-    """Yield configurations that are followed from home to drawn readings; None after many failures.
+    """Yield configurations followed from home to drawn readings; None after many failures.
 
-    Draws that fail come nearer to home; the next pose begins a few draws before the one that
-    succeeded.
+    Each failed draw brings the next one nearer to home; the next pose begins a few draws before the
+    last successful one.
     """
     feasibility = Feasibility(machine)
     home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
     lower, upper = motor_travel(machine)
-    last = 0  # the draw that reached the last pose
+    last = 0  # the draw of the last successful pose
 
     def drawn(shrink: float) -> Array:
         part = rng.random(len(home))
@@ -281,12 +280,12 @@ def _followed(
             full = _FULL_EXTREME if extreme else _FULL
             readings = drawn(_NEARER ** max(0, draw + 1 - full))
             start = machine.home_configuration
-            found = feasibility.led(start, readings, _WAY, on_the_chain=True)
-            if not isinstance(found, tuple):
+            result = feasibility.led(start, readings, _WAY, on_the_chain=True)
+            if not isinstance(result, tuple):
                 last = draw
-                yield found
+                yield result
                 break
-            obstacles[found] += 1
+            obstacles[result] += 1
         else:
             yield None
 
@@ -301,7 +300,7 @@ def _walked(
             there = random_walk(machine, here, rng)
             obstacle = feasibility.obstacle(there)
             if obstacle is None or beyond_travel(machine, there).any():
-                here = there  # walks never lead further out of the travel
+                here = there  # walks never lead further outside the travel
             if obstacle is None:
                 yield there
                 break
@@ -311,7 +310,7 @@ def _walked(
 
 
 def poses_at(machine: Machine, configurations: list[Array]) -> Configurations:
-    """Return closed configurations as poses."""
+    """Return closed configurations with their readings and poses."""
     return Configurations(
         np.array(configurations),
         np.array([joint_values(machine, c) for c in configurations]),

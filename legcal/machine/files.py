@@ -1,4 +1,4 @@
-"""Finding and reading the files of a mechanism: a path, a folder, or a shipped name."""
+"""Finding and reading the files of a mechanism, from a path, a folder or a shipped name."""
 
 import os
 from pathlib import Path
@@ -9,13 +9,13 @@ from legcal.files.schema import content_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-FOLDER_YAML = "robot.yaml"  # as Gepetto names it
+FOLDER_YAML = "robot.yaml"  # mechanism YAML in a folder, as named by Gepetto
 DATASET_YAML = "dataset.yaml"
-RESULT_YAML = "calibrated.yaml"  # of the model in a result folder
+RESULT_YAML = "calibrated.yaml"  # mechanism YAML in a result folder
 
 
 def shipped_folder(name: str) -> Path:
-    """Return a folder that comes with legcal, in a wheel or in a checkout."""
+    """Return a folder shipped with legcal, in a wheel or in a checkout."""
     folders = [top / name for top in (_PACKAGE / "shipped", _PACKAGE.parent)]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
 
@@ -26,9 +26,9 @@ def shipped_names() -> list[str]:
 
 
 def find_model(model: str | Path) -> Path:
-    """Return the file that describes a mechanism, of a path or of the name of a shipped model.
+    """Return the file of a mechanism, from a path or the name of a shipped model.
 
-    A result folder stands for its calibrated model.
+    A result folder gives its calibrated model.
     """
     path = Path(model)
     names = shipped_names()
@@ -85,7 +85,7 @@ def find_model(model: str | Path) -> Path:
 
 
 def what_a_dataset_is_for(path: Path) -> Problem:
-    """Return that a dataset is no model, and the commands that take one."""
+    """Return the problem of a dataset given as a model, with the commands for datasets."""
     folder = path.parent if path.name == DATASET_YAML else path
     return Problem(
         "the mechanism could not be read: found a dataset, needed a model; give the model that it "
@@ -96,7 +96,7 @@ def what_a_dataset_is_for(path: Path) -> Problem:
 
 
 def find_urdf(yaml_path: Path, written: str | None) -> Path:
-    """Return the URDF of a mechanism YAML: as written in it, or the same stem near it."""
+    """Return the URDF of a mechanism YAML: the stated one, or the same stem nearby."""
     if written is not None:
         path = yaml_path.parent / written
         return path.resolve() if ".." in path.parts else path
@@ -114,20 +114,20 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
     )
 
 
-def read_file(path: Path, what: str) -> bytes:
+def read_file(path: Path, kind: str) -> bytes:
     """Return the bytes of a mechanism file."""
     try:
-        return content_of(path, what)
+        return content_of(path, kind)
     except DatasetError as error:
         raise ModelError(error.facts) from error
 
 
 def yaml_of_urdf(path: Path) -> Path | None:
-    """Return the YAML that closes the loops of a URDF, or None."""
+    """Return the mechanism YAML near a URDF, or None."""
     near = [path.with_suffix(".yaml"), _sibling(path, "models").with_suffix(".yaml")]
     return next((candidate for candidate in near if candidate.is_file()), None)
 
 
 def _sibling(path: Path, folder: str) -> Path:
-    """Return the path of the same file name in a folder beside its own."""
+    """Return the path of a file of the same name in a sibling folder."""
     return path.resolve().parent.parent / folder / path.name

@@ -1,8 +1,8 @@
-"""Reading a mechanism of any format: which one it is, and the reader of that format.
+"""Reading a mechanism of any format: detecting the format and calling its reader.
 
-A YAML with its URDF (ours, or Gepetto's, whose joints may stand for others), a URDF that closes its
-loops itself, or MJCF (:mod:`legcal.machine.mjcf`): all become a :class:`Source`, a tree with pairs
-of frames that coincide. Without a block ``legcal`` the tree is closed near where it is drawn.
+A YAML with its URDF (ours, or Gepetto's, with stand-in joints), a URDF with its own loops, or MJCF
+(:mod:`legcal.machine.mjcf`): all are converted to a :class:`Source`, a tree with pairs of
+coincident frames. Without a block ``legcal`` the tree is closed near its drawn configuration.
 """
 
 import math
@@ -58,11 +58,11 @@ _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
-CLOSED = 1e-10  # [m] and [rad]
-_OPEN = 0.01  # of the size of the machine: loops that are open so far draw no home
-_RIGID = 1e-3  # determinants of rotations but for rounding
-_SPREAD = 0.1  # [rad], and of the size of the machine: of the start of a trial, times its number
-_MAX_STEP = 0.3  # [rad], and of the size of the machine
+CLOSED = 1e-10  # largest residual of a closed loop [m, rad]
+_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
+_RIGID = 1e-3  # tolerance of determinants of rotations
+_SPREAD = 0.1  # start offset of a trial per trial number [rad], and relative to the machine
+_MAX_STEP = 0.3  # largest step [rad], and relative to the machine
 
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
@@ -73,21 +73,21 @@ KINDS: dict[str, LoopKind] = {
 
 
 def read_source(model: str | Path) -> Source:
-    """Return the tree and the closures of a mechanism, checked in themselves."""
+    """Return the tree and the closures of a mechanism; each file is checked in itself."""
     path = find_model(model)
     is_xml = path.suffix.lower() in XML_SUFFIXES
     source = _read_xml(path) if is_xml else read_yaml_source(path)
     if source.file.legcal is not None:
         return source
-    known = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in known for pair in source.file.closed_loop for name in pair):
-        return source  # refused later, with the place of the name
+    names = {*source.urdf.links, *source.urdf.joints}
+    if not all(name in names for pair in source.file.closed_loop for name in pair):
+        return source  # refused later, with the location of the name
     check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
     return completed(source)
 
 
 def _read_xml(path: Path) -> Source:
-    """Return the mechanism of an XML file, by the format of its outermost element."""
+    """Return the mechanism of an XML file, by its root element."""
     beside = yaml_of_urdf(path)
     if beside is not None and path.suffix.lower() != ".mjcf":
         return read_yaml_source(beside)
@@ -99,7 +99,7 @@ def _read_xml(path: Path) -> Source:
         raise ModelError(
             Problem(
                 f"the mechanism could not be read: found <{root.tag}> "
-                "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give "
+                "as the root element, needed <robot> (URDF) or <mujoco> (MJCF); give "
                 "one of them.",
                 file=str(path),
                 line=cast("int", root.sourceline),
@@ -120,7 +120,7 @@ def _read_xml(path: Path) -> Source:
 
 
 def read_yaml_source(path: Path) -> Source:
-    """Return a mechanism from its YAML and the URDF that it names.
+    """Return a mechanism from its YAML and the URDF named there.
 
     A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
     """
@@ -136,7 +136,7 @@ def read_yaml_source(path: Path) -> Source:
 
 
 def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
-    """Return a mechanism whose URDF has joints that stand for others."""
+    """Return a mechanism after replacing the stand-in joints of its URDF."""
     robot = parse_robot(urdf.path, urdf.content)
     frames = replace_stand_ins(robot, file, urdf)
     content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
@@ -165,7 +165,7 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that each joint that stands for another is there once and means something known."""
+    """Check that each stand-in joint occurs once and has a known type."""
     problems = []
     for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
         if name not in urdf.joints:
@@ -213,15 +213,15 @@ def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
 
 
 def rotation_letters(kind: str) -> str | None:
-    """Return the letters of the axes that a joint type turns about, in order; None if unknown."""
+    """Return the rotation axes of a joint type as letters, in order; None if unknown."""
     if kind in ("SPHERICAL", "FIXED"):
         return "XYZ" if kind == "SPHERICAL" else ""
-    found = _UNIVERSAL.fullmatch(kind)
-    return found[1] + found[2] if found and found[1] != found[2] else None
+    match = _UNIVERSAL.fullmatch(kind)
+    return match[1] + match[2] if match and match[1] != match[2] else None
 
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
-    """Replace the joints of a URDF that stand for others, and return what frames they carried."""
+    """Replace the stand-in joints of a URDF; return the frames that they carried."""
     text = UrdfBuilder(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
     elements = {e.get("name"): e for e in robot if e.tag == "joint"}
     replaced = {}
@@ -261,8 +261,8 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
 def read_loop_source(path: Path, content: bytes) -> Source:
     """Return the mechanism of a URDF with loops.
 
-    Motors are the prismatic joints that a ``<transmission>`` or ``<ros2_control>`` names, or all
-    prismatic joints where none is named.
+    Motors are the prismatic joints named in ``<transmission>`` or ``<ros2_control>``, or all
+    prismatic joints if none is named.
     """
     robot = parse_robot(path, content)
     problems = Problems(path)
@@ -301,8 +301,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
-    """Return the loops of a URDF, the problems of others noted."""
-    found = []
+    """Return the valid loops of a URDF, and note the problems of the others."""
+    loops = []
     seen: set[str] = set()
     for i, element in enumerate(elements, start=1):
         n_before = len(problems)
@@ -324,14 +324,14 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -
         if len(problems) > n_before or ends is None:
             continue
         (link_1, T_1), (link_2, T_2) = ends
-        found.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
-    return found
+        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
+    return loops
 
 
 def _ends(
     element: etree._Element, urdf: Urdf, problems: Problems
 ) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
-    """Return the links of a loop and its frame in each, or None with its problems noted."""
+    """Return the links of a loop and its frame in each, or None after noting problems."""
     sides = [part for part in element if part.tag in ("link1", "link2")]
     origins: list[etree._Element | None] = [
         part if part.find("origin") is None else part.find("origin") for part in sides
@@ -365,7 +365,7 @@ def _ends(
 def _pose(
     element: etree._Element, origin: etree._Element | None, problems: Problems
 ) -> RigidTransform:
-    """Return the motion that ``xyz`` and ``rpy`` describe, zero where they are not written."""
+    """Return the motion of ``xyz`` and ``rpy``, zero by default."""
     xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
     return RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
 
@@ -373,7 +373,7 @@ def _pose(
 def _three(
     element: etree._Element, part: etree._Element | None, key: str, problems: Problems
 ) -> Array:
-    """Return three numbers of a part of a loop; zero where they are missing."""
+    """Return three numbers of an element of a loop; zero by default."""
     text = None if part is None else part.get(key)
     numbers = [0.0] * 3 if text is None else number_list(text, 3)
     if numbers is None:
@@ -414,14 +414,14 @@ def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[
 
 
 def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list[str], list[str]]:
-    """Return the joints that have an encoder, and what the reader should know of that."""
+    """Return the joints with an encoder, and notes about them."""
     named = [e for e in robot.iterfind("transmission/joint") if e.get("name") is not None]
     named += [e for e in robot.iterfind("ros2_control/joint") if e.get("name") is not None]
     for element in named:
         if element.get("name") not in urdf.joints:
             problems.add(
                 element,
-                "is a motor of no joint of the file",
+                "names no joint of the file",
                 closest(str(element.get("name")), urdf.joints).rstrip("."),
             )
     motors = list(dict.fromkeys(str(e.get("name")) for e in named))
@@ -435,10 +435,10 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
 
 
 def completed(source: Source) -> Source:
-    """Return a mechanism without a block with the poses where it is closed, and all travels."""
+    """Return a mechanism without a block, completed with the closed poses and all travels."""
     closures = [
-        Closure("3d" if kind == "3d" else "6d", one, two)
-        for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+        Closure("3d" if kind == "3d" else "6d", first, second)
+        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
     ]
     try:
         chain = ClosedChain(source.urdf.text, closures)
@@ -450,18 +450,18 @@ def completed(source: Source) -> Source:
     drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
     unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
     unit[chain.rotation_columns()] = 1.0
-    found = closed_near(chain, start, source.urdf.links, unit)
-    configuration = start if found is None else found
+    closed = closed_near(chain, start, source.urdf.links, unit)
+    configuration = start if closed is None else closed
     urdf = source.urdf
     sliders = sliders_without_travel(urdf)
-    off = _off(chain, start)
-    if sliders and found is not None and off > CLOSED:
-        configuration = found = _levelled(chain, found, source, closures, unit)
+    off = _loop_error(chain, start)
+    if sliders and closed is not None and off > CLOSED:
+        configuration = closed = _levelled(chain, closed, source, closures, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
         source = _with_travel(source, readings, poses)
-    if found is None:
+    if closed is None:
         return source
     size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
     drawn = {
@@ -480,10 +480,10 @@ def _levelled(
     closures: Sequence[Closure],
     unit: Array,
 ) -> Array:
-    """Return a closed configuration with the platform level, the given one where it cannot be.
+    """Return a closed configuration with a level platform, or the given one if there is none.
 
-    A file that neither draws a closed mechanism nor says how far its sliders go leaves the pose
-    open. Of the level ones it is the one with the sliders nearest to where they are drawn.
+    A file without a closed drawing and without slider limits leaves the pose undetermined. Among
+    the level poses the one with sliders nearest to their drawn positions is taken.
     """
     urdf = source.urdf
     try:
@@ -508,56 +508,56 @@ def _levelled(
         rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
         return rows[0][None], rows[1][None]
 
-    found = _solved(chain, equations, configuration, unit)
-    if found is None:
+    closed = _solved(chain, equations, configuration, unit)
+    if closed is None:
         return configuration
     sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
     values = [chain.q_index(name) for name in sliders]
     rates = [chain.v_index(name) for name in sliders]
     for _ in range(STEPS):
-        free = null_space(equations(found[None])[1][0], rcond=1e-9)
-        step = -free @ np.linalg.lstsq(free[rates], found[values], rcond=1e-6)[0]
-        nearer = _solved(chain, equations, chain.integrate(found, _shortened(step, unit)), unit)
-        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(found[values]):
+        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
+        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
             break
-        found = nearer
-    return found
+        closed = nearer
+    return closed
 
 
 def closed_near(
     chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
 ) -> Array | None:
-    """Return a closed configuration near a given one, or None where none was found.
+    """Return a closed configuration near a given one, or None.
 
-    Among those that several starts lead to, the one with the smallest rotations of links. *unit*
+    Of the results of several starts, the one with the smallest rotations of links is taken. *unit*
     (nv,) is the size of the machine [m], 1 for angles.
     """
-    if _off(chain, start) <= CLOSED:
+    if _loop_error(chain, start) <= CLOSED:
         return start
     rng = np.random.default_rng(1965)
     best: tuple[float, Array] | None = None
     drawn = chain.turns(start, links[0], links)
     for trial in range(TRIALS):
         away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
-        found = _close(chain, away, unit)
-        if found is None:
+        closed = _close(chain, away, unit)
+        if closed is None:
             continue
-        turned = _turned(drawn, chain.turns(found, links[0], links))
+        turned = _turned(drawn, chain.turns(closed, links[0], links))
         if best is None or turned < best[0] - 1e-6:
-            best = turned, found
+            best = turned, closed
     return None if best is None else best[1]
 
 
 def _turned(before: Array, after: Array) -> float:
-    """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
+    """Return the total difference of rotations (n, 3, 3) [rad]."""
     apart = np.swapaxes(before, 1, 2) @ after
-    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # rounded away, or not finite
+    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # degenerate or not finite
         return math.inf
     return float(Rotation.from_matrix(apart).magnitude().sum())
 
 
 def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
-    """Close the loops near a configuration, or return None."""
+    """Return a closed configuration near a given one, or None."""
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
@@ -567,7 +567,7 @@ def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | Non
 
 
 def _shortened(step: Array, unit: Array) -> Array:
-    """Return a step (nv,), no longer than ``_MAX_STEP``."""
+    """Return a step (nv,), shortened to ``_MAX_STEP``."""
     longest = float(np.abs(step / unit).max(initial=0.0))
     return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
 
@@ -575,8 +575,8 @@ def _shortened(step: Array, unit: Array) -> Array:
 def _solved(
     chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
 ) -> Array | None:
-    """Return the configuration near a given one where equations hold, or None."""
-    found = solve(
+    """Return the solution of equations near a configuration, or None."""
+    solution = solve(
         equations,
         lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
         configuration[None],
@@ -585,11 +585,11 @@ def _solved(
         damped=True,
         steps=STEPS,
     )
-    return found.points[0] if found.worst[0] <= CLOSED else None
+    return solution.points[0] if solution.worst[0] <= CLOSED else None
 
 
-def _off(chain: ClosedChain, configuration: Array) -> float:
-    """Return how far the loops are from closed."""
+def _loop_error(chain: ClosedChain, configuration: Array) -> float:
+    """Return the largest residual of the loops."""
     residual = chain.residual(configuration)
     return float(np.abs(residual).max()) if len(residual) else 0.0
 
@@ -597,7 +597,7 @@ def _off(chain: ClosedChain, configuration: Array) -> float:
 def _with_travel(
     source: Source, readings: Mapping[str, float], poses: Mapping[str, RigidTransform]
 ) -> Source:
-    """Write a travel about some readings into the URDF, and note it."""
+    """Write an assumed travel about some readings into the URDF, and note it."""
     travel = assumed_travel(poses)
     robot = parse_robot(source.urdf.path, source.urdf.content)
     set_travel(robot, readings, travel)

@@ -1,8 +1,8 @@
-"""Home: a closed pose in the wanted assembly mode, given by a file or searched for.
+"""Home: a closed pose in the required assembly mode, stated by a file or searched for.
 
-A home may lie outside a travel by a little: drawings are, and limits are often set before the
-machine is. Up to :data:`MAX_OUTSIDE` of the travel that is a note. Further out the pose is no pose
-of this machine, and everything computed there would be judged where no motor goes.
+A home may be slightly outside a travel: drawings often are, and limits are often set before the
+machine is built. Up to :data:`MAX_OUTSIDE` of the travel that is a note. Further out the pose is
+not reachable, and results there would be irrelevant.
 """
 
 from collections.abc import Sequence
@@ -33,19 +33,21 @@ from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 
 TRIALS = 200
-MIN_TRIALS = 20  # trials, where one of them found a pose above the base
-MIN_APART = 0.05  # of the reach, by which a platform is above or below the base
+MIN_TRIALS = 20  # least number of trials, even if one finds a pose above the base
+MIN_APART = 0.05  # least height above or below the base, relative to the reach
 BATCH = 21  # trials solved at once
-MAX_STALLED = 5  # steps that change little
-_FAR, _DEPENDENT = 0.1, 1e-7  # of a leg length, and of the largest singular value
-_CLOSED = 1e-9  # of a leg length
-_REGULAR = 1e-4  # singularity measure, beyond which motors hold the platform
-MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
-_MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
+MAX_STALLED = 5  # consecutive steps with little improvement before a trial is given up
+_FAR = 0.1  # residual of constraints, in leg lengths, beyond which a pose is not near them
+_DEPENDENT = 1e-7  # singular value of dependent constraints, relative to the largest
+_CLOSED = 1e-9  # residual of a closed pose, in leg lengths
+_REGULAR = 1e-4  # singularity measure above which motors hold the platform
+# A home is refused if it is outside the travel by more than both.
+MAX_OUTSIDE = 1.0  # relative to the travel
+_MAX_OUTSIDE_OF_LEG = 0.01  # relative to the leg length at home, for sliders with little travel
 
 
 def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
-    """Return the home pose and the closed configuration there, from a given pose or from none.
+    """Return the home pose, stated or searched for, and the closed configuration there.
 
     Raises
     ------
@@ -61,10 +63,10 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
 
 
 def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
-    """Return the pose nearest to home that meets every constraint of legs and plane.
+    """Return the pose nearest to home that meets all constraints of legs and plane.
 
-    Files give home with few digits; sliders absorb that, but rods, revolute axes and universal
-    joints in a row cannot.
+    Files state home with few digits; sliders absorb the rounding, but rods, revolute axes and
+    universal joints do not.
 
     Raises
     ------
@@ -88,18 +90,18 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
 def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel, or at readings (n_legs,).
 
-    More motors than freedoms are as near to it, in least squares, as they can be together.
-    Among the poses that seeded starts lead to, the one with the smallest rotation of the platform
-    is taken, counted from where its joints lie over those of the base, and among mirror images in
-    the plane of the base joints the one on the positive side of
-    the base's z. Lengths of legs without a motor follow, inside their travel if possible.
+    Redundant motors are as near to it as possible, in least squares. Among the poses reached from
+    seeded starts, the one with the smallest rotation of the platform is taken, measured from the
+    rotation with its joints over those of the base, and of mirror images in the plane of the base
+    joints the one on the positive side of the base z. Lengths of legs without a motor follow,
+    within their travel if possible.
 
     Raises
     ------
     DidNotConverge
-        If none is found.
+        If there is no such pose.
     ModelError
-        If rods on motors reach the platform on both sides of the base: nothing says on which it is.
+        If rods on motors reach the platform on both sides of the base, so that home is ambiguous.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     if readings is not None:
@@ -118,8 +120,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             for trial in trials
         ]
         starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
-        found = at_readings(starts)
-        for T in found:
+        reached = at_readings(starts)
+        for T in reached:
             if T is None:
                 continue
             rank = _unlikely(machine, T) + float((level.inv() * T.rotation).magnitude())
@@ -159,23 +161,22 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
 
 
 def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
-    """Return how far joints of the platform are above a point of the base, in the mean [m]."""
+    """Return the mean height of platform joints above a point of the base [m]."""
     return float(np.mean(B_at(machine, T.as_matrix()[None])[0, :, 2]) - centre[2])
 
 
 def _in_yaml(T: RigidTransform) -> str:
-    """Return a pose as models have it."""
+    """Return a pose in the notation of models."""
     xyz, quat = T.translation, T.rotation.as_quat()
     numbers = [", ".join(f"{x + 0.0:.4g}" for x in part.round(6)) for part in (xyz, quat)]
     return f"{{xyz: [{numbers[0]}], quat_xyzw: [{numbers[1]}]}}"
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
-    """Return the closed pose nearest to home once the legs have other numbers, None if none is.
+    """Return the closed pose nearest to home for legs with other numbers, None if there is none.
 
-    *legs* are those of the machine in R_b and R_e as they are to be; both frames stay where they
-    are. Their residuals at home may be *max_error* leg lengths; it stays where they have no
-    constraints.
+    *legs* are in R_b and R_e, which stay in place. Their residuals at home may be *max_error* leg
+    lengths. Without constraints home is unchanged.
     """
     changed = tuple(
         replace(
@@ -197,9 +198,9 @@ def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> Rig
 def _at_readings(
     machine: Machine, starts: Sequence[tuple[Array, Array]], readings: Array, reach: float
 ) -> list[RigidTransform | None]:
-    """Return the poses, found from places and turns, at readings (n_motors,) of the motors.
+    """Return the poses at readings (n_motors,) of the motors from starts, None if not found.
 
-    Where sliders contradict each other there it is that of least squares, if all stay in travel.
+    If redundant sliders contradict each other it is the least-squares pose, if all are in travel.
     """
     t, turns = (np.array(part) for part in zip(*starts, strict=True))
     poses = np.concatenate([Rotation.from_rotvec(turns).as_matrix(), t[..., None]], axis=2)
@@ -209,8 +210,8 @@ def _at_readings(
         return machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
 
     def exact(poses: Array) -> tuple[Array, Array]:
-        found = missed(poses)
-        return found.values, found.by_pose
+        rows = missed(poses)
+        return rows.values, rows.by_pose
 
     def solved(equations: Equations, poses: Array) -> Solved:
         return solve(
@@ -223,27 +224,27 @@ def _at_readings(
             max_stalled=MAX_STALLED,
         )
 
-    found = solved(exact, poses)
-    holds = found.worst < _CLOSED * reach
-    if found.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
-        poses, n_dependent = _on_constraints(machine, found.points)
-        found = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
-        singular = np.linalg.svd(found.jacobian * unit, compute_uv=False)[:, -1]
-        holds = (found.worst < _CLOSED * reach) & (singular > _REGULAR)
-        holds &= [_in_travel(machine, pose) for pose in found.points]
+    solution = solved(exact, poses)
+    holds = solution.worst < _CLOSED * reach
+    if solution.jacobian.shape[1] > 6 and not holds.any() and not machine.actuators:
+        poses, n_dependent = _on_constraints(machine, solution.points)
+        solution = solved(lambda x: least_squares_equations(missed(x), n_dependent), poses)
+        singular = np.linalg.svd(solution.jacobian * unit, compute_uv=False)[:, -1]
+        holds = (solution.worst < _CLOSED * reach) & (singular > _REGULAR)
+        holds &= [_in_travel(machine, pose) for pose in solution.points]
     return [
         motion_of(pose[:, :3], pose[:, 3]) if held else None
-        for pose, held in zip(found.points, holds, strict=True)
+        for pose, held in zip(solution.points, holds, strict=True)
     ]
 
 
 def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
-    """Return poses (k, 3, 4) where the constraints hold, if these are near, and how many depend."""
+    """Return poses (k, 3, 4) on the constraints if near, and the number of dependent ones."""
     near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
     held = np.array([problem is None for _, problem in near])
     poses = np.array([T.as_matrix()[:3] for T, _ in near])
-    found = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
-    constraints = found.by_pose[:, ~found.measured]
+    equations = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    constraints = equations.by_pose[:, ~equations.measured]
     n = constraints.shape[1]
     if n == 0 or not held.any():
         return poses, 0
@@ -251,13 +252,13 @@ def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
 
 
 def _in_travel(machine: Machine, pose: Array) -> bool:
-    """Say whether all motors are inside their travel at a pose (3, 4)."""
+    """Return whether all motors are within their travel at a pose (3, 4)."""
     q = readings_at(machine, motion_of(pose[:, :3], pose[:, 3]))
     return all(machine.legs[j].in_travel(q[j : j + 1])[0] for j in machine.motors)
 
 
 def _unlikely(machine: Machine, T: RigidTransform) -> float:
-    """Return a penalty: below the base, a fixed leg backwards, a passive one outside its travel."""
+    """Return a penalty: below the base, a reversed fixed leg, a passive leg outside its travel."""
     centre = machine.A_base.mean(axis=0)
     B = B_at(machine, T.as_matrix()[None])[0]
     size = float(np.abs(B - machine.A_base).max())
@@ -274,19 +275,19 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
 
 
 def check_home_travel(machine: Machine) -> None:
-    """Check that the home that a file gives is not far outside the travel of its motors.
+    """Check that a stated home is not far outside the travel of its motors.
 
     Raises
     ------
     ModelError
         If an actuated leg is outside its travel by more than the travel itself and by more than
-        1 % of its length, or a motor that rods hang on by more than its travel.
+        1 % of its length, or a motor that carries rods by more than its travel.
     """
     far: dict[int, float] = {}
     q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
     for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
-        if leg.actuator is not None:  # rods may share one
+        if leg.actuator is not None:  # rods may share an actuator
             is_far = actuators[j] not in {actuators[k] for k in far}
         else:
             allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
@@ -299,8 +300,8 @@ def check_home_travel(machine: Machine) -> None:
     leg = machine.legs[worst]
     others = ""
     if len(far) > 1:
-        what = "leg" if leg.actuator is None else "motor"
-        more = f"{what} is" if len(far) == 2 else f"{what}s are"
+        thing = "leg" if leg.actuator is None else "motor"
+        more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
@@ -316,7 +317,7 @@ def check_home_travel(machine: Machine) -> None:
 
 
 def home_reading_in_words(leg: Leg, q: float) -> tuple[str, str, str]:
-    """Return the leg or the motor that it hangs on, a reading of it, and its travel."""
+    """Return a leg or the motor that carries it, a reading of it, and its travel, in words."""
     size, unit = SHOWN_IN[leg.reading_unit]
     name = f"leg '{leg.name}'" if leg.actuator is None else f"motor '{leg.actuator.joint}'"
     low, high = (size * x for x in leg.travel)
@@ -324,16 +325,16 @@ def home_reading_in_words(leg: Leg, q: float) -> tuple[str, str, str]:
 
 
 def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
-    """Return the legs outside their travel at home by more than a share of it, and how far.
+    """Return the excess of legs outside their travel at home by more than a share of it.
 
-    In m, of rods on motors that turn in rad.
+    The excess is in m, or in rad for rods on motors that turn.
     """
-    found = {}
+    excess_of = {}
     q = readings_at(machine, machine.home)
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
         moves = leg.kind is not LegKind.CONSTANT or leg.actuator is not None
         if moves and excess > share * (upper - lower):
-            found[j] = excess
-    return found
+            excess_of[j] = excess
+    return excess_of

@@ -1,4 +1,4 @@
-"""What `legcal inspect` says of a machine: its document."""
+"""The document of `legcal inspect`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from legcal.machine.schema import motor_entries
 
 
 class ArmBlock(Document):
-    """The line of an arm that is a cylinder, where its motor reads 0 [m]."""
+    """The line of a cylindrical arm, with its motor at reading 0 [m]."""
 
-    link: str  # that carries its visual
-    point: Triple  # its middle
-    axis: Triple  # from the motor outwards
+    link: str  # link of its visual
+    point: Triple  # middle
+    axis: Triple  # direction, from the motor outwards
 
 
 class ActuatorBlock(SparseDocument):
@@ -29,7 +29,7 @@ class ActuatorBlock(SparseDocument):
     direction: Triple | None = None  # of a prismatic
     point: Triple | None = None  # of the axis of a revolute
     axis: Triple | None = None
-    arm: ArmBlock | None = None  # of a revolute, where it is seen as a cylinder
+    arm: ArmBlock | None = None  # visible cylindrical arm of a revolute
 
     @model_validator(mode="after")
     def _has_its_motion(self) -> ActuatorBlock:
@@ -41,16 +41,16 @@ class ActuatorBlock(SparseDocument):
 
 
 class InspectedArm(ArmBlock):
-    """An arm that is a cylinder, as the model draws it."""
+    """A cylindrical arm, as drawn by the model."""
 
     radius: Number  # [m]
 
 
 class InspectedActuator(ActuatorBlock):
-    """A motor as the model has it."""
+    """A motor of the model."""
 
     arm: InspectedArm | None = None
-    gain: Number | None = None  # true motion over reading; left out where it is 1
+    gain: Number | None = None  # true motion over reading; omitted if 1
     centre_us: Number | None = None  # of a hobby servo: the pulse at joint value 0 [us]
     us_per_deg: Number | None = None
 
@@ -63,7 +63,7 @@ class CylinderBlock(Document):
 
 
 class InspectedLeg(SparseDocument):
-    """A leg as it was found."""
+    """A leg as classified."""
 
     name: str
     type: str
@@ -73,13 +73,13 @@ class InspectedLeg(SparseDocument):
     B: Triple  # in the platform link [m]
     q0: Number  # [m]
     sign: int
-    travel: list[Number] | None  # [m, or rad of what turns]; of what a slider or actuator moves
+    travel: list[Number] | None  # of the slider or actuator [m or rad]
     q_home: Number  # the reading at ``home``
     base_axis: Triple | None
     platform_axis: Triple | None
     twist: Number | None  # [rad]
     cylinders: list[CylinderBlock]
-    actuator: str | None = None  # the joint of the motor that moves A; left out where none does
+    actuator: str | None = None  # joint of the motor that moves A; omitted if A is fixed
 
 
 class Inspection(SparseDocument):
@@ -89,12 +89,12 @@ class Inspection(SparseDocument):
     spatial: bool
     mobility: int
     motors: int
-    motor_rank: int  # freedoms of the platform that motors hold
+    motor_rank: int  # freedoms of the platform held by motors
     n: int
-    n_d: int  # legs that define the frames
-    r: int  # legs with an R joint on the base
-    n_ac: int  # legs that are actuated or of constant length
-    idle_spins: int  # freedoms that only turn a leg about itself
+    n_d: int  # number of legs that define the frames
+    r: int  # number of legs with an R joint on the base
+    n_ac: int  # number of legs that are actuated or of constant length
+    idle_spins: int  # number of freedoms that only spin a leg about itself
     base_frame: list[str]
     home: Pose  # T_base_platform
     legs: list[InspectedLeg]
@@ -109,10 +109,10 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     stated = motor_entries(machine.actuators)
     actuators = dict[str, InspectedActuator]()
     for a in machine.actuators:
-        found = a.document() | stated.get(a.joint, {})
+        document = a.document() | stated.get(a.joint, {})
         if a.arm is not None:
-            found["arm"] = found["arm"] | {"radius": a.arm.radius}
-        actuators[a.joint] = InspectedActuator.model_validate(found)
+            document["arm"] = document["arm"] | {"radius": a.arm.radius}
+        actuators[a.joint] = InspectedActuator.model_validate(document)
     return Inspection(
         name=machine.name,
         spatial=machine.spatial,
@@ -133,7 +133,6 @@ def machine_document(machine: Machine) -> dict[str, Any]:
 
 
 def _leg(leg: Leg, q_home: float) -> InspectedLeg:
-    """Return one leg of the document."""
     has_travel = leg.has_value and bool(np.isfinite(leg.travel).all())
     return InspectedLeg(
         name=leg.name,

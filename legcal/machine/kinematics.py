@@ -1,10 +1,10 @@
-"""The pose at readings, the readings at a pose, and the closed chain at both.
+"""Forward and inverse kinematics, on the equations of legs and on the closed chain.
 
-Poses are found from the equations of the legs, configurations from the closures of the URDF's tree
-in Pinocchio; both have one solver. Forward kinematics follows the closed chain from a known
+Poses are solved from the equations of the legs, configurations from the closures of the URDF in
+Pinocchio; both use the same solver. Forward kinematics follows the closed chain from a known
 configuration in steps that cannot cross a singularity, so that the assembly mode is kept and no leg
-is flipped. Where the joints of the spanning tree stand in the way, the pose alone is followed
-and the chain closed where it ends.
+is flipped. If joints of the spanning tree obstruct the path, the pose alone is followed and the
+chain is closed at its end.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,14 +43,14 @@ from legcal.machine.solved_poses import ROUNDING, TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 from legcal.machine.ties import machine_ties
 
-CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
-MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
-LONG_STEP = 1.0 / 16.0  # where another way follows if that does not lead there
-RANDOM_ANGLES = 6  # other angles of all legs that are tried
-FEW_RESTARTS = 2  # of legs that do not close from there
-SAME_START = 2.5e-9  # mean leg lengths, and of rotation matrices: where a start is the last pose
-FEW_STEPS = 12  # of Newton's method at most, and
-REDUNDANT_STEPS = 40  # where readings contradict each other: convergence is linear there
+CONTRACTION = 0.5  # largest step relative to the one before; for the first, to 1 rad or leg length
+MIN_STEP = 1.0 / 4096.0  # least step, relative to the path between readings
+LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
+RANDOM_ANGLES = 6  # random starts for the angles of all legs
+FEW_RESTARTS = 2  # restarts of single legs that do not close
+SAME_START = 2.5e-9  # tolerance of a start at the last pose [mean leg lengths, rotation matrix]
+FEW_STEPS = 12  # largest number of Newton steps
+REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
 
 def forward_kinematics(
@@ -63,17 +63,17 @@ def forward_kinematics(
     mechanism : Machine
         The machine.
     q : (n_legs,) array
-        Readings [m, rad]; those of legs without a motor are ignored and may be NaN. Of rods on
-        one actuator that of the first counts.
+        Readings [m, rad]; legs without a motor are ignored and may be NaN. Of rods on one actuator
+        the first counts.
     start : RigidTransform, optional
-        T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it. What
-        the last call for this machine returned is the quickest.
+        T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``. The
+        pose returned by the last call for this machine is fastest.
 
     Returns
     -------
     RigidTransform
-        T_base_platform, with every loop closed to 1e-12 m. Where there are more motors than
-        freedoms the squares of what they miss are least: :func:`reading_residuals`.
+        T_base_platform, with every loop closed to 1e-12 m. With redundant motors it minimises the
+        squares of :func:`reading_residuals`.
 
     Raises
     ------
@@ -81,11 +81,11 @@ def forward_kinematics(
         If the motors do not determine the pose.
     DidNotConverge
         If no closed pose is reached from ``start`` without crossing a singularity, or readings of
-        redundant motors contradict each other by more than errors of a nominal model explain.
+        redundant motors contradict each other by more than the errors of a nominal model.
     UsageError
         If the readings are too few or not finite.
     """
-    # The legs stand where the call before left them if that is where this one starts
+    # Continue from the last configuration if this call starts at the last pose.
     T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
     away = np.zeros((4, 4)) if start is None or T_last is None else start.as_matrix() - T_last
     away[:3, 3] /= mechanism.size
@@ -99,19 +99,19 @@ def forward_kinematics(
     return pose
 
 
-# Pose and configuration at which the last call of forward_kinematics ended
+# Pose and configuration at the end of the last call of forward_kinematics.
 _last: WeakKeyDictionary[Machine, tuple[Array, Array]] = WeakKeyDictionary()
 
 
 class Follower:
-    """A closed configuration that is moved from readings to readings, each step from the last.
+    """A closed configuration that is moved from readings to readings, each time from the last.
 
     Parameters
     ----------
     mechanism : Machine
         The machine.
     start : RigidTransform, optional
-        T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
+        T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``.
 
     Attributes
     ----------
@@ -141,14 +141,14 @@ class Follower:
         return platform_pose(self._machine, self.configuration)
 
     def place(self, T_base_platform: RigidTransform) -> RigidTransform:
-        """Return the pose of the closed chain with the platform at a pose, its legs following.
+        """Move the platform of the closed chain to a pose, with its legs, and return it.
 
         Raises
         ------
         UsageError
             If the legs do not allow the pose, by more than 1 % of a leg length.
         DidNotConverge
-            If the legs do not reach it; the configuration stays where it was.
+            If the legs do not reach it; the configuration is then unchanged.
         """
         projected, problem = project_pose(self._machine, T_base_platform)
         if problem is not None:
@@ -165,13 +165,13 @@ class Follower:
         Parameters
         ----------
         q : (n_legs,) array
-            Readings [m]; those of legs without a motor are ignored and may be NaN.
+            Readings [m]; legs without a motor are ignored and may be NaN.
 
         Raises
         ------
         DidNotConverge
             If no closed pose is reached without crossing a singularity, or readings contradict each
-            other; the configuration stays where it was.
+            other; the configuration is then unchanged.
         UsageError
             If the readings are too few or not finite.
         """
@@ -186,9 +186,9 @@ class Follower:
 
 
 def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:
-    """Return T_base_platform of many rows of readings (n_rows, n_legs) [m], in the mode of home.
+    """Return T_base_platform at rows of readings (n_rows, n_legs), in the mode of home.
 
-    Each row starts from the nearest one that is solved already, or from home.
+    Readings are in m or rad. Each row is followed from the nearest solved row, or from home.
 
     Raises
     ------
@@ -206,18 +206,18 @@ def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:
 def followed_poses(
     machine: Machine, q: Array, *, on_the_chain: bool = True
 ) -> Iterator[tuple[RigidTransform, DidNotConverge | None]]:
-    """Yield the platform pose at each of many rows of readings, and no failure.
+    """Yield the platform pose at each row of readings, with the failure if it was not reached.
 
-    Where it need not be *on_the_chain*, the equations of the legs alone are followed, if they lead
-    to all rows from home: at a tenth of the time, and as far off as axes of the chain are.
+    If not *on_the_chain*, the equations of the legs alone are followed if they reach all rows from
+    home: in a tenth of the time, and with the errors of axes in the chain.
 
-    Where a row is not reached, the pose of the nearest row that is, or home, comes with the
-    failure. Arguments and other exceptions are those of :func:`forward_kinematics_many`.
+    If a row is not reached, its failure comes with the pose of the nearest reached row, or home.
+    Arguments and other exceptions as in :func:`forward_kinematics_many`.
     """
     readings = _readings(machine, np.asarray(q, dtype=np.float64))
-    known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    reached = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
     if not on_the_chain:
-        poses, part = follow_poses(machine, machine.home, known[0], readings, LONG_STEP)
+        poses, part = follow_poses(machine, machine.home, reached[0], readings, LONG_STEP)
         if np.all(part == 1.0):
             followed = motions_of(poses[:, :, :3], poses[:, :, 3])
             for i, (T, row) in enumerate(zip(followed, readings, strict=True)):
@@ -225,7 +225,7 @@ def followed_poses(
             return
     configurations = [machine.home_configuration]
     for i, row in enumerate(readings):
-        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
+        nearest = configurations[int(np.argmin(np.abs(np.array(reached) - row).max(axis=1)))]
         try:
             configuration = follow(machine, nearest, row, f" of row {i + 1}")
         except DidNotConverge as failure:
@@ -234,16 +234,16 @@ def followed_poses(
         T = platform_pose(machine, configuration)
         contradicted = _disagreement(machine, T, row, f" of row {i + 1}")
         if contradicted is None:
-            known.append(row)
+            reached.append(row)
             configurations.append(configuration)
         yield T, contradicted
 
 
 def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
-    """Yield the closed configuration at each of readings (n, n_motors).
+    """Yield the closed configurations at readings (n, n_motors).
 
-    Each is followed from the nearest one that is reached already, or from home. Raises
-    DidNotConverge at the first that is not reached.
+    Each is followed from the nearest one reached before, or from home. Raises DidNotConverge at the
+    first that is not reached.
     """
     columns, reached = slider_columns(machine, machine.motors)[0], [machine.home_configuration]
     for row in readings:
@@ -255,10 +255,10 @@ def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
 def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
-    Of a rod it is the reading of the actuator that it hangs on, with ``|A(q) - B| = l``.
+    For a rod on an actuator it is the reading of the actuator, with ``|A(q) - B| = l``.
 
-    A length is a distance, so that no leg is ever flipped. Values outside the travel are
-    returned as they are.
+    A length is a distance, so that no leg is ever flipped. Values outside the travel are returned
+    unchanged.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     Returns
     -------
     (n_legs,) array
-        Joint values [m, rad]; zero for a leg of constant length that hangs on no actuator.
+        Joint values [m, rad]; zero for a leg of constant length on no actuator.
 
     Raises
     ------
@@ -281,8 +281,8 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     problem = violated_constraint(mechanism, T_base_platform)
     if problem is not None:
         raise UsageError(
-            f"The platform cannot stand there: {problem}, needed a pose that every leg "
-            "allows; choose one that keeps it."
+            f"The platform cannot take this pose: {problem}, needed a pose that every leg "
+            "allows; choose a pose that meets this constraint."
         )
     q = readings_at(mechanism, T_base_platform)
     q[[not leg.has_value for leg in mechanism.legs]] = 0.0
@@ -292,16 +292,16 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
 def _disagreement(
     machine: Machine, T: RigidTransform, readings: Array, which: str = ""
 ) -> DidNotConverge | None:
-    """Return the error of readings (n_motors,) that contradict each other, None if they do not."""
+    """Return the error of contradicting readings (n_motors,), None if they agree."""
     if not machine.is_redundant:
         return None
-    found = contradictions(machine, [platform_in_base(machine, T)], readings[None])
-    if not found:
+    conflicts = contradictions(machine, [platform_in_base(machine, T)], readings[None])
+    if not conflicts:
         return None
     return DidNotConverge(
         Problem(
             f"the pose at the readings{which} could not be computed",
-            str(found[0].cause(machine)),
+            str(conflicts[0].cause(machine)),
             "",
             "check this reading, its encoder and the offset of the leg",
             str(machine.yaml_path),
@@ -347,14 +347,14 @@ def _check_determined(machine: Machine) -> None:
 
 
 def platform_in_base(machine: Machine, T_base_platform: RigidTransform) -> RigidTransform:
-    """Return T_Rb_Re, the pose of the frame on the platform joints, from that of the links."""
+    """Return T_Rb_Re, the pose of the frame on the platform joints, from the pose of the links."""
     return product(machine.T_base_Rb.inv(), T_base_platform, machine.T_platform_Re)
 
 
 def platforms_in_base(
     machine: Machine, poses: Sequence[RigidTransform]
 ) -> tuple[RigidTransform, ...]:
-    """Return the same for many poses."""
+    """Return T_Rb_Re for many poses of the links."""
     if len(poses) == 0:
         return ()
     stacked = RigidTransform(np.array([T.as_matrix() for T in poses]), normalize=False)
@@ -366,8 +366,8 @@ def pose_differences(
 ) -> tuple[Array, Array]:
     """Return displacement [m] and rotation angle [rad] between T_Rb_Re of two models, eq (20).
 
-    The displacement, Delta X, is that of the platform joint of the first frame leg, the origin of
-    R_e; the angle, Delta E, that of the rotation between both orientations.
+    The displacement, Delta X, is of the platform joint of the first frame leg, the origin of R_e;
+    the angle, Delta E, is of the rotation between both orientations.
     """
     T, T_reference = (
         np.array([pose.as_matrix() for pose in several]).reshape(-1, 4, 4)
@@ -390,16 +390,16 @@ def follow(
 ) -> Array:
     """Return the closed configuration at readings (n_motors,), followed from a closed one.
 
-    It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are no shorter
-    than a part *min_step* of the way. *on_the_chain* stops where the joints of the chain do: soon,
-    but in a place that depends on the spanning tree. *which* names the readings in the message. Of
-    redundant motors the pose is followed that misses the readings least, and sliders stand there.
-    Motors whose readings are NaN are free; the others must determine the pose.
+    It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are at least the
+    fraction *min_step* of the path. With *on_the_chain* following stops if joints of the chain do:
+    early, but at a point that depends on the spanning tree. *which* names the readings in messages.
+    With redundant motors the least-squares pose is followed, and sliders are set to it. Motors with
+    NaN readings are free; the others must determine the pose.
 
     Raises
     ------
     DidNotConverge
-        If the steps stop contracting or reach a singularity, even tiny ones.
+        If even the smallest steps do not contract or reach a singularity.
     """
     given = np.isfinite(readings)
     is_redundant = machine.is_redundant and bool(given.all())
@@ -407,23 +407,23 @@ def follow(
     q_columns, v_columns = slider_columns(machine, motors)
     free = np.delete(np.arange(machine.chain.nv), v_columns)
     first, last = configuration[q_columns], readings[given]
-    known = machine.chain.linearize(configuration)[1][:, free]
+    last_jacobian = machine.chain.linearize(configuration)[1][:, free]
 
     def attempt(part: float) -> bool:
-        nonlocal configuration, known
+        nonlocal configuration, last_jacobian
         trial = configuration.copy()
         trial[q_columns] = last if part == 1.0 else first + part * (last - first)
         reached, jacobian = _closed_from(machine, trial, free)
         if reached is None or _is_flipped(machine, reached):
             return False
-        if not excludes_singularity(known, jacobian):
+        if not excludes_singularity(last_jacobian, jacobian):
             ends = [
                 matrix_of(*machine.chain.placement(c, machine.base, machine.platform))
                 for c in (configuration, reached)
             ]
             if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
                 return False
-        configuration, known = reached, jacobian
+        configuration, last_jacobian = reached, jacobian
         return True
 
     done = 0.0 if is_redundant else walk_in_steps(attempt, min_step)
@@ -444,8 +444,8 @@ def follow(
             Problem(
                 f"the pose at the readings{which} could not be reached: at "
                 f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
-                "legs meet no more or the mechanism is singular, needed a regular path; check the "
-                f"readings and {machine.urdf.wording.home}.",
+                "legs no longer close or the mechanism is singular, needed a regular path; check "
+                f"the readings and {machine.urdf.wording.home}.",
                 file=str(machine.yaml_path),
             )
         )
@@ -468,22 +468,22 @@ def follow(
 
 
 def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
-    """Return the pose near T_base_platform at which readings (n_motors,) miss least."""
+    """Return the pose near T_base_platform with the smallest residuals of readings (n_motors,)."""
     equations = equations_of_readings(machine, readings[None])
     tolerance = ROUNDING * machine.size
-    found = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
-    return motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    solution = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
+    return motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
 
 
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
-    """Return what poses must satisfy at readings of the motors (k, n_motors) [m, rad]."""
+    """Return the equations of poses at readings of the motors (k, n_motors) [m, rad]."""
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
+        rows = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
         if machine.is_redundant:
-            return least_squares_equations(found, n_dependent)
-        return found.values, found.by_pose
+            return least_squares_equations(rows, n_dependent)
+        return rows.values, rows.by_pose
 
     return equations
 
@@ -491,13 +491,14 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
 def follow_poses(
     machine: Machine, start: RigidTransform, first: Array, last: Array, min_step: float
 ) -> tuple[Array, Array]:
-    """Return poses (k, 3, 4) followed from one at *first* readings to many *last* (k, n_motors).
+    """Return poses (k, 3, 4) followed from one, at *first* readings, to *last* ones (k, n_motors).
 
-    The joints of the chain do not count. With them comes which part of each way is done, (k,).
+    The joints of the chain are ignored. The second result is the completed fraction of each path,
+    (k,).
     """
     T = start.as_matrix()[None]
-    known = dimensionless(machine, T)
-    poses, known = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], known))
+    jacobians = dimensionless(machine, T)
+    poses, jacobians = (np.repeat(x, len(last), axis=0) for x in (T[:, :3], jacobians))
     scale = leg_scale(machine, start)
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     motors = list(machine.motors)
@@ -508,11 +509,11 @@ def follow_poses(
             return poses, done
         part = np.minimum(done[rows] + step[rows], 1.0)
         readings = first + part[:, None] * (last[rows] - first)
-        if machine.is_redundant:  # from where motors are: readings between need not agree
+        if machine.is_redundant:  # from the motors at the pose: readings in between need not agree
             now = readings_at_poses(machine, poses[rows])[:, motors]
             share = ((part - done[rows]) / (1.0 - done[rows]))[:, None]
             readings = now + share * (last[rows] - now)
-        found = newton(
+        solution = newton(
             equations_of_readings(machine, readings),
             poses_after,
             poses[rows],
@@ -522,14 +523,14 @@ def follow_poses(
             unit=unit,
             steps=REDUNDANT_STEPS if machine.is_redundant else FEW_STEPS,
         )
-        jacobian = dimensionless(machine, found.points)
-        good = found.converged | (found.worst < TOLERANCE * scale)
-        good &= ~_is_reversed(machine, found.points)
+        jacobian = dimensionless(machine, solution.points)
+        good = solution.converged | (solution.worst < TOLERANCE * scale)
+        good &= ~_is_reversed(machine, solution.points)
         for i in np.flatnonzero(good):
-            if not excludes_singularity(known[rows[i]], jacobian[i]):
-                good[i] = is_on_same_side(known[rows[i]], jacobian[i])
+            if not excludes_singularity(jacobians[rows[i]], jacobian[i]):
+                good[i] = is_on_same_side(jacobians[rows[i]], jacobian[i])
         reached = rows[good]
-        poses[reached], known[reached] = found.points[good], jacobian[good]
+        poses[reached], jacobians[reached] = solution.points[good], jacobian[good]
         done[reached] = part[good]
         step[rows] *= np.where(good, 2.0, 0.5)
 
@@ -537,12 +538,12 @@ def follow_poses(
 def _closed_from(
     machine: Machine, configuration: Array, free: IntArray
 ) -> tuple[Array | None, Array]:
-    """Return the configuration closed with the motors fixed, None if not near, and its Jacobian."""
+    """Return the configuration closed with the motors fixed, or None, and its Jacobian."""
     equations, retract = closure_equations(machine, None, machine.size, free)
-    found = newton(
+    solution = newton(
         equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
-    return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
+    return solution.points[0] if solution.worst[0] < CLOSED else None, solution.jacobian[0]
 
 
 def _closed_at(
@@ -550,7 +551,7 @@ def _closed_at(
 ) -> Array | None:
     """Return the closed configuration at a pose with some columns set, None if joints forbid it.
 
-    The platform is free only where axes that are a little off leave no other way.
+    The platform is free only if slightly inexact axes require it.
     """
     rng = np.random.default_rng(1965)
     angles = machine.chain.rotation_columns()
@@ -571,7 +572,7 @@ def _closed_at(
 
 
 def _is_flipped(machine: Machine, configuration: Array) -> bool:
-    """Say whether a leg without a motor has shrunk through its base joint."""
+    """Return whether a leg without a motor has shrunk through its base joint."""
     rows = [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE]
     if not rows:
         return False
@@ -580,11 +581,11 @@ def _is_flipped(machine: Machine, configuration: Array) -> bool:
 
 
 def _is_reversed(machine: Machine, poses: Array) -> BoolArray:
-    """Say at which poses (k, 3, 4) a leg that is fixed to the platform points the wrong way."""
+    """Return at which poses (k, 3, 4) a leg fixed to the platform points the wrong way."""
     R, t = poses[:, :, :3], poses[:, :, 3]
-    found = np.zeros(len(poses), dtype=np.bool_)
+    reversed_poses = np.zeros(len(poses), dtype=np.bool_)
     for leg in machine.legs:
         if leg.is_fixed_to_platform and leg.platform_axis is not None:
             along = (R @ leg.platform_axis) * (R @ leg.B + t - leg.A)
-            found |= along.sum(axis=1) <= 0.0
-    return found
+            reversed_poses |= along.sum(axis=1) <= 0.0
+    return reversed_poses

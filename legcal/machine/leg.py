@@ -1,10 +1,9 @@
 """A leg: the chain of joint, slider or rod, and joint from base to platform, and its numbers.
 
-:class:`JointType` is the one table of joints: what each leaves free, which axis it has, and which
-equations it adds to those of its leg. What belongs to the base stands in a frame of the base, what
-belongs to the platform in a frame of the platform: the links for the legs of a
-:class:`~legcal.machine.model.Machine`, the joint frames R_b and R_e for
-:func:`legcal.machine.parameters.geometries`.
+:class:`JointType` is the table of joints: their freedoms, axes and the equations that they add to
+their leg. Vectors of the base are in a frame of the base, those of the platform in a frame of the
+platform: the links for the legs of a :class:`~legcal.machine.model.Machine`, the joint frames R_b
+and R_e for :func:`legcal.machine.parameters.geometries`.
 """
 
 from __future__ import annotations
@@ -23,26 +22,26 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.bodies import Connection
 
-TRAVEL_MARGIN = 0.05  # of the travel: as good as inside
-# Of readings and of measured lengths whose standard deviation nobody states, in mean leg lengths
+TRAVEL_MARGIN = 0.05  # tolerance of the travel, relative to it
+# Default standard deviations of readings and of measured lengths, in mean leg lengths.
 SIGMA_READING, SIGMA_LENGTH = 5e-6, 1.25e-4
-MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
-MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # of the leg length; beyond, its unit is the mistake
-MAX_LEGS = 32  # the work of all that is done with them grows with the cube of their number
+MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # plausible leg lengths [m]; others hint at a wrong unit
+MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # plausible radii, relative to the leg length
+MAX_LEGS = 32  # computing time grows with the cube of the number of legs
 
 
 class LegColumns:
-    """Where the numbers of a leg stand: joint centres [m], length [m], angles of axes, twist."""
+    """Columns of the numbers of a leg: joint centres [m], length [m], angles of axes, twist."""
 
     A, B, LENGTH = slice(0, 3), slice(3, 6), 6
     BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
-    OWN = 12  # the leg's own; those of its actuator follow (ActuatorColumns)
+    OWN = 12  # number of columns of the leg itself; its actuator follows (ActuatorColumns)
     ACTUATOR = slice(OWN, OWN + ActuatorColumns.COUNT)
     COUNT = ACTUATOR.stop
 
 
 class LegKind(StrEnum):
-    """What moves along a leg: a motor with an encoder, a free slider, or nothing."""
+    """The freedom along a leg: a motor with an encoder, a free slider, or none."""
 
     ACTUATED = "actuated"
     PASSIVE = "passive"
@@ -50,7 +49,7 @@ class LegKind(StrEnum):
 
 
 class EquationKind(StrEnum):
-    """What an equation of a leg is about."""
+    """The subject of an equation of a leg."""
 
     LENGTH = "length"
     BASE_AXIS = "base axis"
@@ -58,7 +57,7 @@ class EquationKind(StrEnum):
     DIRECTION_1 = "direction in the platform, first angle"
     DIRECTION_2 = "direction in the platform, second angle"
     TWIST = "twist"
-    PLANE = "plane of motion"  # of the platform of a planar machine, and of no leg
+    PLANE = "plane of motion"  # of the platform of a planar machine, without leg
 
 
 class JointType(StrEnum):
@@ -74,9 +73,9 @@ class JointType(StrEnum):
     ============  ==  ======================  ====================  ============================
     """
 
-    n_freedoms: int  # rotations of the leg that it leaves free
-    at_base: tuple[EquationKind, ...]  # what it adds to the equations of its leg at the base,
-    at_platform: tuple[EquationKind, ...]  # and at the platform
+    n_freedoms: int  # free rotations of the leg
+    at_base: tuple[EquationKind, ...]  # equations that it adds to its leg at the base
+    at_platform: tuple[EquationKind, ...]  # equations that it adds at the platform
 
     def __new__(
         cls,
@@ -98,29 +97,29 @@ class JointType(StrEnum):
 
     @property
     def has_axis(self) -> bool:
-        """Whether it turns about an axis that is fixed in base or platform."""
+        """Whether it has an axis fixed in base or platform."""
         return self in (JointType.REVOLUTE, JointType.UNIVERSAL)
 
     @property
     def twists_freely(self) -> bool:
-        """Whether the leg may turn about itself."""
+        """Whether the leg may twist about itself."""
         return self is JointType.SPHERICAL
 
     @property
     def inner_is_across(self) -> bool:
-        """Whether the axis in the leg is across the leg and the axis in base or platform."""
+        """Whether the axis in the leg is normal to the leg and to the axis in base or platform."""
         return self is JointType.UNIVERSAL
 
 
 class Cover(NamedTuple):
-    """A stretch of a leg that moves with one half of it, such as one inside a solid."""
+    """A section of a leg that moves with one half of it, such as one inside a solid."""
 
     side: Literal["base", "platform"]
     start: float  # from A for base, from B for platform, positive from A to B [m]
     end: float
 
     def span(self, length: float) -> tuple[float, float]:
-        """Return both ends as distances from A along a leg of that length [m]."""
+        """Return both ends as distances from A along a leg of this length [m]."""
         shift = 0.0 if self.side == "base" else length
         return self.start + shift, self.end + shift
 
@@ -131,32 +130,32 @@ class Cylinder:
 
     link: str  # the URDF link that carries the visual; it names the part in observations
     radius: float  # [m]
-    side: Literal["base", "platform"]  # the half of the leg that it moves with
+    side: Literal["base", "platform"]  # the half of the leg that carries it
     start: float  # ends along the leg [m], start < end: from A for base, from B for platform,
     end: float  # positive from A to B
-    covers: tuple[Cover, ...] = ()  # where other solids of the leg enclose it
+    covers: tuple[Cover, ...] = ()  # sections enclosed by other solids of the leg
 
     def span(self, length: float) -> tuple[float, float]:
-        """Return both ends as distances from A along a leg of that length [m]."""
+        """Return both ends as distances from A along a leg of this length [m]."""
         return Cover(self.side, self.start, self.end).span(length)
 
 
 def with_radii(
     cylinders: Sequence[Sequence[Cylinder]], radius: Callable[[int, Cylinder], float]
 ) -> tuple[tuple[Cylinder, ...], ...]:
-    """Return the cylinders of all legs with other radii [m], by number of the leg and cylinder."""
+    """Return the cylinders of all legs with radii [m] by a function of leg index and cylinder."""
     return tuple(
-        tuple(replace(one, radius=radius(j, one)) for one in of_leg)
+        tuple(replace(cylinder, radius=radius(j, cylinder)) for cylinder in of_leg)
         for j, of_leg in enumerate(cylinders)
     )
 
 
 def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:
-    """Return the cylinder that each link names as a part: its longest; the others hide pieces."""
-    found: dict[str, Cylinder] = {}
+    """Return the longest cylinder of each link, which it names as a part; others only hide."""
+    longest: dict[str, Cylinder] = {}
     for cylinder in sorted(cylinders, key=lambda c: (c.end - c.start, c.radius)):
-        found[cylinder.link] = cylinder
-    return found
+        longest[cylinder.link] = cylinder
+    return longest
 
 
 def cylinder_of_arm(arm: Arm) -> Cylinder:
@@ -166,16 +165,16 @@ def cylinder_of_arm(arm: Arm) -> Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A connection as a leg passes it from base to platform."""
+    """A connection of a leg, passed from base to platform."""
 
     connection: Connection
-    near: int  # which of its two bodies lies towards the base,
-    far: int  # and which towards the platform
+    near: int  # index of the body towards the base
+    far: int  # index of the body towards the platform
     axis: Array  # (3,) unit axis in the joint frame
 
     @property
     def name(self) -> str:
-        """The joint as a message names it."""
+        """The joint, in words."""
         return self.connection.joint or "the 3d closure"
 
     def line(self, side: int) -> tuple[Array, Array]:
@@ -186,10 +185,10 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """The axis of a revolute, or the centre of a sphere, which has no direction."""
+    """The axis of a revolute, or the centre of a sphere (no direction)."""
 
     name: str
-    point: Array  # (3,) the joint's origin [m]
+    point: Array  # (3,) origin of the joint [m]
     direction: Array | None  # (3,) unit vector
 
     @property
@@ -200,25 +199,25 @@ class Axis:
         return self.direction
 
     def distance(self, point: Array) -> float:
-        """Return how far a point is from the axis, or from the centre of a sphere [m]."""
+        """Return the distance of a point from the axis, or from the centre of a sphere [m]."""
         if self.direction is None:
             return float(np.linalg.norm(point - self.point))
         return float(distance_to_line(point, self.direction, self.point))
 
     def foot(self, point: Array) -> Array:
-        """Return the point of the axis that is nearest to a point [m]."""
+        """Return the point of the axis nearest to a point [m]."""
         return self.point + ((point - self.point) @ self.along) * self.along
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """What the revolutes and spheres at one end of a leg make together."""
+    """The joint formed by the revolutes and spheres at one end of a leg."""
 
-    type: JointType  # FIXED where nothing turns but the leg about itself
-    centre: Array | None  # (3,) [m]; None for R, which has an axis of possible ones
-    axes: tuple[Axis, ...]  # that of R; of U the one fixed in base or platform, then the inner one
+    type: JointType  # FIXED if the leg only turns about itself
+    centre: Array | None  # (3,) [m]; None for R, which has an axis of possible centres
+    axes: tuple[Axis, ...]  # axis of R; for U the one fixed in base or platform, then the inner one
     spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
-    spare: int = 0  # freedoms that it has beyond those of its type
+    spare: int = 0  # freedoms beyond those of its type
 
     @property
     def outer(self) -> Array | None:
@@ -233,23 +232,23 @@ class Pivot:
 
 @dataclass(frozen=True, eq=False)
 class LegChain:
-    """The joints of one leg, and its geometry with all of them at zero in the base body's frame."""
+    """The joints of one leg, and its geometry with all of them at zero, in the base body."""
 
     steps: tuple[Step, ...]  # from base to platform
-    poses: tuple[Array, ...]  # (4, 4) of the base body, the bodies of the leg, the platform's
-    n_lower: int  # joints on the base side of the slider, or of the rod, with its actuator
+    poses: tuple[Array, ...]  # (4, 4) of the bodies from base to platform
+    n_lower: int  # number of joints below the slider, or the rod, with its actuator
     slider: Step | None  # None for a leg of constant length
     base: Pivot
     platform: Pivot
     A: Array  # (3,) [m]
     B: Array  # (3,) [m]
-    u: Array  # (3,) in which a slider moves the platform end; else from A to B
-    idle_spins: int  # freedoms that turn nothing but the leg about itself
-    actuator: Step | None = None  # the first of the steps, where a rod hangs on what it moves
+    u: Array  # (3,) direction of the slider towards the platform; else from A to B
+    idle_spins: int  # freedoms that only spin the leg about itself
+    actuator: Step | None = None  # the first step, if it is a motor that carries the rod
 
     @property
     def B_platform(self) -> Array:
-        """B in the platform's body, (3,) [m]."""
+        """B in the platform body, (3,) [m]."""
         return self.line_in(-1, self.B)[0]
 
     @property
@@ -259,12 +258,12 @@ class LegChain:
 
     @property
     def n_upper(self) -> int:
-        """The index of the body behind the slider, or of the one of the rod."""
+        """The index of the body behind the slider, or of the rod."""
         return self.n_lower + (self.slider is not None)
 
     @property
     def motor(self) -> str | None:
-        """The joint of the slider, or of what a rod hangs on; None for other rods."""
+        """The joint of the slider, or of the motor that carries the rod; None for other rods."""
         moving = self.slider or self.actuator
         return None if moving is None else moving.connection.joint
 
@@ -279,7 +278,7 @@ class LegChain:
         return self.base.type.twists_freely or self.platform.type.twists_freely
 
     def line_in(self, body: int, point: Array) -> tuple[Array, Array]:
-        """Return a point and the direction u in one of the bodies, 0 the base's, -1 the last."""
+        """Return a point and the direction u in one of the bodies: 0 the base, -1 the platform."""
         matrix = matrix_inverse(self.poses[body])
         return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
 
@@ -292,37 +291,37 @@ class Leg:
     Axes are lines, given for joints whose axis is a parameter: R, and the outer axis of U in a leg
     without an S joint; none in planar machines. A leg that is fixed to the platform (the centre
     leg of a Tricept) has its direction from A to B as platform axis, and B at the foot of the
-    platform link's origin, in R_e at its :func:`frame_point` where it defines that. The twist is
-    the angle about u from the inner axis at the base to the inner one at the platform, which a leg
-    without an S joint keeps.
+    platform link origin, or in R_e at its :func:`frame_point` if it defines R_e. The twist is the
+    angle about u from the inner axis at the base to the inner axis at the platform, constant for a
+    leg without an S joint.
     """
 
     base_joint: JointType
     platform_joint: JointType
     kind: LegKind
-    A: Array  # (3,) base joint centre [m]; on an actuator that at reading 0
+    A: Array  # (3,) base joint centre [m], with an actuator that carries it at reading 0
     B: Array  # (3,) platform joint centre [m]
     q0: float  # length at reading zero [m], L = sign q + q0; the length of a rod
     base_axis: Array | None = None  # (3,) unit axis; in links its last nonzero component is > 0
     platform_axis: Array | None = None  # (3,)
     twist: float | None = None  # [rad], in (-pi/2, pi/2]
     name: str = ""
-    prismatic: str | None = None  # the URDF joint of the slider, or of what the rod hangs on
-    sign: int = 1  # -1 where the leg shrinks with the joint value
+    prismatic: str | None = None  # the URDF joint of the slider, or of the actuator of a rod
+    sign: int = 1  # -1 if the leg shrinks with the joint value
     travel: tuple[float, float] = (0.0, 0.0)  # joint limits of slider or actuator [m or rad]
-    cylinders: tuple[Cylinder, ...] = ()  # what a camera can see of it
-    chain: LegChain | None = None  # its joints in the URDF; None where no file describes it
-    actuator: Actuator | None = None  # what a rod hangs on whose joint at A moves
-    mode: int = 1  # of such a rod, the sign of d|AB|/dq: which of two readings reaches B
+    cylinders: tuple[Cylinder, ...] = ()  # visible cylinders
+    chain: LegChain | None = None  # its joints in the URDF; None without a file
+    actuator: Actuator | None = None  # the motor that carries the joint at A of a rod
+    mode: int = 1  # sign of d|AB|/dq of such a rod, which selects one of two readings
 
     @property
     def is_motor(self) -> bool:
-        """Whether a motor moves it: its slider, or what it hangs on."""
+        """Whether a motor moves it: a slider, or the actuator of a rod."""
         return self.kind is LegKind.ACTUATED or self.actuator is not None
 
     @property
     def has_value(self) -> bool:
-        """Whether it has a joint value: of its slider, or of what it hangs on."""
+        """Whether it has a joint value: of a slider, or of the actuator of a rod."""
         return self.kind is not LegKind.CONSTANT or self.actuator is not None
 
     @property
@@ -337,13 +336,13 @@ class Leg:
 
     @property
     def motor_label(self) -> str:
-        """What messages call its motor: the joint that moves A, else the leg itself."""
+        """The name of its motor in messages: the joint that moves A, else the leg itself."""
         return self.name if self.actuator is None else self.actuator.joint
 
     def reading_of(self, distance: float) -> float:
-        """Return the reading [m or rad] by which its motor moves the joint at A, or B, so far [m].
+        """Return the change of reading [m or rad] that moves the joint at A, or B, by *distance*.
 
-        It is the distance itself where the motor slides.
+        For a motor that slides it is the distance itself.
         """
         if self.actuator is None or not self.actuator.turns:
             return distance
@@ -351,9 +350,9 @@ class Leg:
 
     @property
     def type(self) -> str:
-        """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there.
+        """The joints from base to platform, such as ``SPU``; ``UP`` if fixed to the platform.
 
-        Of a rod that hangs on an actuator this comes first: ``PSS``, ``RSS``.
+        For a rod on an actuator the actuator comes first: ``PSS``, ``RSS``.
         """
         first = "" if self.actuator is None else "R" if self.actuator.turns else "P"
         slider = "" if self.kind is LegKind.CONSTANT else "P"
@@ -361,28 +360,28 @@ class Leg:
 
     @property
     def arm(self) -> Arm | None:
-        """The arm of its motor that outlines have as a part of this rod, None on any other."""
+        """The arm of its motor if outlines list it as a part of this rod, else None."""
         arm = None if self.actuator is None else self.actuator.arm
         return arm if arm is not None and arm.leg == self.name else None
 
     def is_arm(self, part: str) -> bool:
-        """Say whether one of its parts is not along the leg but the arm of its motor."""
+        """Return whether a part is the arm of its motor, not along the leg."""
         return self.arm is not None and self.arm.link == part
 
     @property
     def radius_along(self) -> dict[str, float]:
-        """Radius [m] of each part along the leg that outlines are found of, by its URDF link."""
+        """Radius [m] of each part along the leg with outlines, by URDF link."""
         return {link: c.radius for link, c in main_cylinders(self.cylinders).items()}
 
     @property
     def radius_of_part(self) -> dict[str, float]:
-        """The same with the arm that is one of its parts."""
+        """Radius [m] of each part with outlines, the arm included, by URDF link."""
         arm = {} if self.arm is None else {self.arm.link: self.arm.radius}
         return self.radius_along | arm
 
     @property
     def is_fixed_to_platform(self) -> bool:
-        """Whether the leg does not turn against the platform."""
+        """Whether the leg does not turn relative to the platform."""
         return self.platform_joint is JointType.FIXED
 
     def length_at(self, reading: float) -> float:
@@ -394,9 +393,9 @@ class Leg:
         return np.asarray(self.sign * (lengths - self.q0))
 
     def in_travel(self, readings: Array) -> BoolArray:
-        """Return which readings (n,) [m] are inside the travel, or outside by at most 5 % of it.
+        """Return which readings (n,) [m] are within the travel, with a margin of 5 % of it.
 
-        A missing one (NaN) is not; without limits, or with equal ones, all others are.
+        Missing readings (NaN) are not; without limits, or with equal limits, all others are.
         """
         lower, upper = self.travel
         margin = TRAVEL_MARGIN * (upper - lower)
@@ -406,44 +405,42 @@ class Leg:
 
     @property
     def equations(self) -> tuple[EquationKind, ...]:
-        """The equations of this leg, in the order of their rows."""
-        found = [EquationKind.LENGTH]
+        """The kinds of equations of this leg, in the order of their rows."""
+        kinds = [EquationKind.LENGTH]
         if self.base_axis is not None:
-            found += self.base_joint.at_base
+            kinds += self.base_joint.at_base
         if self.platform_axis is not None:
-            found += self.platform_joint.at_platform
+            kinds += self.platform_joint.at_platform
         if self.twist is not None:
-            found.append(EquationKind.TWIST)
-        return tuple(found)
+            kinds.append(EquationKind.TWIST)
+        return tuple(kinds)
 
     @property
     def urdf_chain(self) -> LegChain:
-        """Its joints in the URDF; ValueError if no file describes the leg."""
+        """Its joints in the URDF; ValueError for a leg without a file."""
         if self.chain is None:
             raise ValueError("a leg that no file describes has no joints in a URDF")
         return self.chain
 
     @property
     def idle_spins(self) -> int:
-        """Freedoms of its joints in the URDF that turn nothing but the leg about itself."""
+        """Number of freedoms in the URDF that only spin the leg about itself."""
         return 0 if self.chain is None else self.chain.idle_spins
 
     @property
     def n_constraints(self) -> int:
-        """How many equations hold without a reading; of a rod at that of its actuator."""
+        """Number of equations that hold without a reading (or at that of the actuator of a rod)."""
         return len(self.equations) - (self.kind is not LegKind.CONSTANT)
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicParameters:
-    """Joint centres in R_b and R_e and lengths of legs: all parameters if joints are point-like."""
+    """Joint centres in R_b and R_e and leg lengths: all parameters of point-like joints."""
 
     base_joints: Array  # (n_legs, 3) A in R_b [m]
     platform_joints: Array  # (n_legs, 3) B in R_e [m]
     offsets: Array  # (n_legs,) q0, or the length of constant legs [m]
-    passive: tuple[
-        int, ...
-    ] = ()  # legs whose offset is no parameter, since no reading depends on it
+    passive: tuple[int, ...] = ()  # legs without offset parameter, since no reading depends on it
 
 
 def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:
@@ -457,7 +454,7 @@ def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:
 
 
 def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
-    """Return legs with point-like joints, actuated where they are not passive."""
+    """Return legs with point-like joints, actuated unless passive."""
     S = JointType.SPHERICAL
     joints = zip(
         parameters.base_joints, parameters.platform_joints, parameters.offsets, strict=True
@@ -479,12 +476,12 @@ def mean_length(legs: Sequence[Leg], pose: Array) -> float:
 
 
 def frame_point(legs: Sequence[Leg], frame_legs: Sequence[int], leg: int) -> Array:
-    """Return the point (3,) of a frame leg that is fixed to the platform which defines R_e [m].
+    """Return the point (3,) [m] at which a frame leg fixed to the platform defines R_e.
 
-    Nothing depends on where B lies on the line of such a leg. Frames need a point that every model
-    of one machine has in the same place: beyond the foot of the middle of the other two joints, by
-    half the distance of these, so that the three span a plane also where the line meets the
-    middle. Beside another leg of this kind it is the foot of the third joint.
+    Nothing depends on the position of B along such a leg. Frames need a point that all models of
+    one machine share: it is half the distance of the other two joints beyond the foot of their
+    middle, so that the three span a plane even if the line meets the middle. With another leg of
+    this kind it is the foot of the third joint.
     """
     u = legs[leg].platform_axis
     others = [legs[j].B for j in frame_legs if not legs[j].is_fixed_to_platform]
@@ -498,13 +495,13 @@ def frame_point(legs: Sequence[Leg], frame_legs: Sequence[int], leg: int) -> Arr
 def with_platform_points(
     legs: Sequence[Leg], frame_legs: Sequence[int], origin: Array | None = None
 ) -> tuple[Leg, ...]:
-    """Return legs with B where models put it on those that are fixed to the platform.
+    """Return legs with B at its conventional point on legs fixed to the platform.
 
-    Nothing depends on where B lies on the line of such a leg. A frame leg has it at its
-    :func:`frame_point`, another at the foot of the platform link's origin, *origin* (3,) in the
-    frame of the legs [m], if that is given.
+    Nothing depends on the position of B along such a leg. A frame leg has B at its
+    :func:`frame_point`, any other at the foot of the platform link origin, *origin* (3,) in the
+    frame of the legs [m], if given.
     """
-    found = []
+    moved = []
     for j, leg in enumerate(legs):
         point = frame_point(legs, frame_legs, j) if j in frame_legs else origin
         if leg.is_fixed_to_platform and leg.platform_axis is not None and point is not None:
@@ -520,8 +517,8 @@ def with_platform_points(
                     for c in leg.cylinders
                 ),
             )
-        found.append(leg)
-    return tuple(found)
+        moved.append(leg)
+    return tuple(moved)
 
 
 def radius_name(leg_name: str, part: str) -> str:

@@ -1,9 +1,8 @@
 """Loading a mechanism: files, tree, closures, legs and home, each checked before the next.
 
-A :class:`Source` is a URDF with the mechanism YAML that says which frames close (other formats are
-converted to that). Loops cut the links into rigid bodies, chains of joints between base and
-platform are classified as legs, and a closed pose is found; every check below names what is wrong
-with the file.
+A :class:`Source` is a URDF with a mechanism YAML that states the closures (other formats are
+converted). The links are grouped into rigid bodies, chains of joints between base and platform are
+classified as legs, and a closed pose is found; every check below names the mistake in the file.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -60,7 +59,7 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.occluders import occluders_of, visual_solids, with_covers
-from legcal.machine.origins import with_own_origins
+from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
@@ -73,19 +72,19 @@ from legcal.machine.topology import (
     check_bodies,
     check_plane,
     check_type,
+    distinct_joint,
     find_chains,
     normals_in_links,
     normals_of_closures,
-    own_joint,
     plane_of_motion,
     propose_block,
     propose_frame,
 )
 from legcal.machine.urdf import Urdf, UrdfJoint
 
-MAX_ORIGIN = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
-MAX_TURN = 4.0 * np.pi  # [rad] of an arm; limits beyond are most likely degrees
-_DEVIATION = {  # by [deg]
+MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
+MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
+_DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
     EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
     EquationKind.DIRECTION_1: "it turned {} deg in the platform to which it is fixed",
@@ -95,7 +94,7 @@ _DEVIATION = {  # by [deg]
 
 
 def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machine:
-    """Return the mechanism of a file, its legs found from geometry.
+    """Return the mechanism of a file, with its legs classified from geometry.
 
     Parameters
     ----------
@@ -103,14 +102,14 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
         A mechanism YAML, or a folder with ``robot.yaml``; a URDF with its YAML beside it (or in
         ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
     without : collection of str
-        Sliders of legs that are taken for passive although ``name_mot`` has them.
+        Sliders of legs that are treated as passive although ``name_mot`` lists them.
 
     Raises
     ------
     ModelError
         If a file is missing, malformed or contradicts itself; all problems of a file at once.
     OutOfClass
-        If the mechanism is not one that the method covers.
+        If the method does not support the mechanism.
     """
     source = read_source(model)
     if without:
@@ -120,33 +119,34 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
 
 
 def _load(source: Source) -> Machine:
-    """Return the mechanism of a source."""
     file, urdf = source.file, source.urdf
     _check_origins(urdf)
     _check_names(file, urdf, source.path)
-    # The closures: in one order, since sums depend on it.
+    # Closures in a fixed order, since sums depend on it.
     pairs = sorted(zip(file.closed_loop, file.type, strict=True))
-    closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
-    # Base, platform and legs, as the file has them or proposed; home from a drawing, if any.
+    closures = [
+        Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
+    ]
+    # Base, platform and legs, stated or proposed; home from a drawing, if any.
     block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
-    urdf, own = with_own_origins(source.urdf, closures, machine)
+    urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
     if urdf is not source.urdf:
-        machine = _assemble(replace(source, urdf=urdf), block, own)
-    # Home: a pose that closes.
+        machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
+    # A closed home.
     given = machine.home if block.home is not None else None
     if given is not None and source.is_drawn_open and not machine.actuators:
         _check_spread(machine)
-        with suppress(DidNotConverge):  # travels say more than where open loops happen to close
+        with suppress(DidNotConverge):  # travels are better evidence than the poses of open loops
             given = home_at_mid_travel(machine)
             machine = replace(machine, home=given)
             block = block.model_copy(update={"home": None})
     if given is None:
-        _check_spread(machine)  # before a home of kilometres is looked for
+        _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
             q = _stated_or_middle(machine, block.home_readings or {})
             given = home_at_mid_travel(machine, q)
@@ -167,7 +167,7 @@ def _load(source: Source) -> Machine:
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)
     _check_unit(machine)
-    # What the geometry says must be what Pinocchio finds.
+    # The geometry must agree with Pinocchio.
     _check_across(machine)
     configurations = generic_configurations(machine, CONFIGURATIONS)
     machine = replace(machine, mobility=mobility(machine, configurations))
@@ -176,12 +176,12 @@ def _load(source: Source) -> Machine:
     _check_dependence(machine)
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = mechanism_notes(machine, home_is_given=block.home is not None)
-    return replace(machine, diagnostics=(*source.notes, *proposed, *found))
+    notes = mechanism_notes(machine, home_is_given=block.home is not None)
+    return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
-    """Return the mechanism, its chain not closed yet."""
+    """Return the mechanism, with its chain still open."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
     check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
@@ -253,9 +253,11 @@ def _closed_chain(
     block: LegcalBlock,
     chains: Sequence[LegChain],
 ) -> ClosedChain:
-    """Return the tree with its closures, and actuators with their gains."""
-    known = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
-    gains = {str(c.motor): known.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
+    """Return the tree with its closures and the gains of actuators."""
+    stated_gains = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {
+        str(c.motor): stated_gains.get(str(c.motor), 1.0) for c in chains if c.actuator is not None
+    }
     try:
         normals = normals_of_closures(in_plane, closures, block, urdf)
         return ClosedChain(urdf.text, closures, normals, gains)
@@ -266,18 +268,18 @@ def _closed_chain(
 def _actuators(
     chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
 ) -> dict[str | None, Actuator | None]:
-    """Return the actuators by their joints, with what the YAML says of them beside the URDF.
+    """Return the actuators by joint, with their numbers from the YAML.
 
     Raises
     ------
     ModelError
-        With one sentence for each motor of which it says what cannot be.
+        With one sentence for each motor with impossible numbers.
     """
     stated = {
         chain.motor: actuator_of(
             chain, T_body_base, _travel(chain, urdf), urdf.joints[str(chain.motor)].child
         )
-        for chain in reversed(chains)  # its point is where the first leg has it
+        for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
     problems = []
@@ -285,13 +287,13 @@ def _actuators(
         actuator, place = stated.get(name), f"legcal.motors.{name}"
         wrong = Problem(f"{place} could not be used", file=str(path), name=place)
         if actuator is None:
-            known = sorted(str(motor) for motor in stated)
+            motors = sorted(str(motor) for motor in stated)
             problems.append(
                 replace(
                     wrong,
                     found="no motor of that name that carries rods",
-                    needed=f"one of {', '.join(known) or 'them in the model'}",
-                    remedy=closest(name, known or ["none"]),
+                    needed=f"one of {', '.join(motors) or 'them in the model'}",
+                    remedy=closest(name, motors or ["none"]),
                 )
             )
             continue
@@ -307,7 +309,7 @@ def _actuators(
 
 
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
-    """Return the limits of a leg's slider or actuator [m or rad], zero for a rod."""
+    """Return the limits of the slider or actuator of a leg [m or rad], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
     return (0.0, 0.0) if limits is None else limits
 
@@ -324,22 +326,22 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
 
 def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
     """Refuse readings at home of joints that are no actuators."""
-    known = sorted(actuator.joint for actuator in machine.actuators)
+    joints = sorted(actuator.joint for actuator in machine.actuators)
     for name in given:
-        if name not in known:
+        if name not in joints:
             raise ModelError(
                 Problem(
                     f"legcal.home_readings.{name} could not be used",
                     "no actuator of that name",
-                    f"one of {', '.join(known)}",
-                    closest(name, known),
+                    f"one of {', '.join(joints)}",
+                    closest(name, joints),
                     str(machine.yaml_path),
                 )
             )
 
 
 def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
-    """Return the readings of legs at a home that is looked for: as *given*, else mid-travel."""
+    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
     _check_home_readings(machine, given)
     return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
 
@@ -347,15 +349,15 @@ def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[floa
 def _readings_at_home(
     machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
 ) -> list[float]:
-    """Return the joint values at home: as *given* for actuators, else the one inside the travel.
+    """Return the joint values at home: as *given* for actuators, else those within the travel.
 
-    Where both are, it is the one that the file has *drawn*.
+    If both are within the travel, the one *drawn* in the file is taken.
 
     Raises
     ------
     ModelError
-        If both readings at which a rod reaches the platform at home are inside the travel, or a
-        reading is given of a joint that is no actuator.
+        If both readings at which a rod reaches the platform at home are within the travel, or a
+        reading is given for a joint that is not an actuator.
     """
     path = machine.yaml_path
     _check_home_readings(machine, given)
@@ -364,12 +366,12 @@ def _readings_at_home(
     for j, leg in enumerate(machine.legs):
         if leg.actuator is None:
             continue
-        both = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
         size, unit = SHOWN_IN[leg.reading_unit]
-        said = f"the readings {size * both[0]:.1f} and {size * both[1]:.1f} {unit}"
+        choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         if leg.actuator.joint in given:
             wanted = given[leg.actuator.joint]
-            q[j] = min(both, key=lambda x: abs(x - wanted))
+            q[j] = min(readings, key=lambda x: abs(x - wanted))
             if not leg.in_travel(np.array([wanted]))[0]:
                 degrees = ", in radians" if leg.reads_angle else ""
                 raise ModelError(
@@ -377,22 +379,22 @@ def _readings_at_home(
                         f"legcal.home_readings.{leg.actuator.joint} could not be used",
                         f"{wanted:g} {leg.reading_unit}, outside the travel of "
                         f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                        f"the one of {said} that is that of home",
+                        f"the one of {choices} at home",
                         f"correct it{degrees}",
                         str(path),
                     )
                 )
             continue
-        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in both]
+        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
         scale = 1e-6 * float(np.ptp(leg.travel))
         if all(inside) and leg.actuator.joint in drawn:
-            q[j] = min(both, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
+            q[j] = min(readings, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
             continue
-        if all(inside) and abs(both[0] - both[1]) > scale:
+        if all(inside) and abs(readings[0] - readings[1]) > scale:
             raise ModelError(
                 Problem(
                     f"the assembly of leg '{leg.name}' at home is ambiguous",
-                    f"that its rod reaches the platform at {said} of '{leg.actuator.joint}', "
+                    f"that its rod reaches the platform at {choices} of '{leg.actuator.joint}', "
                     "both inside its travel",
                     "one",
                     f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
@@ -400,7 +402,11 @@ def _readings_at_home(
                 )
             )
         middle = 0.5 * sum(leg.travel)
-        q[j] = both[inside.index(True)] if any(inside) else min(both, key=lambda x: abs(x - middle))
+        q[j] = (
+            readings[inside.index(True)]
+            if any(inside)
+            else min(readings, key=lambda x: abs(x - middle))
+        )
     return q
 
 
@@ -412,13 +418,13 @@ def _legs_in_order(
     Raises
     ------
     ModelError
-        If a name means no leg, or two mean the same, or a leg has none.
+        If a name belongs to no leg, two names to the same leg, or a leg has no name.
     """
     problems, ordered = [], list[LegChain]()
     owner: dict[int, str] = {}
     for name, joint in block.legs.items():
-        found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
-        if not found:
+        matches = [c for c in chains if _is_on(joint, c, bodies, urdf)]
+        if not matches:
             problems.append(
                 Problem(
                     f"legcal.legs.{name} could not be used",
@@ -428,23 +434,23 @@ def _legs_in_order(
                     str(path),
                 )
             )
-        elif id(found[0]) in owner:
+        elif id(matches[0]) in owner:
             problems.append(
                 Problem(
                     f"legcal.legs.{name} could not be used",
-                    f"'{joint}' on the leg that is already named '{owner[id(found[0])]}'",
+                    f"'{joint}' on the leg that is already named '{owner[id(matches[0])]}'",
                     "a leg of its own",
                     "correct it",
                     str(path),
                 )
             )
         else:
-            owner[id(found[0])] = name
-            ordered.append(found[0])
+            owner[id(matches[0])] = name
+            ordered.append(matches[0])
     problems += [
         Problem(
             "legcal.legs is incomplete",
-            f"no name for the leg with joint '{own_joint(chain)}'",
+            f"no name for the leg with joint '{distinct_joint(chain)}'",
             "every leg",
             "add a line for it",
             str(path),
@@ -458,7 +464,6 @@ def _legs_in_order(
 
 
 def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
-    """Say whether a joint belongs to a leg."""
     if any(step.connection.joint == joint for step in chain.steps):
         return True
     entry = urdf.joints[joint]
@@ -466,7 +471,7 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
 
 
 def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that the URDF has every link and joint that the YAML names.
+    """Check that all links and joints named in the YAML are in the URDF.
 
     Raises
     ------
@@ -494,24 +499,24 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     problems = [
         Problem(
             f"{place} could not be used",
-            f"the {what} '{name}', which is not in {urdf.path.name}",
+            f"the {kind} '{name}', which is not in {urdf.path.name}",
             "",
-            closest(name, sorted(known)),
+            closest(name, sorted(candidates)),
             str(path),
         )
-        for place, name, what, known in named
-        if name not in known
+        for place, name, kind, candidates in named
+        if name not in candidates
     ]
     problems += [
         Problem(
             f"closed_loop.{i} could not be used",
-            f"'{one}' twice",
+            f"'{frame_1}' twice",
             "two frames",
             "correct one of them",
             str(path),
         )
-        for i, (one, two) in enumerate(file.closed_loop)
-        if one == two
+        for i, (frame_1, frame_2) in enumerate(file.closed_loop)
+        if frame_1 == frame_2
     ]
     problems += _frames_of_neighbours(file, urdf, path)
     if block is not None and block.base == block.platform:
@@ -529,9 +534,9 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
 
 
 def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[Problem]:
-    """Say where a closure names the frame of another one, and its own is left over.
+    """Return the problems of closures that name the frame of a neighbour instead of their own.
 
-    Legs that meet in a point may share a frame: then no similar name beside it is unused.
+    Legs that meet in a point may share a frame: then no similar frame beside it is unused.
     """
     places: dict[str, list[int]] = {}
     for i, pair in enumerate(file.closed_loop):
@@ -569,30 +574,30 @@ def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[P
 
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check how many legs there are and, in a plane, that they are of those that the class has.
+    """Check the number of legs and, in a plane, that their type is supported.
 
     Raises
     ------
     OutOfClass
-        If there are fewer, or more than MAX_LEGS, or a leg of a planar mechanism is fixed to
-        the platform or hangs on an actuator.
+        If there are too few, or more than MAX_LEGS, or a leg of a planar mechanism is fixed to the
+        platform or carried by an actuator.
     """
     n_d = n_frame_legs(spatial=spatial)
     if len(chains) < n_d:
         where = "in space" if spatial else "in a plane"
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {where}",
                 f"at least {n_d}, whose joints define the frames of base and platform",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
     if len(chains) > MAX_LEGS:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{len(chains)} legs",
                 f"at most {MAX_LEGS}, since the work grows with their cube",
                 "leave out passive legs",
@@ -603,20 +608,20 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
     if fixed and not spatial:
         raise OutOfClass(
             Problem(
-                f"the leg of joint '{any_joint(fixed[0])}' is outside the method",
+                f"the leg of joint '{any_joint(fixed[0])}' is not supported",
                 "it fixed to the platform of a planar mechanism",
                 "a revolute joint there",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 "a planar machine whose joints at A move on carriages or arms",
                 "a machine in space, or sliders along the legs",
-                "this machine cannot be calibrated this way",
+                "this machine cannot be calibrated with legcal",
                 str(path),
             )
         )
@@ -658,19 +663,19 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
         elif kind != "prismatic" and motor not in moving:
             problems.append(
                 Problem(
-                    f"the motor '{motor}' is outside the method",
+                    f"the motor '{motor}' is not supported",
                     f"a {kind} joint in name_mot that does not stand between the base and an "
                     "arm with rods",
                     "sliders of legs, or joints on the base that carry the joints of rods",
                     "remove it from name_mot if it has no motor, otherwise this machine "
-                    "cannot be calibrated this way",
+                    "cannot be calibrated with legcal",
                     str(path),
                 )
             )
         elif motor not in moving:
             problems.append(
                 Problem(
-                    f"the motor '{motor}' is outside the method",
+                    f"the motor '{motor}' is not supported",
                     "it on no leg",
                     "the slider of a leg",
                     "remove it from name_mot",
@@ -682,7 +687,7 @@ def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, p
 
 
 def _beyond_turns(joint: UrdfJoint) -> bool:
-    """Say whether a joint turns further than any arm."""
+    """Return whether the limits of a joint exceed those of any arm."""
     return joint.limits is not None and max(map(abs, joint.limits)) > MAX_TURN
 
 
@@ -692,7 +697,7 @@ def _check_frames(machine: Machine) -> None:
     Raises
     ------
     ModelError
-        If they are too few or too many, coincide, or are collinear.
+        If they are too few or too many, coincident or collinear.
     """
     path, n_d = machine.yaml_path, n_frame_legs(spatial=machine.spatial)
     chosen = [machine.leg_names[j] for j in machine.frame_legs]
@@ -727,7 +732,7 @@ def _check_frames(machine: Machine) -> None:
 
 
 def _check_origins(urdf: Urdf) -> None:
-    """Check that no joint is so far out that rounding hides how joints lie to each other.
+    """Check that no joint is so far away that rounding hides the relative position of joints.
 
     Raises
     ------
@@ -749,7 +754,7 @@ def _check_origins(urdf: Urdf) -> None:
 
 
 def _check_spread(machine: Machine) -> None:
-    """Check that the joints are as near each other as metres put them, before home is looked for.
+    """Check that the joints are within metres of each other, before the search for home.
 
     Raises
     ------
@@ -774,13 +779,13 @@ def _check_spread(machine: Machine) -> None:
 
 
 def _check_unit(machine: Machine) -> None:
-    """Check that the legs are as long at home, and move as far, as those written in metres.
+    """Check that leg lengths at home and travels are plausible in metres.
 
     Raises
     ------
     ModelError
-        If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
-        cylinder along it is thicker than half of it or thinner than 2e-4 of it.
+        If a leg is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or the
+        radius of a cylinder along it is more than half or less than 2e-4 of its length.
     """
     lengths = np.linalg.norm(vectors_A_to_B(machine, machine.home), axis=1)
     fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
@@ -826,15 +831,15 @@ def _check_unit(machine: Machine) -> None:
 
 
 def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
-    """Check that constraints which follow from others follow exactly; *closes*: at home they do.
+    """Check that dependent constraints are dependent exactly; *closes*: the machine closes at home.
 
     Raises
     ------
     OutOfClass
-        If some nearly do: the machine then lacks the mobility that it is meant to have.
+        If some are nearly dependent: the machine then lacks its intended mobility.
     """
     nearly = n_nearly_dependent(machine)
-    # At a home that alone is special, constraints depend exactly and around it nearly.
+    # If home is a special pose, constraints are dependent there exactly and around it nearly.
     if nearly > (n_dependent_at_home(machine) if closes else 0):
         n = n_pose_constraints(machine.legs)
         raise OutOfClass(
@@ -842,21 +847,21 @@ def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
                 f"the mechanism '{machine.name}' could not be used",
                 f"that {nearly} of the {n} constraints of its joints follow from the "
                 "others to 1 mrad but not exactly",
-                "an overconstrained machine to have its mobility exactly",
-                "write axes that are parallel, perpendicular or meet with all digits (12 "
-                "decimals or more)",
+                "exactly dependent constraints in an overconstrained machine",
+                "write parallel, perpendicular or intersecting axes with all digits (12 decimals "
+                "or more)",
                 str(machine.yaml_path),
             )
         )
 
 
 def _check_ties(machine: Machine) -> None:
-    """Check that an overconstrained machine with small errors can have its mobility.
+    """Check that an overconstrained machine keeps its mobility with small errors.
 
     Raises
     ------
     OutOfClass
-        If errors that its constraints allow one by one destroy it together.
+        If errors that are allowed one by one destroy the mobility together.
     """
     ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
     if machine.actuators and n_dependent_at_home(machine):
@@ -866,17 +871,16 @@ def _check_ties(machine: Machine) -> None:
         remedy = "give its rods spherical joints"
         if joints == {JointType.SPHERICAL}:
             remedy = (
-                "leave out rods that hold nothing new (between the same joints as another, a third "
-                "one on a motor, those of a fourth arm), otherwise this machine cannot be "
-                "calibrated this way"
+                "leave out redundant rods (between the same joints as another, a third one on a "
+                "motor, those of a fourth arm), otherwise this machine cannot be calibrated with "
+                "legcal"
             )
         raise OutOfClass(
             Problem(
-                f"the mechanism '{machine.name}' is outside the method",
-                f"it overconstrained ({n_dependent_at_home(machine)} of the {n} "
-                "constraints of its joints follow from the others) with joints at A that "
-                "move",
-                "none that follow",
+                f"the mechanism '{machine.name}' is not supported",
+                f"an overconstrained machine ({n_dependent_at_home(machine)} of the {n} "
+                "constraints of its joints follow from the others) with moving joints at A",
+                "independent constraints",
                 remedy,
                 str(machine.yaml_path),
             )
@@ -884,11 +888,11 @@ def _check_ties(machine: Machine) -> None:
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(
             Problem(
-                f"the mechanism '{machine.name}' is outside the method",
-                f"it overconstrained ({ties.n_dependent} of the {n} constraints of its "
-                "joints follow from the others) and no errors of its parameters near the "
-                f"model with which it keeps its mobility {machine.mobility}",
-                "parameters that can be tied so",
+                f"the mechanism '{machine.name}' is not supported",
+                f"an overconstrained machine ({ties.n_dependent} of the {n} constraints of its "
+                f"joints follow from the others) that loses its mobility {machine.mobility} with "
+                "small errors of its parameters, however they are tied",
+                "parameters with errors that keep the mobility",
                 "give a leg another joint, or leave out a leg without a motor",
                 str(machine.yaml_path),
             )
@@ -896,12 +900,12 @@ def _check_ties(machine: Machine) -> None:
 
 
 def _check_across(machine: Machine) -> None:
-    """Check that the closures of a planar mechanism hold across its plane too.
+    """Check that the closures of a planar mechanism also hold across its plane.
 
     Raises
     ------
     OutOfClass
-        If one is further open than joints may be off, or turned by more than 1 mrad.
+        If a gap exceeds the tolerance of joints, or a rotation 1 mrad.
     """
     within = joint_tolerance((machine.A_base, machine.B_platform))
     row, residual = 0, machine.chain.residual(machine.home_configuration)
@@ -928,15 +932,15 @@ def _check_across(machine: Machine) -> None:
 def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
     """Check the equations of all legs against Pinocchio at closed configurations.
 
-    The closed configurations come from the URDF alone, the equations from the geometry that was
-    found: both must describe one machine. Origins and axes of a file are rounded, so the same
-    tolerances hold as for joints.
+    The closed configurations come from the URDF alone, the equations from the classified geometry:
+    both must describe the same machine. Origins and axes in files are rounded, so the tolerances of
+    joints apply.
 
     Raises
     ------
     OutOfClass
-        If a length is further off than joints may be, or an axis, a direction or a twist by more
-        than 1 mrad.
+        If the error of a length exceeds the tolerance of joints, or the error of an axis, a
+        direction or a twist 1 mrad.
     """
     poses = [machine.chain.placement(c, machine.base, machine.platform) for c in configurations]
     R, t = np.array([R for R, _ in poses]), np.array([t for _, t in poses])
@@ -958,7 +962,7 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
                     problems.setdefault(
                         name,
                         Problem(
-                            f"leg '{name}' is outside the method",
+                            f"leg '{name}' is not supported",
                             f"{problem} at a closed pose",
                             "",
                             "check the origins and axes along the leg",
@@ -970,7 +974,7 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
 
 
 def _broken_equation(kind: EquationKind, value: float, within: float) -> str | None:
-    """Return how an equation is broken, None if it is kept; lengths *within* so much [m]."""
+    """Return the violation of an equation in words, None if it holds; lengths *within* [m]."""
     if kind is EquationKind.LENGTH:
         if value <= within:
             return None

@@ -1,4 +1,4 @@
-"""Mesh files that the visuals of a URDF name."""
+"""Mesh files named in the visuals of a URDF."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from legcal.machine.urdf import number_list
 def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
     """Return the corners (n, 3) in the link [m] and the triangles (m, 3) of a mesh file.
 
-    They are of the scene that yourdfpy makes of it. ValueError says what was found and needed where
-    the file holds none.
+    They come from the scene of yourdfpy. Raises ValueError if the file holds no mesh.
     """
-    from yourdfpy import URDF  # half a second: only where there is a mesh
+    from yourdfpy import URDF  # half a second: imported only for meshes
 
     name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
@@ -43,7 +42,7 @@ def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]
 
 
 def _alone(visual: etree._Element) -> bytes:
-    """Return a URDF of one link with the shape and the place of a visual, and nothing else."""
+    """Return a URDF of one link with the shape and the pose of a visual, and nothing else."""
     robot = etree.Element("robot", {"name": "visual"})
     shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
     origin = visual.find("origin")
@@ -59,7 +58,7 @@ def _alone(visual: etree._Element) -> bytes:
 
 
 def mesh_file(urdf_path: Path, name: str) -> Path | None:
-    """Return the file that a URDF names: as it stands, or from a folder above the URDF."""
+    """Return the path of a file named in a URDF: as stated, or relative to a folder above it."""
     if not name.strip() or "\0" in name:
         return None
     plain = Path(name.split("://", 1)[-1])

@@ -1,9 +1,9 @@
-"""A mechanism as MuJoCo's MJCF writes it: bodies with joints, closed by equality constraints.
+"""A mechanism in the MJCF of MuJoCo: bodies with joints, closed by equality constraints.
 
-``<connect>`` makes a ``3d`` closure and ``<weld>`` a ``6d`` one; motors are the joints of actuators
-and the slides of ``<jointpos>`` sensors. What only a simulation needs is left alone: cameras,
-lights, inertias, plugins, adhesion, and geoms other than cylinders and capsules. An element of a
-body, a constraint or a geom type that MJCF does not have is refused, since it may be misspelt.
+``<connect>`` gives a ``3d`` closure and ``<weld>`` a ``6d`` one; motors are the joints of actuators
+and the slides of ``<jointpos>`` sensors. Elements for simulation only are ignored: cameras, lights,
+inertias, plugins, adhesion, and geoms other than cylinders and capsules. An unknown element of a
+body, constraint or geom type is refused, since it may be misspelt.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 Attributes = Mapping[str, str]
-Defaults = dict[str, dict[str, str]]  # attributes by element
+Defaults = dict[str, dict[str, str]]  # attributes of each element
 LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
 class BodyElement(NamedTuple):
-    """An element of a body: the body, the frame it is written in, its default class."""
+    """An element of a body, with its body, the frame around it, and its default class."""
 
     element: etree._Element
     body: str
@@ -113,20 +113,20 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
 
 
 class MjcfReader:
-    """One MJCF file: its elements after defaults, and the tree that its bodies make.
+    """One MJCF file: its elements with defaults applied, and the tree of its bodies.
 
-    Problems are noted, to be raised together. The configuration of the file, where all joints are
-    at their ``ref``, closes its loops.
+    Problems are collected and raised together. The loops are closed in the configuration of the
+    file, with all joints at their ``ref``.
     """
 
     def __init__(self, root: etree._Element, problems: Problems) -> None:
         self.root, self.problems = root, problems
         self.tree = UrdfBuilder()
-        self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # of every body in the world
-        self.references: dict[str, float] = {}  # the values of joints in the file [rad] or [m]
-        self._joints: dict[str, str] = {}  # the type of every joint
+        self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # pose of every body in the world
+        self.references: dict[str, float] = {}  # values of joints in the file [rad] or [m]
+        self._joints: dict[str, str] = {}  # type of every joint
         self.sites: dict[str, LinkFrame] = {}
-        self._names: set[str] = set()  # that no new link or joint may have
+        self._names: set[str] = set()  # taken names of links and joints
         named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
         self._driven = frozenset(str(element.get("joint")) for element in named)
         self._defaults: dict[str, Defaults] = {"main": {}}
@@ -161,7 +161,7 @@ class MjcfReader:
     def _contents(
         self, body: BodyElement
     ) -> tuple[list[BodyElement], list[BodyElement], list[TextCylinder]]:
-        """Return joints, bodies and cylinders of a body, also in its frames; note its sites."""
+        """Return joints, bodies and cylinders of a body and its frames; register its sites."""
         joints, bodies, cylinders = list[BodyElement](), list[BodyElement](), list[TextCylinder]()
         pending = [body._replace(element=part) for part in body.element]
         while pending:
@@ -185,7 +185,7 @@ class MjcfReader:
         return joints, bodies, cylinders
 
     def _body(self, part: BodyElement) -> list[BodyElement]:
-        """Write a body with its joints, and return the bodies on it."""
+        """Write a body with its joints, and return its child bodies."""
         element = part.element
         name = element.get("name", "")
         if name in self.poses:
@@ -211,7 +211,7 @@ class MjcfReader:
         return bodies
 
     def _is_free(self, joints: list[BodyElement]) -> bool:
-        """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
+        """Return whether the joints of a body are passive and leave it all six freedoms."""
         axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
         for part in joints:
             attributes = self._attributes(part)
@@ -227,7 +227,7 @@ class MjcfReader:
     def _joint(
         self, part: BodyElement, at: str, T_at_body: RigidTransform, *, last: bool, only: bool
     ) -> LinkFrame:
-        """Write one joint of a body; return the link after it and the body's frame in that link."""
+        """Write one joint of a body; return the link after it and the body frame in that link."""
         element, attributes = part.element, self._attributes(part)
         kind = "free" if element.tag == "freejoint" else attributes.get("type", "hinge")
         name = attributes.get("name", "")
@@ -266,7 +266,7 @@ class MjcfReader:
         return child, EYE if child == part.body else T_body_joint.inv()
 
     def _ball(self, name: str, at: str, child: str, T_at_joint: RigidTransform) -> None:
-        """Write a ball joint as three revolutes, perpendicular in the file's configuration."""
+        """Write a ball joint as three revolutes, perpendicular in the configuration of the file."""
         for axis, letter in zip(np.eye(3), "xyz", strict=True):
             after = child if letter == "z" else self._unused(f"{name}_{letter}_link")
             if after != child:
@@ -284,7 +284,7 @@ class MjcfReader:
         links: tuple[str, str],
         T_at_joint: RigidTransform,
     ) -> None:
-        """Write a hinge or a slide, its zero where the value of the file is."""
+        """Write a hinge or a slide, with its zero at the value in the file."""
         element = part.element
         given = self._numbers(element, attributes, "axis", (3,))
         axis = np.array(_Z) if given is None else given
@@ -309,7 +309,7 @@ class MjcfReader:
         self.tree.joint(name, urdf_type, *links, T_at_joint * to_zero, axis, limits)
 
     def _range(self, element: etree._Element, attributes: Attributes) -> tuple[float, float] | None:
-        """Return the limits of a joint as the file writes them, or None."""
+        """Return the limits of a joint, or None."""
         numbers = self._numbers(element, attributes, "range", (2,))
         limited = attributes.get("limited", "auto")
         if numbers is None or limited == "false" or not numbers.any():
@@ -325,7 +325,7 @@ class MjcfReader:
         return lower, upper
 
     def _cylinder(self, part: BodyElement) -> TextCylinder | None:
-        """Return the cylinder of a geom that is a cylinder or a capsule, else None."""
+        """Return the cylinder of a geom of type cylinder or capsule, else None."""
         element, attributes = part.element, self._attributes(part)
         kind = attributes.get("type", "sphere")
         if kind not in _GEOMS:
@@ -349,7 +349,7 @@ class MjcfReader:
         return TextCylinder(part.T_body_frame * T, float(size[0]), length)
 
     def _site(self, part: BodyElement) -> None:
-        """Note a site by its name."""
+        """Register a site by name."""
         element, name = part.element, str(part.element.get("name"))
         if name in self.sites:
             self.problems.add(
@@ -374,15 +374,15 @@ class MjcfReader:
         return RigidTransform.from_components(middle, turn), float(np.linalg.norm(along))
 
     def _unused(self, name: str) -> str:
-        """Return a name that nothing in the file has, and take it."""
-        found = self.tree.unused(name, self._names)
-        self._names.add(found)
-        return found
+        """Return an unused name, and take it."""
+        unused = self.tree.unused(name, self._names)
+        self._names.add(unused)
+        return unused
 
     # Closures and motors
 
     def loops(self) -> Iterator[Loop]:
-        """Give the loops of all ``<equality>`` elements."""
+        """Yield the loops of all ``<equality>`` elements."""
         names: set[str] = set()
         for i, element in enumerate(self.root.iterfind("equality/*"), start=1):
             name_of_class = element.get("class", "main")
@@ -391,11 +391,11 @@ class MjcfReader:
             if attributes.get("active", "true") == "false":
                 continue
             if element.tag not in ("connect", "weld"):
-                found = "is no constraint that legcal knows"
+                reason = "is no constraint that legcal knows"
                 if element.tag in _COUPLINGS:
-                    found = f"couples <{element.tag}> coordinates, which is not followed"
+                    reason = f"couples <{element.tag}> coordinates, which is not followed"
                 remedy = "close loops with <connect> and <weld> alone"
-                self.problems.add(element, found, remedy)
+                self.problems.add(element, reason, remedy)
                 continue
             name = str(attributes.get("name") or f"{element.tag}{i}")
             if name in names:
@@ -420,18 +420,18 @@ class MjcfReader:
             yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
-        """Return the two sites that a constraint holds together."""
-        found = []
+        """Return the two sites of a constraint."""
+        sites = []
         for key in ("site1", "site2"):
             name = element.get(key, "")
             if name in self.sites:
-                found.append(self.sites[name])
+                sites.append(self.sites[name])
             else:
                 self._unknown(element, f"the site '{name}' as {key}", name, self.sites)
-        return (found[0], found[1]) if len(found) == 2 else None
+        return (sites[0], sites[1]) if len(sites) == 2 else None
 
     def _joined_bodies(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
-        """Return the frames on two bodies that a constraint holds together."""
+        """Return the frames on the two bodies of a constraint."""
         names = [element.get("body1", ""), element.get("body2", WORLD)]
         for key, name in zip(("body1", "body2"), names, strict=True):
             if not name:
@@ -444,23 +444,23 @@ class MjcfReader:
             self.problems.add(element, "has no anchor", "write the point in the frame of body1")
         if any(name not in self.poses for name in names):
             return None
-        T_one_two = self.poses[names[0]].inv() * self.poses[names[1]]
+        T_body1_body2 = self.poses[names[0]].inv() * self.poses[names[1]]
         at = np.zeros(3) if anchor is None else anchor
-        if element.tag == "connect":  # the anchor stands in body1
-            T_one = RigidTransform.from_translation(at)
-            T_two = RigidTransform.from_translation(T_one_two.inv().apply(at))
-            return (names[0], T_one), (names[1], T_two)
+        if element.tag == "connect":  # the anchor is in body1
+            T_body1 = RigidTransform.from_translation(at)
+            T_body2 = RigidTransform.from_translation(T_body1_body2.inv().apply(at))
+            return (names[0], T_body1), (names[1], T_body2)
         relpose = self._numbers(element, attributes, "relpose", (7,))
-        T_two = RigidTransform.from_translation(at)  # the anchor of a weld stands in body2
-        if relpose is not None and relpose[3:].any():  # MuJoCo brings the anchor to this very place
+        T_body2 = RigidTransform.from_translation(at)  # the anchor of a weld is in body2
+        if relpose is not None and relpose[3:].any():  # MuJoCo moves the anchor to this point
             rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
-            T_one = RigidTransform.from_components(relpose[:3], rotation)
-        else:  # the configuration of the file holds
-            T_one = T_one_two * T_two
-        return (names[0], T_one), (names[1], T_two)
+            T_body1 = RigidTransform.from_components(relpose[:3], rotation)
+        else:  # as in the configuration of the file
+            T_body1 = T_body1_body2 * T_body2
+        return (names[0], T_body1), (names[1], T_body2)
 
     def motors(self) -> list[str]:
-        """Return the joints that have an encoder: driven ones, and slides that are measured."""
+        """Return the joints with an encoder: driven joints, and measured slides."""
         motors: dict[str, None] = {}
         named = (*self.root.iterfind("actuator/*"), *self.root.iterfind("sensor/jointpos"))
         for element in named:
@@ -493,25 +493,25 @@ class MjcfReader:
         return list(motors)
 
     def _unknown(
-        self, element: etree._Element, what: str, name: str, known: Mapping[str, object]
+        self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
     ) -> None:
-        """Note that an element names something that is not in the file."""
-        remedy = closest(name, known).rstrip(".")
-        self.problems.add(element, f"names {what}, which is not in the file", remedy)
+        """Add the problem of an unknown name in an element."""
+        remedy = closest(name, candidates).rstrip(".")
+        self.problems.add(element, f"names {reference}, which is not in the file", remedy)
 
     # Attributes, with defaults and compiler options
 
     def _attributes(self, part: BodyElement) -> dict[str, str]:
-        """Return the attributes of an element over those of its default class."""
-        own = _attributes_of(part.element)
-        classes = self._default(part.element, own.get("class", part.childclass))
+        """Return the attributes of an element, on top of its default class."""
+        stated = _attributes_of(part.element)
+        classes = self._default(part.element, stated.get("class", part.childclass))
         default = classes.get(str(part.element.tag), {})
-        if not ORIENTATIONS.keys().isdisjoint(own):
+        if not ORIENTATIONS.keys().isdisjoint(stated):
             default = {k: v for k, v in default.items() if k not in ORIENTATIONS}
-        return {**default, **own}
+        return {**default, **stated}
 
     def _default(self, element: etree._Element, name: str) -> Defaults:
-        """Return a default class; the main one, with a problem, if it is not there."""
+        """Return a default class; the main class, and a problem, if it does not exist."""
         if name not in self._defaults:
             self.problems.add(
                 element,
@@ -522,20 +522,20 @@ class MjcfReader:
         return self._defaults[name]
 
     def _childclass(self, part: BodyElement) -> str:
-        """Return the default class that holds within a body or frame."""
+        """Return the default class inside a body or frame."""
         name = part.element.get("childclass", part.childclass)
-        known = self._default(part.element, name) is self._defaults.get(name)
-        return name if known else part.childclass
+        is_defined = self._default(part.element, name) is self._defaults.get(name)
+        return name if is_defined else part.childclass
 
     def _numbers(
         self, element: etree._Element, attributes: Attributes, key: str, counts: tuple[int, ...]
     ) -> Array | None:
-        """Return the numbers of an attribute; None where it is missing or wrong."""
+        """Return the numbers of an attribute; None if missing or wrong."""
         text = attributes.get(key)
         if text is None:
             return None
-        found = number_list(text, len(text.split()))
-        if found is None or len(found) not in counts:
+        numbers = number_list(text, len(text.split()))
+        if numbers is None or len(numbers) not in counts:
             wanted = " or ".join(map(str, counts))
             self.problems.add(
                 element,
@@ -543,7 +543,7 @@ class MjcfReader:
                 "correct the value",
             )
             return None
-        return np.array(found)
+        return np.array(numbers)
 
     def _pose(self, element: etree._Element, attributes: Attributes) -> RigidTransform:
         """Return the motion of ``pos`` and an orientation."""
@@ -572,8 +572,8 @@ class MjcfReader:
         return Rotation.identity() if rotation is None else rotation
 
     def _rotation(self, key: str, numbers: Array) -> Rotation | None:
-        """Return the rotation of one way to write it, or None where it means none."""
-        if key == "euler":  # about the moved axes for small letters, the fixed ones for capitals
+        """Return the rotation of an orientation attribute, None if it is degenerate."""
+        if key == "euler":  # about moved axes for small letters, fixed axes for capitals
             rotation = Rotation.identity()
             for letter, angle in zip(self._eulerseq, numbers, strict=True):
                 turn = Rotation.from_euler(letter.lower(), self._radians(float(angle)))
@@ -602,11 +602,11 @@ class MjcfReader:
         here = {tag: dict(values) for tag, values in inherited.items()}
         for part in element:
             if part.tag != "default":
-                values, own = here.setdefault(str(part.tag), {}), _attributes_of(part)
-                if not ORIENTATIONS.keys().isdisjoint(own):
+                values, attributes = here.setdefault(str(part.tag), {}), _attributes_of(part)
+                if not ORIENTATIONS.keys().isdisjoint(attributes):
                     for key in ORIENTATIONS:
                         values.pop(key, None)
-                values.update(own)
+                values.update(attributes)
         if name == "main":
             here = {**self._defaults["main"], **here}
             name = element.get("class", "main")
@@ -624,7 +624,7 @@ class MjcfReader:
                 self._read_defaults(part, inner, here)
 
     def _read_compiler(self, element: etree._Element) -> None:
-        """Read the options of a ``<compiler>`` that matter for kinematics; later ones win."""
+        """Read the ``<compiler>`` options that affect kinematics; later ones win."""
         for key, allowed in (
             ("angle", ("degree", "radian")),
             ("coordinate", ("local",)),
@@ -653,19 +653,19 @@ class MjcfReader:
 
 
 def _attributes_of(element: etree._Element) -> dict[str, str]:
-    """Return the attributes that an element has itself."""
+    """Return the attributes of an element itself."""
     return {str(key): str(value) for key, value in element.attrib.items()}
 
 
 def _span_space(axes: list[Array]) -> bool:
-    """Say whether there are three axes, independent of each other."""
+    """Return whether there are three linearly independent axes."""
     return len(axes) == 3 and int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) == 3
 
 
 def _without_loose_bodies(
     urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
-    """Return the tree without free bodies that no closure touches, and their names."""
+    """Return the tree without free bodies outside all closures, and the names of these."""
     loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
     if not loose:
         return urdf, []
@@ -690,5 +690,5 @@ def _without_loose_bodies(
 
 
 def _z_onto(direction: Array) -> Rotation:
-    """Return the shortest rotation that takes z onto a direction of any length."""
+    """Return the shortest rotation of z onto a direction of any length."""
     return rotation_between(np.array([0.0, 0.0, 1.0]), direction / np.linalg.norm(direction))

@@ -1,8 +1,8 @@
-"""How the closed machine can move: mobility, free motions of its joints, and singularities.
+"""Mobility of the closed machine, free motions of its joints, and singularities.
 
-The closures leave a null space of joint rates; the mobility is the rank of the twist that it gives
-the platform. What is left of the null space moves no platform: legs with an S joint at both ends
-spin about themselves. Dependent closures (a planar machine welded in space) do not change it.
+The closures leave a null space of joint rates; the mobility is the rank of the resulting twists of
+the platform. The rest of the null space does not move the platform: legs with an S joint at both
+ends spin about themselves. Dependent closures (a planar machine welded in space) do not change it.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ from legcal.machine.model import (
 )
 from legcal.machine.solver import solve
 
-CLOSED = 2.5e-12  # mean leg lengths, and [rad] for frames
-RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
-STEP = 0.05  # [rad], and of a leg length
+CLOSED = 2.5e-12  # residual of a closed chain [mean leg lengths, rad]
+RANK_TOLERANCE = 1e-7  # relative to the largest singular value, with lengths in leg lengths
+STEP = 0.05  # step to a generic configuration [rad], and relative to the leg length
 CONFIGURATIONS = 3
-MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
+MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that excludes a singularity between J0 and J1
 
 
 def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
@@ -35,25 +35,25 @@ def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
 
 
 def mobility(machine: Machine, configurations: Sequence[Array]) -> int:
-    """Return the freedoms of the platform.
+    """Return the number of freedoms of the platform.
 
-    The rank is taken where the closures have their largest among closed configurations, of which
-    some should be near home only, because a symmetric pose may be singular.
+    It is evaluated at the configuration where the closures have the largest rank. Some of the
+    configurations should only be near home, because a symmetric home may be singular.
     """
     return min(freedoms_at(machine, c) for c in configurations)[1]
 
 
 def freedoms_at(machine: Machine, configuration: Array) -> tuple[int, int]:
-    """Return the freedoms of all joints and of the platform alone at a closed configuration."""
+    """Return the freedoms of all joints, and of the platform alone, at a closed configuration."""
     null_space = free_motions(machine, configuration)
     return null_space.shape[1], _moved(machine, null_space)
 
 
 def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
-    """Return how many freedoms of the platform the motors hold.
+    """Return the number of freedoms of the platform that the motors hold.
 
-    It is the mobility less the freedoms that are left where the motors stand, at that of the
-    configurations of :func:`mobility` where these are fewest.
+    It is the mobility minus the freedoms with fixed motors, at the configuration of
+    :func:`mobility` with the fewest.
     """
     _, sliders = slider_columns(machine, machine.motors)
     scale, left = machine.size, []
@@ -65,7 +65,7 @@ def motor_rank(machine: Machine, configurations: Sequence[Array]) -> int:
 
 
 def _moved(machine: Machine, motions: Array) -> int:
-    """Return the rank of the platform's twists by motions (nv, k) of the joints, as linearised."""
+    """Return the rank of platform twists by motions (nv, k) of the joints, at the linearisation."""
     scale = machine.size
     twist = machine.chain.twist(machine.base, machine.platform) @ motions
     twist[:3] /= scale
@@ -73,8 +73,8 @@ def _moved(machine: Machine, motions: Array) -> int:
 
 
 def generic_configurations(machine: Machine, count: int) -> list[Array]:
-    """Return home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
-    chain, found = machine.chain, [machine.home_configuration]
+    """Return home, then up to ``count - 1`` closed ones nearby in seeded directions."""
+    chain, configurations = machine.chain, [machine.home_configuration]
     rng = np.random.default_rng(1965)
     unit = _column_units(machine)
     jacobian = chain.linearize(machine.home_configuration)[1] * unit
@@ -88,19 +88,19 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
         step = STEP * unit * direction / size
         configuration = project(machine, chain.integrate(machine.home_configuration, step))
         if configuration is not None:
-            found.append(configuration)
-    return found
+            configurations.append(configuration)
+    return configurations
 
 
 def project(machine: Machine, configuration: Array) -> Array | None:
-    """Return the closed configuration nearest to one that is almost closed, None if none is."""
+    """Return the closed configuration nearest to an almost closed one, None if there is none."""
     chain, weights = machine.chain, _row_weights(machine)
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         return (weights * residual)[None], (weights[:, None] * jacobian)[None]
 
-    found = solve(
+    solution = solve(
         equations,
         lambda points, step: chain.integrate(points[0], step[0])[None],
         configuration[None],
@@ -108,13 +108,13 @@ def project(machine: Machine, configuration: Array) -> Array | None:
         unit=_column_units(machine),
         steps=15,
     )
-    return found.points[0] if found.worst[0] < CLOSED else None
+    return solution.points[0] if solution.worst[0] < CLOSED else None
 
 
 def free_motions(machine: Machine, configuration: Array) -> Array:
-    """Return a basis (nv, k) of the tangent steps that keep all loops closed, idle spins too.
+    """Return a basis (nv, k) of the tangent steps that keep all loops closed, with idle spins.
 
-    It is orthonormal with lengths in leg lengths.
+    It is orthonormal, with lengths in leg lengths.
     """
     units = _column_units(machine)
     jacobian = machine.chain.linearize(configuration)[1] * units
@@ -125,7 +125,7 @@ def free_motions(machine: Machine, configuration: Array) -> Array:
 
 
 def _row_weights(machine: Machine) -> Array:
-    """Return what makes gaps of closures comparable: leg lengths beside [rad]."""
+    """Return the weights of closure residuals: lengths in leg lengths beside [rad]."""
     weights, row = np.ones(machine.chain.n_rows), 0
     for closure in machine.chain.closures:
         weights[row : row + 3] = 1.0 / machine.size
@@ -134,7 +134,7 @@ def _row_weights(machine: Machine) -> Array:
 
 
 def _column_units(machine: Machine) -> Array:
-    """Return what turns tangent steps without a unit into [m] and [rad]."""
+    """Return the units of tangent steps: [m] and [rad] per dimensionless step."""
     units = np.full(machine.chain.nv, machine.size)
     units[machine.chain.rotation_columns()] = 1.0
     return units
@@ -143,10 +143,10 @@ def _column_units(machine: Machine) -> Array:
 def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
     """Return the smallest singular value of the dimensionless Jacobian of the legs' equations.
 
-    Rows are the lengths of actuated and constant legs and all other demands, counted at the end
-    of their leg; columns are a rotation about the mean of the platform joints and a displacement.
-    Lengths are measured in mean leg lengths at the pose, angles in radian, so that the number has
-    no unit and does not depend on the size of the machine or on the frames of its links.
+    Rows are the lengths of actuated and constant legs and all other constraints, as lengths at the
+    end of their leg; columns are a rotation about the mean of the platform joints and a
+    displacement. Lengths are in mean leg lengths at the pose and angles in radian, so that the
+    number is dimensionless and independent of the size of the machine and the frames of its links.
 
     Parameters
     ----------
@@ -158,14 +158,14 @@ def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
     Returns
     -------
     float
-        Zero at a singular pose, and wherever the motors do not determine the pose; of the order
-        of the platform's size in leg lengths at a good one.
+        Zero at a singular pose, and if the motors do not determine the pose; of the order of the
+        platform size in leg lengths at a good pose.
     """
     return float(singularities(mechanism, T_base_platform.as_matrix()[None])[0])
 
 
 def singularities(machine: Machine, poses: Array) -> Array:
-    """Return the same at poses (k, 3 or 4, 4), (k,)."""
+    """Return :func:`singularity` at poses (k, 3 or 4, 4), (k,)."""
     jacobian = dimensionless(machine, poses)
     if jacobian.shape[1] < 6:
         return np.zeros(len(poses))
@@ -179,7 +179,7 @@ def dimensionless(
 ) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
-    Poses are matrices T_base_platform (k, 3 or 4, 4). All motors count, or some.
+    Poses are matrices T_base_platform (k, 3 or 4, 4). *motors* limits the motors, all by default.
     """
     motors = list(machine.motors if motors is None else motors)
     R, t = poses[:, :3, :3], poses[:, :3, 3]
@@ -194,31 +194,33 @@ def dimensionless(
         jacobian = equations.by_pose[:, counts]
         gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
         return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
-    u = (vectors / lengths[..., None])[:, motors]  # lines alone; of rods one hangs on each
+    u = (vectors / lengths[..., None])[:, motors]  # plain lengths; one rod for each actuator
     return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
 
 
-def is_on_same_side(known: Array, jacobian: Array) -> bool:
-    """Say whether two Jacobians of :func:`dimensionless` are on the same side of singularities.
+def is_on_same_side(reference: Array, jacobian: Array) -> bool:
+    """Return whether two Jacobians of :func:`dimensionless` are on the same side of singularities.
 
-    Determinants of square ones have the same sign then. The sum of the products of all minors,
-    det(J0' J1), says so too where there are more rows, because constraints follow from each other.
-    Motors that do not determine the pose leave it zero.
+    Determinants of square Jacobians then have the same sign. With more rows (dependent constraints)
+    the sum of the products of all minors, det(J0' J1), is positive. It is zero if the motors do not
+    determine the pose.
     """
-    return len(known) >= known.shape[1] and bool(np.linalg.det(known.T @ jacobian) > 0.0)
+    return len(reference) >= reference.shape[1] and bool(
+        np.linalg.det(reference.T @ jacobian) > 0.0
+    )
 
 
-def excludes_singularity(known: Array, jacobian: Array) -> bool:
-    """Say whether two Jacobians differ too little for one of smaller rank between them."""
-    difference = jacobian - known
-    if known.shape[0] == known.shape[1]:
+def excludes_singularity(reference: Array, jacobian: Array) -> bool:
+    """Return whether two Jacobians are too close for a singular one between them."""
+    difference = jacobian - reference
+    if reference.shape[0] == reference.shape[1]:
         try:
-            change = np.linalg.solve(known, difference)
+            change = np.linalg.solve(reference, difference)
         except np.linalg.LinAlgError:
-            change = np.full_like(known, np.inf)
+            change = np.full_like(reference, np.inf)
         if float(np.abs(change).sum(axis=1).max()) < MAX_CHANGE:
             return True
-    left, values, right = np.linalg.svd(known, full_matrices=False)
+    left, values, right = np.linalg.svd(reference, full_matrices=False)
     rank = int(np.sum(values > 1e-6 * values[0]))
     change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
     return float(np.linalg.norm(change, 2)) < MAX_CHANGE

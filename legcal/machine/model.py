@@ -47,17 +47,17 @@ class Machine:
     platform: str  # link
     platform_joint: str | None  # the virtual joint that carries the platform
     legs: tuple[Leg, ...]  # in the order of the YAML, in the links of base and platform
-    frame_legs: tuple[int, ...]  # whose joints define R_b and R_e: origin, x axis, xy plane
-    spatial: bool  # whether the platform moves in space and not in a plane
+    frame_legs: tuple[int, ...]  # legs that define R_b and R_e: origin, x axis, xy plane
+    spatial: bool  # motion in space, not in a plane
     home: RigidTransform  # T_base_platform of a pose in the assembly mode
     home_configuration: Array  # (nq,) the closed chain there
     chain: ClosedChain  # the tree and its closures in Pinocchio
     urdf: Urdf  # the tree as written
     mobility: int = 0  # freedoms of the platform
-    motor_rank: int = 0  # of which the motors hold
-    diagnostics: tuple[str, ...] = ()  # what the reader should know, one sentence each
-    base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
-    platform_normal: Array | None = None  # platform, the same way up; None in space
+    motor_rank: int = 0  # freedoms of the platform held by motors
+    diagnostics: tuple[str, ...] = ()  # notes for the reader, one sentence each
+    base_normal: Array | None = None  # (3,) normal of the plane of motion in the base link
+    platform_normal: Array | None = None  # the same in the platform link; both None in space
     occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
 
     @property
@@ -72,7 +72,7 @@ class Machine:
 
     @cached_property
     def size(self) -> float:
-        """Mean leg length at home [m]: what errors and tolerances of lengths are parts of."""
+        """Mean leg length at home [m], the reference of relative errors and tolerances."""
         vectors = vectors_at(self, self.home.as_matrix()[None])[0]
         return float(np.linalg.norm(vectors, axis=1).mean())
 
@@ -88,43 +88,43 @@ class Machine:
 
     @cached_property
     def motors(self) -> tuple[int, ...]:
-        """Indices of the legs with a motor; of rods on one actuator that of the first."""
+        """Indices of the legs with a motor; for rods on one actuator the first leg."""
         return tuple(j for j, leg in enumerate(self.legs) if leg.is_motor and self.reads[j] == j)
 
     @cached_property
     def reads(self) -> tuple[int, ...]:
-        """Index of the leg whose encoder reads each leg: rods on one motor share one."""
+        """Index of the leg whose encoder reads each leg; rods on one motor share it."""
         return reading_legs(self.legs)
 
     @property
     def readings_carry_length(self) -> bool:
-        """Whether the scale of the machine is in its readings: not where all of them are angles."""
+        """Whether the readings determine the scale of the machine: not if all are angles."""
         return not self.actuators or any(leg.is_motor and not leg.reads_angle for leg in self.legs)
 
     @cached_property
     def rod_to_measure(self) -> tuple[Leg, str] | None:
-        """The first rod on a motor, and what --length calls its ends; None without any."""
+        """The first rod on a motor, and the names of its ends for --length; None without any."""
         rod = next((leg for leg in self.legs if leg.actuator is not None), None)
         return None if rod is None else (rod, f"{rod.name}.base:{rod.name}.platform")
 
     @property
     def length_option(self) -> str:
-        """The option of ``legcal calibrate`` that states this rod's length; bare without any."""
+        """The option of ``legcal calibrate`` for the length of this rod; bare without any."""
         rod = self.rod_to_measure
         return "--length" if rod is None else f"--length {rod[1]}=MEASURED±SIGMAmm"
 
     def rod_for_scale(self, *, has_length: bool) -> tuple[Leg, str] | None:
-        """Return the rod to measure, None where readings or something measured carry lengths."""
+        """Return the rod to measure, None if readings or other measurements determine the scale."""
         return None if has_length or self.readings_carry_length else self.rod_to_measure
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
-        """What moves joints at A, each once, in the base link."""
+        """The motors that move joints at A, each once, in the base link."""
         return actuators_of(self.legs)
 
     @property
     def at_zero(self) -> str:
-        """Words after "joints A": the reading at which their coordinates hold, if they move."""
+        """Words after "joints A" if these move: the reading at which their coordinates hold."""
         return AT_ZERO if self.actuators else ""
 
     @cached_property
@@ -134,17 +134,17 @@ class Machine:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the motors hold all freedoms of the platform: readings give its pose."""
+        """Whether the motors hold all freedoms of the platform: readings determine its pose."""
         return min(self.motor_rank, len(self.motors)) == self.mobility
 
     @property
     def is_redundant(self) -> bool:
-        """Whether readings give the pose and can contradict each other: it is of least squares."""
+        """Whether readings overdetermine the pose, which is then a least-squares pose."""
         return self.is_determined and len(self.motors) > self.mobility
 
     @property
     def undetermined(self) -> str:
-        """Why readings do not give the pose, as a sentence goes on."""
+        """The reason why readings do not determine the pose, as the end of a sentence."""
         n, moves = len(self.motors), f"a platform with mobility {self.mobility}"
         if n == 0:
             return f"no motor determines the pose of {moves}"
@@ -166,7 +166,7 @@ class Machine:
         return A.reshape(*q.shape, 3)
 
     def at_readings(self, readings: Array) -> Array:
-        """Return joint values (..., n_legs) with those of motors (..., n_motors); others are 0."""
+        """Return joint values (..., n_legs) from motor readings (..., n_motors); others are 0."""
         readings = np.asarray(readings)
         number = {j: i for i, j in enumerate(self.motors)}
         q = np.zeros((*readings.shape[:-1], self.n_legs))
@@ -187,12 +187,12 @@ class Machine:
 
     @property
     def sign(self) -> Array:
-        """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
+        """Sign of the length change of each leg with its reading, (n_legs,): +1 or -1."""
         return self._arrays[3].copy()
 
     @cached_property
     def _arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Joint centres of base and platform, offsets and signs, of which callers get copies."""
+        """Joint centres of base and platform, offsets and signs; callers get copies."""
         return (
             np.array([leg.A for leg in self.legs]),
             np.array([leg.B for leg in self.legs]),
@@ -201,7 +201,7 @@ class Machine:
         )
 
     def lengths_at(self, q: Array, legs: Sequence[int] | None = None) -> Array:
-        """Return the lengths of some legs, or all, at readings (..., n): :meth:`Leg.length_at`."""
+        """Return the lengths of some or all legs at readings (..., n): :meth:`Leg.length_at`."""
         chosen = slice(None) if legs is None else list(legs)
         moves = np.array([leg.actuator is None for leg in self.legs])[chosen]
         return np.asarray(np.where(moves, self.sign[chosen] * q, 0.0) + self.q0[chosen])
@@ -240,22 +240,24 @@ class Machine:
         for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
             base[leg, rank:n_d] = 0.0
             platform[leg, rank:n_d] = 0.0
-        found = parameters_of_legs(self.legs_of_frames)
-        return replace(found, base_joints=base, platform_joints=platform)
+        parameters = parameters_of_legs(self.legs_of_frames)
+        return replace(parameters, base_joints=base, platform_joints=platform)
 
     def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
-        """Return the mechanism with other radii of its visible cylinders, as :func:`with_radii`."""
+        """Return the machine with other radii of its visible cylinders; see :func:`with_radii`."""
         others = with_radii([leg.cylinders for leg in self.legs], radius)
         legs = zip(self.legs, others, strict=True)
-        return replace(self, legs=tuple(replace(leg, cylinders=own) for leg, own in legs))
+        return replace(
+            self, legs=tuple(replace(leg, cylinders=cylinders) for leg, cylinders in legs)
+        )
 
     def with_leg_order(self, names: Sequence[str]) -> "Machine":
-        """Return the same mechanism with its legs, each named once, in another order.
+        """Return the machine with its legs, each named once, in another order.
 
         Raises
         ------
         UsageError
-            If the names are not those of the legs.
+            If the names are not the names of all legs.
         """
         if sorted(names) != sorted(self.leg_names):
             raise UsageError(
@@ -273,7 +275,7 @@ class Machine:
 
 def vectors_A_to_B(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
-    matrix = T_base_platform.as_matrix()  # RigidTransform.apply is slow on few points
+    matrix = T_base_platform.as_matrix()  # faster than RigidTransform.apply on few points
     return np.asarray(vectors_at(machine, matrix[None])[0])
 
 
@@ -287,16 +289,16 @@ def B_at(machine: Machine, poses: Array) -> Array:
 
 
 def vectors_at(machine: Machine, poses: Array) -> Array:
-    """Return the same at poses T_base_platform (k, 3 or 4, 4), (k, n_legs, 3) [m].
+    """Return the vectors from A to B at poses T_base_platform (k, 3 or 4, 4), (k, n_legs, 3) [m].
 
-    Joints at A that move are where the first rod on their actuator reaches the platform.
+    Moving joints at A are at the position where the first rod of their actuator reaches B.
     """
     B = B_at(machine, poses)
-    A = machine.A_at(_of_actuators(machine, B)) if machine.actuators else machine.A_base
+    A = machine.A_at(_actuator_readings(machine, B)) if machine.actuators else machine.A_base
     return np.asarray(B - A)
 
 
-def _of_actuators(machine: Machine, B: Array) -> Array:
+def _actuator_readings(machine: Machine, B: Array) -> Array:
     """Return the joint values (k, n_legs) of actuators whose rods reach B (k, n_legs, 3)."""
     q = np.zeros(B.shape[:2])
     for j, first in enumerate(machine.reads):
@@ -308,18 +310,18 @@ def _of_actuators(machine: Machine, B: Array) -> Array:
 def readings_at_poses(machine: Machine, poses: Array) -> Array:
     """Return the joint values (k, n_legs) at poses T_base_platform (k, 3 or 4, 4) [m or rad].
 
-    q = sign (|AB| - q0); of a rod the reading of its actuator at which the first of its rods
-    reaches the platform.
+    q = sign (|AB| - q0); for rods on an actuator its reading at which the first rod reaches the
+    platform.
     """
     B = B_at(machine, poses)
     lengths = np.linalg.norm(B - machine.A_base, axis=2)
     hangs = np.array([leg.actuator is not None for leg in machine.legs])
-    own = machine.sign * (lengths - machine.q0)
-    return np.asarray(np.where(hangs, _of_actuators(machine, B), own))
+    of_sliders = machine.sign * (lengths - machine.q0)
+    return np.asarray(np.where(hangs, _actuator_readings(machine, B), of_sliders))
 
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
-    """Return the same at one pose, (n_legs,)."""
+    """Return the joint values at one pose, (n_legs,)."""
     return np.asarray(readings_at_poses(machine, T_base_platform.as_matrix()[None])[0])
 
 
@@ -329,7 +331,7 @@ def platform_pose(machine: Machine, configuration: Array) -> RigidTransform:
 
 
 def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return where the sliders of some legs stand in configurations and in tangent vectors."""
+    """Return the indices of the sliders of some legs in configurations and in tangent vectors."""
     names = [machine.legs[j].prismatic for j in legs]
     joints = [name for name in names if name is not None]
     chain = machine.chain
@@ -339,7 +341,7 @@ def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], li
 def joint_values(machine: Machine, configuration: Array) -> Array:
     """Return the joint value of every leg at a configuration, (n_legs,) [m or rad].
 
-    It is that of its slider, or of what it hangs on, and zero for other rods.
+    It is the value of the slider, or of the actuator of a rod, and zero for other rods.
     """
     values = np.zeros(machine.n_legs)
     sliding = [j for j, leg in enumerate(machine.legs) if leg.has_value]

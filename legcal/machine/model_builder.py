@@ -20,13 +20,13 @@ from legcal.machine.motor_visuals import motor_visuals
 from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.spanning_tree import UrdfBuilder, axis_xml, limit_xml, origin_xml_at, visual_xml
 
-TURN = (-3.15, 3.15)  # [rad]
-VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
+TURN = (-3.15, 3.15)  # limits of revolutes [rad]
+VISIBLE = 0.9  # length of tube and rod together, relative to the shortest leg
 _AXES = {letter: axis_xml(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
 
 
 def urdf_text(machine: Assembled) -> str:
-    """Return the URDF of a machine: all its geometry."""
+    """Return the URDF of a machine, with all its geometry."""
     tree = UrdfBuilder()
     tree.link("base")
     tree.link("platform")
@@ -42,7 +42,7 @@ def urdf_text(machine: Assembled) -> str:
 
 
 def yaml_text(machine: Assembled) -> str:
-    """Return the mechanism YAML of a machine: closures, motors, legs and home."""
+    """Return the mechanism YAML of a machine, with closures, motors, legs and home."""
     stated = motor_entries([leg.actuator for leg in machine.legs if leg.actuator is not None])
     return mechanism_yaml(
         [
@@ -65,14 +65,14 @@ def yaml_text(machine: Assembled) -> str:
 
 
 def _motor(leg: AssembledLeg) -> str:
-    """Return the joint of the motor that moves a leg, empty without one."""
+    """Return the joint of the motor of a leg, empty if it has none."""
     if leg.actuator is not None:
         return leg.actuator.joint
     return f"{leg.name}_prismatic" if leg.kind is LegKind.ACTUATED else ""
 
 
 def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
-    """Add the motors that carry joints: a carriage or an arm each, in the axes of the base."""
+    """Add the motors that carry joints, a carriage or an arm each, in the axes of the base."""
     on_base = list[str]()
     for actuator in dict.fromkeys(leg.actuator for leg in machine.legs):
         if actuator is None:
@@ -91,15 +91,15 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
 
 
 def _hangs_from_base(leg: AssembledLeg) -> bool:
-    """Say whether a leg hangs from the base, or what moves on it, and not from the platform.
+    """Return whether the tree of a leg starts at the base (or an actuator), not at the platform.
 
-    From the platform hangs a leg whose S is at the base.
+    A leg with its S at the base starts at the platform.
     """
     return not leg.type.base.twists_freely or leg.type.platform.twists_freely
 
 
 def _joint_of(leg: AssembledLeg) -> str:
-    """Return the joint that names a leg in the YAML."""
+    """Return the joint that identifies a leg in the YAML."""
     if leg.kind is LegKind.CONSTANT:
         return f"{leg.name}_a1" if _hangs_from_base(leg) else f"{leg.name}_b1"
     return f"{leg.name}_prismatic"
@@ -114,7 +114,7 @@ def _joint(
     rotation: Array | None = None,
     moving: str = "",
 ) -> None:
-    """Connect two links; without numbers their frames coincide."""
+    """Connect two links; their frames coincide if no numbers are given."""
     at = origin_xml_at(
         np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
     )
@@ -122,20 +122,20 @@ def _joint(
 
 
 class _Branch:
-    """One leg, from the link that it hangs from to the frames that close its loop."""
+    """One leg, from the link at its start to the frames that close its loop."""
 
     def __init__(self, tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
         self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
         self._T = machine.T_base_platform
-        self._carrier, self._A = "base", leg.A_base  # that, and the joint at A in it
+        self._carrier, self._A = "base", leg.A_base  # the link at the start, and A in it
         self._R_base_carrier = np.eye(3)  # at home
         if leg.actuator is not None:
             self._carrier, self._A = leg.actuator.link, leg.A_base - leg.actuator.point
             self._R_base_carrier = leg.actuator.rotations(np.array([leg.q_home]))[0]
         self._link = self._carrier if self._from_base else "platform"
-        self._along = np.zeros(3)  # where the next joint stands in the link before it
+        self._along = np.zeros(3)  # position of the next joint in the previous link
 
     def write(self) -> None:
         """Add the leg to the tree."""
@@ -162,7 +162,7 @@ class _Branch:
         self._close(R)
 
     def _near(self, side: str, joint: JointType, u: Array, axis: Array, at: Array) -> Array:
-        """Add the joint that a leg hangs from, and return the frame of the leg there."""
+        """Add the joint at the start of the leg, and return the frame of the leg there."""
         y = _unit(cross(u, axis))
         along = np.column_stack([cross(y, u), y, u])
         if joint is JointType.FIXED:
@@ -180,7 +180,7 @@ class _Branch:
         return along
 
     def _far(self, R: Array) -> Array:
-        """Add the joint at the platform of a leg without S, and return the frame after it."""
+        """Add the platform joint of a leg without S, and return the frame after it."""
         leg = self._leg
         if leg.type.platform is JointType.FIXED:
             return R
@@ -195,7 +195,7 @@ class _Branch:
         return last
 
     def _close(self, R: Array) -> None:
-        """Add the frames that coincide where the loop closes."""
+        """Add the coincident frames that close the loop."""
         leg, tree = self._leg, self._tree
         end, seat = f"{leg.name}_end", f"{leg.name}_seat"
         tree.link(end)
@@ -221,14 +221,14 @@ class _Branch:
         axis: str,
         limits: tuple[float, float],
     ) -> None:
-        """Add a joint and go on from its child."""
+        """Add a joint and continue from its child."""
         self._tree.link(child)
         moving = _AXES[axis] + limit_xml(limits)
         _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
         self._link, self._along = child, np.zeros(3)
 
     def _half(self, *, near: bool) -> None:
-        """Show the half of the leg that the present link carries."""
+        """Add the visual of the half of the leg on the current link."""
         leg = self._leg
         radius = leg.tube if near == self._from_base else leg.rod
         if radius is None:
@@ -243,15 +243,14 @@ class _Branch:
 
 
 def _unit(vector: Array) -> Array:
-    """Return a vector of length one."""
     return np.asarray(vector / np.linalg.norm(vector))
 
 
 @dataclass(frozen=True, eq=False)
 class Created:
-    """A model that was written."""
+    """A model after writing."""
 
-    machine: Machine  # the model as legcal understands it
+    machine: Machine  # the model as loaded again
     yaml_path: Path
     urdf_path: Path
 
@@ -283,7 +282,7 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
 
 
 def model_paths(name: str, output: Path) -> tuple[Path, Path]:
-    """Return where the YAML and the URDF of a model go."""
+    """Return the paths of the YAML and the URDF of a model."""
     return output / "models" / f"{name}.yaml", output / "urdf" / f"{name}.urdf"
 
 
@@ -315,15 +314,17 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
 
 
 def _load(path: Path, temporary: Path, source: str) -> None:
-    """Load the files in the temporary folder; problems name the source instead."""
+    """Load the files in the temporary folder; errors name the source instead."""
     try:
         load_mechanism(path)
     except LegcalError as error:
-        raise error.told(lambda problem: _of_source(problem, temporary, source)) from error
+        raise error.told(
+            lambda problem: _attributed_to_source(problem, temporary, source)
+        ) from error
 
 
-def _of_source(problem: Problem, temporary: Path, source: str) -> Problem:
-    """Return a problem of a file in the temporary folder as one of the source."""
+def _attributed_to_source(problem: Problem, temporary: Path, source: str) -> Problem:
+    """Return a problem of a file in the temporary folder as a problem of the source."""
     file = Path(problem.file)
     if not file.is_relative_to(temporary):
         return problem

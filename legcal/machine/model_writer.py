@@ -1,6 +1,6 @@
-"""Models written with other numbers: the URDF by moved origins, the YAML beside it.
+"""Models written with other numbers: a URDF with moved origins, and its YAML.
 
-What is written is loaded again and checked.
+Written files are loaded again and checked.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from legcal.machine.rods import actuators_of
 from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.urdf import UrdfPatch
 
-_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
-CLOSES = 2.5e-9  # mean leg lengths and [rad], home against the pose at its own readings
-ROUNDING = 1e-15  # mean leg lengths: what moves less does not move
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML
+CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
+ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
 
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
-    """Return the YAML of a mechanism, complete."""
+    """Return the complete YAML of a mechanism."""
     return mechanism_yaml(
         [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures],
         [str(machine.legs[j].prismatic) for j in machine.motors],
@@ -56,7 +56,7 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
 
 
 def _actuators_in_words(machine: Machine) -> dict[str, Any]:
-    """Return what the YAML says of actuators: their readings at home, and what no URDF has."""
+    """Return the YAML entries of actuators: readings at home, numbers with no place in a URDF."""
     q = readings_at(machine, machine.home)
     home = {str(machine.legs[j].prismatic): float(q[j]) for j in machine.motors
             if machine.legs[j].actuator is not None}  # fmt: skip
@@ -65,7 +65,7 @@ def _actuators_in_words(machine: Machine) -> dict[str, Any]:
 
 
 def model_name(machine: Machine) -> str:
-    """Return the name that the files of a mechanism get: that of its file, or of its folder."""
+    """Return the name for the files of a mechanism: that of its file, or of its folder."""
     path = machine.yaml_path
     return path.resolve().parent.name if path.name == FOLDER_YAML else path.stem
 
@@ -73,7 +73,7 @@ def model_name(machine: Machine) -> str:
 def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism.
 
-    A URDF that was read as it stands is copied byte for byte.
+    An unconverted URDF is copied byte for byte.
     """
     name = model_name(machine)
     places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
@@ -103,23 +103,23 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:
-    """Return a joint that stands for a leg: its slider, or any other that is its own."""
+    """Return a joint that identifies a leg: its slider, or any other of its own."""
     if leg.prismatic is not None and leg.actuator is None:
         return leg.prismatic
     chain = leg.urdf_chain
-    own = chain.steps[chain.actuator is not None :]
-    moving = [step.connection.joint for step in own if step.connection.joint]
+    steps = chain.steps[chain.actuator is not None :]
+    moving = [step.connection.joint for step in steps if step.connection.joint]
     fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
     return str([*moving, *fixed][0])
 
 
 def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None:
-    """Write the mechanism's URDF with other numbers of its legs, of whatever class.
+    """Write the URDF of a mechanism with other numbers of its legs, of any type.
 
-    Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
-    The visuals of arms move with their lines. Radii are not written: they absorb the bias of edges.
-    Nor is home looked at: with other rods or axes the mechanism may close elsewhere.
-    A gain other than 1 of a motor that carries rods has its place in the YAML alone.
+    Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e unchanged. The visuals
+    of arms move with their lines. Radii are not written, since they absorb the bias of edges. Home
+    is not checked: with other rods or axes the mechanism may close elsewhere. Gains of motors that
+    carry rods are in the YAML only.
     """
     patch = UrdfPatch(machine.urdf.content)
     for name, (after, is_turned) in moved_origins(machine, legs).items():
@@ -143,10 +143,9 @@ def write_calibrated_yaml(
 ) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
-    Every other character stays as it was, but for the numbers of ``legcal.home`` where home moves;
-    the key is added where the file does not have it, and the gains of the motors of *legs* where
-    they are not those of the model. A mechanism of another format, or without a block ``legcal``,
-    gets a YAML with all it needs.
+    All else is kept character by character, except the numbers of ``legcal.home`` if home moves;
+    the key is added if it is missing, and the gains of the motors of *legs* if they differ from the
+    model. A mechanism of another format, or without a block ``legcal``, gets a complete YAML.
     """
     gains = {a.joint: a.gain for a in actuators_of(legs)}
     if not _is_written_down(machine):
@@ -171,7 +170,7 @@ def write_calibrated_yaml(
 
 
 def _with_gain(leg: Leg, gains: Mapping[str, float]) -> Leg:
-    """Return a leg whose motor has the gain that is given by its joint."""
+    """Return a leg whose motor has its gain from a mapping by joint."""
     if leg.actuator is None:
         return leg
     gain = gains.get(leg.actuator.joint, leg.actuator.gain)
@@ -179,8 +178,8 @@ def _with_gain(leg: Leg, gains: Mapping[str, float]) -> Leg:
 
 
 def _with_motors(text: str, entries: dict[str, Any]) -> str:
-    """Return the text of a YAML with these entries as ``legcal.motors``."""
-    value = json.dumps(entries)  # as YAML on one line
+    """Return the text of a YAML with these entries in ``legcal.motors``."""
+    value = json.dumps(entries)  # YAML on one line
     block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
     written = _entry(block, "motors")
     if written is not None:
@@ -197,7 +196,7 @@ def _indent(block: yaml.Node | None) -> int:
 
 
 def _with_first(text: str, block: yaml.Node | None, entry: str) -> str:
-    """Return a text with an entry before the others of a mapping in it."""
+    """Return a text with an entry inserted as the first of a mapping."""
     if not isinstance(block, yaml.MappingNode) or not block.value:
         return text
     first = block.value[0][0].start_mark
@@ -206,7 +205,7 @@ def _with_first(text: str, block: yaml.Node | None, entry: str) -> str:
 
 
 def _with_home(text: str, home: RigidTransform) -> str:
-    """Return the text of a YAML with other numbers in ``legcal.home``, if it has one."""
+    """Return the text of a YAML with other numbers in ``legcal.home``, if present."""
     written = _entry(_entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal"), "home")
     numbers = []
     for key, values in motion_to_xyz_quat(home).items():
@@ -219,7 +218,7 @@ def _with_home(text: str, home: RigidTransform) -> str:
 
 
 def _is_written_down(machine: Machine) -> bool:
-    """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
+    """Return whether a mechanism has a YAML of our format, for its URDF as it is."""
     if machine.yaml_path.suffix.lower() in XML_SUFFIXES:
         return False
     content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
@@ -242,9 +241,9 @@ def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
 
 
 def check_closes(machine: Machine) -> None:
-    """Check that a mechanism closes at home: its own readings lead back to it."""
-    found = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
-    away = machine.home.inv() * found
+    """Check that a mechanism closes at home, and that its readings lead back to it."""
+    pose = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
+    away = machine.home.inv() * pose
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
     if not max(shift / machine.size, turn) <= CLOSES:
         raise DidNotConverge(
@@ -260,9 +259,9 @@ def check_closes(machine: Machine) -> None:
 
 
 def reload_and_check(path: Path) -> Machine:
-    """Load a mechanism that was just written and check that it closes at home.
+    """Load a mechanism after writing, and check that it closes at home.
 
-    Loading closes the chain there; where the motors determine the pose they must lead back to it.
+    Loading closes the chain there; if the motors determine the pose, its readings must lead back.
     """
     machine = load_mechanism(path)
     if machine.is_determined:

@@ -1,8 +1,7 @@
-"""What is seen of the motors of a new model: rails and carriages, motors and arms.
+"""Visuals of the motors of a new model: rails and carriages, motors and arms.
 
-Sizes follow from the radius of the rods, but for arms that are cylinders of a stated radius. None
-of it lies along a rod: these are shapes that cameras see, and only of such arms anything is
-measured.
+Sizes follow from the radius of the rods, except for cylindrical arms with a stated radius. No shape
+is along a rod: cameras see them, but only cylindrical arms are measured.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.assembly import AssembledLeg
 from legcal.machine.spanning_tree import box_xml, origin_xml_at, visual_xml
 
-THICK, WIDE = 2.0, 3.0  # of arms and rails, in radii of a rod
+THICK, WIDE = 2.0, 3.0  # size of arms and rails, in radii of a rod
 MOTOR_RADIUS, MOTOR_LENGTH = 4.0, 8.0
-BEHIND = 2.5  # how far rails and carriages stand off the joints, away from the rods
-_ROUND = 6  # decimals of sizes and places [m]: they are drawn only
+BEHIND = 2.5  # distance of rails and carriages from the joints, away from the rods
+_ROUND = 6  # decimals of sizes and positions [m], for display only
 
 
 def motor_visuals(actuator: Actuator, rods: Sequence[AssembledLeg]) -> tuple[list[str], list[str]]:
     """Return the ``<visual>`` elements of a motor on the base, and on the link that it moves.
 
-    Those of the base are in the base link, the others from the actuator's point in axes of the
-    base, at reading 0. Without a visible rod there are none.
+    The first are in the base link, the others relative to the point of the actuator in base axes,
+    at reading 0. Without a visible rod there are none.
     """
     radii = [r for rod in rods for r in (rod.tube, rod.rod) if r is not None]
     if not radii:
@@ -62,7 +61,7 @@ def _sliding(
     d, middle = actuator.axis, A.mean(axis=0)
     towards = np.mean([rod.u for rod in rods], axis=0)
     away = -(towards - (towards @ d) * d)
-    if np.linalg.norm(away) < 1e-3:  # rods in line with it stand beside each other
+    if np.linalg.norm(away) < 1e-3:  # rods in line with it are side by side
         away = cross(d, A[-1] - A[0])
     if np.linalg.norm(away) < 1e-6:
         away = normal_basis(d)[0]
@@ -99,10 +98,9 @@ def _box(at: Array, sizes: Array, frame: Array) -> str:
 
 
 def _at(place: Array, frame: Array) -> str:
-    """Return the origin of a shape."""
     return origin_xml_at(np.round(place, _ROUND), frame)
 
 
 def _rounded(size: float) -> float:
-    """Return a size as it is written [m]."""
+    """Return a size, rounded for the file [m]."""
     return round(size, _ROUND)

@@ -1,9 +1,10 @@
-"""What of a model hides without being measured: boxes, spheres, meshes, other cylinders.
+"""Occluders of a model: solids that hide legs without being measured.
 
-Housings and motors of legs, carriages, brackets, towers: each is a convex solid, or a mesh, on what
-carries it. Where the joints A and B of the legs are says where carriers are; a leg's own solids
-turn about it as its joint at one end has them. Where a leg may turn about itself, what they sweep
-stands for them; of meshes only what they enclose of their leg counts there.
+Boxes, spheres, meshes and cylinders of housings, motors, carriages, brackets, towers: each is a
+convex solid, or a mesh, on a carrier. The joints A and B of the legs determine the poses of
+carriers; the solids of a leg turn about it with the joint at one of its ends. If a leg can turn
+about itself, the swept volume replaces its solids; meshes then only hide the sections of their leg
+that they enclose.
 """
 
 from __future__ import annotations
@@ -27,44 +28,43 @@ from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
 from legcal.machine.meshes import mesh_file, read_mesh
 from legcal.machine.urdf import Urdf, number_list, origins_of, parse_robot
 
-SIDES = 24  # of the prism around what is round
-THICKER = 1.2  # radii of a cylinder that what encloses it reaches beyond, at least
-SLICES, DIRECTIONS = 200, 12  # along and around a leg, where a mesh is looked for
-GRAZING = 1e-5  # sine of the angle of a ray to a triangle by which that hides nothing
-ALONG = 1e-6  # sine of the angle to a leg below which a revolute only turns the leg about itself
-EMPTY = 1e-9  # depth of a body [m] that is not worth a look
+SIDES = 24  # sides of the prism around a round solid
+THICKER = 1.2  # least radius of an enclosing solid, relative to the enclosed cylinder
+SLICES, DIRECTIONS = 200, 12  # samples of an enclosing mesh along and around a leg
+GRAZING = 1e-5  # sine of the angle of a ray and a triangle below which the triangle hides nothing
+ALONG = 1e-6  # sine of the angle to a leg below which a revolute only spins the leg
+EMPTY = 1e-9  # size of a solid, or depth, that counts as none [m]
 
-_HELD = 1e3  # weight of directions that a carrier keeps, over that of joints that are off
+_HELD = 1e3  # weight of fixed directions of a carrier, relative to joints
 
 
 def _none() -> Array:
-    """Return no points (0, 3)."""
     return np.zeros((0, 3))
 
 
 class VisualSolid(NamedTuple):
-    """A visual of the file as the corners of a convex solid, or as triangles."""
+    """A visual of the file, as the corners of a convex solid or as triangles."""
 
     link: str
     corners: Array  # (m, 3) in the link [m]
-    triangles: IntArray | None = None  # (k, 3) of corners, where it is a mesh
-    cylinder: VisualCylinder | None = None  # where it is one
+    triangles: IntArray | None = None  # (k, 3) indices of corners, for a mesh
+    cylinder: VisualCylinder | None = None  # the visual, if it is a cylinder
 
 
 @dataclass(frozen=True, eq=False)
 class Carrier:
-    """A rigid body that the joints of some legs place: base, platform, carriage or arm."""
+    """A rigid body placed by the joints of some legs: base, platform, carriage or arm."""
 
-    side: Literal["base", "platform"] = "base"  # whether joints A are on it or joints B
-    legs: tuple[int, ...] = ()  # without any it is the base itself
-    points: Array = field(default_factory=_none)  # (n, 3) those joints in its own frame [m]
-    fixed: Array = field(default_factory=_none)  # (m, 3) points that stay where they are [m]
-    # (k, 3) directions in its frame, and where they point in the base link whatever it does
+    side: Literal["base", "platform"] = "base"  # side of its joints: A or B
+    legs: tuple[int, ...] = ()  # legs with joints on it; none for the base itself
+    points: Array = field(default_factory=_none)  # (n, 3) these joints in its frame [m]
+    fixed: Array = field(default_factory=_none)  # (m, 3) fixed points [m]
+    # (k, 3) constant directions in its frame, and the same in the base link
     held: Array = field(default_factory=_none)
     towards: Array = field(default_factory=_none)
 
     def poses(self, A: Array, B: Array) -> tuple[Array, Array]:
-        """Return R (k, 3, 3) and t (k, 3) [m] from it to the base link, by joints there."""
+        """Return R (k, 3, 3) and t (k, 3) [m] from its frame to the base link, by joints there."""
         n = len(A)
         if not self.legs:
             return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
@@ -80,23 +80,23 @@ class Carrier:
 
 
 class Roll(NamedTuple):
-    """How a leg is turned about itself: by a joint axis at one of its ends."""
+    """The rotation of a leg about itself, determined by a joint axis at one of its ends."""
 
-    carrier: Carrier  # in which the axis is fixed
+    carrier: Carrier  # body of the axis
     axis: Array  # (3,)
-    is_outer: bool  # of a universal joint: the axis in the leg is across it
+    is_outer: bool  # outer axis of a universal joint, perpendicular to the axis in the leg
 
 
 @dataclass(frozen=True, eq=False)
 class LegHalf:
-    """Half of a leg: its frame has z from A to B, and its origin at A or at B."""
+    """Half of a leg; its frame has z from A to B, and its origin at A or B."""
 
     leg: int
     side: Literal["base", "platform"]
-    roll: Roll | None  # None where the leg may turn about itself
+    roll: Roll | None  # None if the leg can turn about itself
 
     def poses(self, A: Array, B: Array) -> tuple[Array, Array]:
-        """Return R (k, 3, 3) and t (k, 3) [m] from it to the base link, by joints there."""
+        """Return R (k, 3, 3) and t (k, 3) [m] from its frame to the base link, by joints there."""
         AB = B[:, self.leg] - A[:, self.leg]
         u = AB / np.linalg.norm(AB, axis=1, keepdims=True)
         axis = np.eye(3)[np.argmin(np.abs(u), axis=1)]
@@ -107,9 +107,9 @@ class LegHalf:
 
 
 def frame_along(u: Array, axis: Array, *, is_outer: bool) -> Array:
-    """Return axes x, y, z in columns (..., 3, 3): z along u, x across it.
+    """Return axes x, y, z as columns (..., 3, 3), z along u, x perpendicular to it.
 
-    It is across the axis too, or as near to it as can be.
+    x is perpendicular to the axis if this is outer, else as near to the axis as possible.
     """
     x = cross(axis, u) if is_outer else axis - np.sum(axis * u, axis=-1, keepdims=True) * u
     x = x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
@@ -118,7 +118,7 @@ def frame_along(u: Array, axis: Array, *, is_outer: bool) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Occluder:
-    """A convex solid or a mesh that hides what is inside and behind it."""
+    """A convex solid or a mesh that hides everything inside and behind it."""
 
     link: str
     carrier: Carrier | LegHalf
@@ -127,17 +127,17 @@ class Occluder:
 
     @cached_property
     def planes(self) -> Array:
-        """Planes (k, 4) of the faces around it: n x + d > 0 is outside."""
+        """Planes (k, 4) of its faces: n x + d > 0 is outside."""
         return planes_around(self.corners)
 
     @property
     def leg(self) -> int:
-        """The leg that it is on, -1 on none."""
+        """The leg that carries it, or -1."""
         return self.carrier.leg if isinstance(self.carrier, LegHalf) else -1
 
     @property
     def turns(self) -> bool:
-        """Whether it is what a solid sweeps that may be anywhere around its leg."""
+        """Whether it is the swept volume of a solid that can be anywhere around its leg."""
         return isinstance(self.carrier, LegHalf) and self.carrier.roll is None
 
 
@@ -149,10 +149,10 @@ def planes_around(corners: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PlacedOccluders:
-    """Occluders of a model where they are in a frame."""
+    """Occluders of a model with their poses in a frame."""
 
     occluders: tuple[Occluder, ...]
-    R: Array  # (n, 3, 3) of each
+    R: Array  # (n, 3, 3)
     t: Array  # (n, 3) [m]
 
     @classmethod
@@ -162,7 +162,7 @@ class PlacedOccluders:
 
     @classmethod
     def at(cls, occluders: Sequence[Occluder], A: Array, B: Array) -> list[PlacedOccluders]:
-        """Place occluders in the base link, for each of joints (k, n_legs, 3) there."""
+        """Return occluders placed in the base link, for each of joints (k, n_legs, 3) there."""
         if not occluders:
             return [cls.none() for _ in A]
         carriers = {id(o.carrier): o.carrier for o in occluders}
@@ -171,7 +171,7 @@ class PlacedOccluders:
         return [cls(tuple(occluders), *here) for here in zip(R, t, strict=True)]
 
     def before(self, T_base_camera: Array) -> PlacedOccluders:
-        """Transform from the base link to the frame of a camera at T_base_camera (4, 4)."""
+        """Return them in the frame of a camera at T_base_camera (4, 4)."""
         R = T_base_camera[:3, :3]
         return replace(self, R=R.T @ self.R, t=(self.t - T_base_camera[:3, 3]) @ R)
 
@@ -179,13 +179,13 @@ class PlacedOccluders:
         return len(self.occluders)
 
     def corners(self, i: int) -> Array:
-        """Return the corners of one of them (m, 3) [m]."""
+        """Return the corners of an occluder (m, 3) [m]."""
         return np.asarray(self.occluders[i].corners @ self.R[i].T + self.t[i])
 
     def silhouette(self, i: int) -> Array:
-        """Return the edges (k, 2, 2) around one of them, seen from the origin along z, at depth 1.
+        """Return the edges (k, 2, 2) around an occluder, seen from the origin along z, at depth 1.
 
-        There are none of a mesh, nor where a part of it is not before the origin.
+        There are none for a mesh, nor for a solid partly behind the origin.
         """
         corners = self.corners(i)
         if self.occluders[i].triangles is not None or corners[:, 2].min() <= EMPTY:
@@ -197,29 +197,33 @@ class PlacedOccluders:
             return np.zeros((0, 2, 2))
         return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
 
-    def hide(self, points: Array, own: IntArray, margin: Array, before: Array) -> IntArray:
-        """Return which of them hides each point (n, 3) from the origin, -1 where none does.
+    def hide(self, points: Array, leg_of_point: IntArray, margin: Array, before: Array) -> IntArray:
+        """Return the occluder that hides each point (n, 3) from the origin, or -1.
 
-        ``own`` is the leg to which each point belongs, -1 of none, ``margin`` what others reach
-        beyond themselves where they are as far away as it, and ``before`` by how much at least what
-        hides it is nearer [m].
+        ``leg_of_point`` is the leg of each point, -1 for none, ``margin`` the reach of bodies of
+        other legs beyond their surface at the depth of the point, and ``before`` the least distance
+        by which a body that hides the point is nearer [m].
         """
         front = np.full(len(points), -1, dtype=np.intp)
         last = 1.0 - before / np.linalg.norm(points, axis=1)
         for i, occluder in enumerate(self.occluders):
-            is_own = own == occluder.leg if occluder.leg >= 0 else np.zeros(len(own), np.bool_)
-            if occluder.turns and (np.all(is_own) or occluder.triangles is not None):
+            is_same_leg = (
+                leg_of_point == occluder.leg
+                if occluder.leg >= 0
+                else np.zeros(len(leg_of_point), np.bool_)
+            )
+            if occluder.turns and (np.all(is_same_leg) or occluder.triangles is not None):
                 continue
-            reach = np.where(is_own, 0.0, margin)
+            reach = np.where(is_same_leg, 0.0, margin)
             behind = self._behind if occluder.triangles is None else self._behind_mesh
             hides = behind(i, points, reach, last)
             if occluder.turns:
-                hides &= ~is_own
+                hides &= ~is_same_leg
             front[hides] = i
         return front
 
     def _behind_mesh(self, i: int, points: Array, reach: Array, last: Array) -> BoolArray:
-        """Return the same as :meth:`_behind` of a mesh; ``reach`` is tried on four sides."""
+        """Return the same as :meth:`_behind` for a mesh; ``reach`` is sampled on four sides."""
         R, t = self.R[i], self.t[i]
         sides = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
         hidden = np.zeros(len(points), dtype=np.bool_)
@@ -229,13 +233,14 @@ class PlacedOccluders:
         return hidden
 
     def _behind(self, i: int, points: Array, reach: Array, last: Array) -> BoolArray:
-        """Return which points (n, 3) are in one of them or behind it, seen from the origin.
+        """Return which points (n, 3) are inside or behind an occluder, seen from the origin.
 
-        What counts on the way to each ends at a part ``last`` (n,) of it.
+        Only the first fraction ``last`` (n,) of the ray to each point counts.
         """
         planes = self.occluders[i].planes
         normal = planes[:, :3] @ self.R[i].T
-        outside = planes[:, 3] - normal @ self.t[i] - reach[:, None]  # of the origin, (n, k)
+        # Distance of the origin from the planes, (n, k).
+        outside = planes[:, 3] - normal @ self.t[i] - reach[:, None]
         slope = points @ normal.T
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -outside / slope
@@ -247,9 +252,9 @@ class PlacedOccluders:
 
 
 def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
-    """Return where rays from an origin (3,) or (n, 3) to points (n, 3) meet a mesh first, (n,).
+    """Return the first hits of a mesh by rays from an origin (3,) or (n, 3) to points (n, 3), (n,).
 
-    They are parts of the way, infinite where none is met. All are in the frame of its carrier.
+    They are fractions of the distance, infinite without a hit. All points are in the carrier frame.
     """
     way = points - origin
     start = np.broadcast_to(origin, way.shape)
@@ -270,15 +275,15 @@ def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def _caster(mesh: Occluder) -> Any:
-    """Return what casts rays at a mesh."""
-    import trimesh  # 30 MB and half a second: only where there are meshes
+    """Return the ray caster of a mesh."""
+    import trimesh  # 30 MB and half a second: imported only for meshes
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     return RayMeshIntersector(trimesh.Trimesh(mesh.corners, mesh.triangles, process=False))
 
 
 def visual_solids(urdf: Urdf) -> list[VisualSolid]:
-    """Return the boxes, spheres, cylinders and meshes of a tree that can be read."""
+    """Return the readable boxes, spheres, cylinders and meshes of a tree."""
     shown = [
         (link.get("name", ""), visual, shape)
         for link in parse_robot(urdf.path, urdf.content).findall("link")
@@ -288,7 +293,7 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
     solids = []
     for (link, visual, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
         if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
-            with suppress(ValueError):  # it hides nothing, and pictures of it say why
+            with suppress(ValueError):  # it hides nothing; pictures state the reason
                 solids.append(VisualSolid(link, *read_mesh(urdf.path, visual)))
         corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
@@ -301,7 +306,7 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
 
 
 def _corners(tag: str, sizes: Mapping[str, str]) -> Array | None:
-    """Return the corners (m, 3) of a shape about its origin [m]; None of a flat or other one."""
+    """Return the corners (m, 3) of a shape about its origin [m], None if flat or not supported."""
     names = {"box": ("size", 3), "sphere": ("radius", 1), "cylinder": ("radius", 1)}
     if tag not in names:
         return None
@@ -333,12 +338,12 @@ def occluders_of(
     shown: Sequence[VisualSolid],
     bodies: Bodies,
     ends: tuple[str, str],  # the links of base and platform
-    normals: tuple[Array, Array] | None,  # of a plane of motion, in these links
+    normals: tuple[Array, Array] | None,  # normals of a plane of motion, in these links
 ) -> tuple[Occluder, ...]:
-    """Return what hides of the visuals of a file: all that is not measured and can be placed."""
+    """Return the occluders of a file: all visuals that are not measured and can be placed."""
     base, platform = ends
     places = _places(legs, bodies, base, platform, normals)
-    found = []
+    occluders = []
     for solid in shown:
         body = bodies.body_of[solid.link]
         if body not in places:
@@ -356,8 +361,8 @@ def occluders_of(
             occluder.planes  # noqa: B018
         except QhullError:  # flat
             continue
-        found.append(occluder)
-    return tuple(found)
+        occluders.append(occluder)
+    return tuple(occluders)
 
 
 def _places(
@@ -367,10 +372,11 @@ def _places(
     platform: str,
     normals: tuple[Array, Array] | None,
 ) -> dict[str, tuple[Carrier | LegHalf, Array]]:
-    """Return what each body is on, and the pose (4, 4) of the body in the frame of that."""
+    """Return the carrier of each body, and the pose (4, 4) of the body in the carrier frame."""
     T_base, T_platform = (matrix_inverse(bodies.T_body_link[link]) for link in (base, platform))
     free = [j for j, leg in enumerate(legs) if not leg.is_fixed_to_platform]
-    free = free if len(free) >= 3 else list(range(len(legs)))  # B of the others may be anywhere
+    # B of the other legs is arbitrary on their line.
+    free = free if len(free) >= 3 else list(range(len(legs)))
     held = (_none(),) * 2 if normals is None else (normals[1][None], normals[0][None])
     on_base = Carrier()
     on_platform = Carrier(
@@ -406,7 +412,7 @@ def _places(
 
 
 def _on_leg(leg: int, half: Half, roll: Roll | None, axis: Array) -> tuple[LegHalf, Array]:
-    """Return half of a leg and the pose (4, 4) in it of a body, with the axis in this body."""
+    """Return half of a leg, and the pose (4, 4) in it of a body with an axis."""
     side, origin, u = half
     R = frame_along(u, axis, is_outer=roll is None or roll.is_outer)
     T = np.eye(4)
@@ -416,19 +422,19 @@ def _on_leg(leg: int, half: Half, roll: Roll | None, axis: Array) -> tuple[LegHa
 
 def _roll(
     chain: LegChain,
-    k: int,  # of the body in the chain
+    k: int,  # index of the body in the chain
     on_base: Carrier,
     on_platform: Carrier,
-    T_link_body: tuple[Array, Array],  # of the bodies of base and platform
+    T_link_body: tuple[Array, Array],  # poses of the base and platform bodies in their links
 ) -> tuple[Roll | None, Array]:
-    """Return what holds a body of a leg from turning about the leg, and that axis with all at zero.
+    """Return the joint that keeps a body from turning about its leg, and its axis at zero.
 
-    The axis is in the frame of the base body.
+    The axis is in the base body, with all joints of the leg at zero.
     """
     before = range(0 if chain.actuator is None else 1, k)
     T_platform = matrix_product(T_link_body[1], matrix_inverse(chain.poses[-1]))
     for pivot, steps, carrier, T in (
-        (chain.base, before, on_base, T_link_body[0]),  # also of an actuator, at reading 0
+        (chain.base, before, on_base, T_link_body[0]),  # also on an actuator, at reading 0
         (chain.platform, range(k, len(chain.steps)), on_platform, T_platform),
     ):
         if pivot.type not in (JointType.REVOLUTE, JointType.UNIVERSAL) or pivot.outer is None:
@@ -443,7 +449,7 @@ def _roll(
 
 
 def _turns_leg(chain: LegChain, i: int) -> bool:
-    """Say whether a joint of a leg is a revolute about it, or a sphere."""
+    """Return whether a joint of a leg is a revolute about it, or a sphere."""
     step = chain.steps[i]
     if step.connection.type != "revolute":
         return step.connection.type == "sphere"
@@ -452,7 +458,7 @@ def _turns_leg(chain: LegChain, i: int) -> bool:
 
 
 def with_covers(legs: Sequence[Leg], occluders: Sequence[Occluder]) -> tuple[Leg, ...]:
-    """Return legs whose cylinders know which stretches of them are inside other solids."""
+    """Return legs with the sections of their cylinders that are inside other solids."""
     return tuple(
         replace(leg, cylinders=tuple(_covered(c, j, occluders) for c in leg.cylinders))
         for j, leg in enumerate(legs)
@@ -460,7 +466,7 @@ def with_covers(legs: Sequence[Leg], occluders: Sequence[Occluder]) -> tuple[Leg
 
 
 def _covered(cylinder: Cylinder, leg: int, occluders: Sequence[Occluder]) -> Cylinder:
-    """Return a cylinder with the stretches of its axis that are inside solids of its leg."""
+    """Return a cylinder with the sections of its axis inside solids of its leg."""
     covers = []
     for occluder in occluders:
         if not isinstance(occluder.carrier, LegHalf) or occluder.leg != leg:
@@ -482,7 +488,7 @@ def _covered(cylinder: Cylinder, leg: int, occluders: Sequence[Occluder]) -> Cyl
 
 
 def _enclosed(mesh: Occluder, radius: float) -> list[tuple[float, float]]:
-    """Return the stretches along z that a mesh surrounds, farther out than a radius [m]."""
+    """Return the sections along z surrounded by a mesh farther out than a radius [m]."""
     z = mesh.corners[:, 2]
     size = (float(z.max()) - float(z.min())) / SLICES
     if size <= EMPTY:
@@ -501,18 +507,18 @@ def _enclosed(mesh: Occluder, radius: float) -> list[tuple[float, float]]:
 
 
 def reordered(occluders: Sequence[Occluder], order: Sequence[int]) -> tuple[Occluder, ...]:
-    """Return occluders of a machine whose legs come in another order."""
+    """Return occluders for another order of the legs."""
     place = {j: k for k, j in enumerate(order)}
     moved = dict[int, Carrier | LegHalf]()
 
     def other(carrier: Carrier) -> Carrier:
         return replace(carrier, legs=tuple(place[j] for j in carrier.legs))
 
-    for carrier in (one.carrier for one in occluders):
+    for carrier in (occluder.carrier for occluder in occluders):
         if isinstance(carrier, Carrier):
             moved[id(carrier)] = other(carrier)
             continue
         roll = carrier.roll
         roll = None if roll is None else roll._replace(carrier=other(roll.carrier))
         moved[id(carrier)] = replace(carrier, leg=place[carrier.leg], roll=roll)
-    return tuple(replace(one, carrier=moved[id(one.carrier)]) for one in occluders)
+    return tuple(replace(occluder, carrier=moved[id(occluder.carrier)]) for occluder in occluders)

@@ -1,11 +1,11 @@
-"""Which origins of a URDF carry the numbers of legs, and where they go with other numbers.
+"""The origins of a URDF that carry the numbers of legs, and their changes for other numbers.
 
-A number of a leg is carried by the origin of a joint: that of its first joint by A, of its last by
-B, of its slider or of a joint of its rod by the length. Of a rod on a carriage or an arm the origin
-of the motor's joint carries the axis, and that of the joint at A in the arm A at reading 0. Where
-an origin moves that leg alone it is a :class:`Handle`. Trees in which no origin does, because the
-last joint of a leg carries the platform or a frame of a closure lies on a link with other things,
-get a link of its own there (:func:`with_own_origins`).
+Each number of a leg is in the origin of a joint: A in its first joint, B in its last, the length in
+its slider or a joint of its rod. For a rod on a carriage or an arm the origin of the motor joint
+holds the axis, and the origin of the joint at A holds A at reading 0. An origin that moves only
+this leg is a :class:`Handle`. If a tree has no such origin, because the last joint of a leg carries
+the platform or a closure frame is on a shared link, a separate link is added
+(:func:`with_separate_origins`).
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_links, twist_after
 from legcal.machine.urdf import Urdf, UrdfJoint, UrdfPatch, parse_urdf
 
-_ROUNDING = 1e-14  # [rad]: what turns less does not turn
+_ROUNDING = 1e-14  # rotation that counts as none [rad]
 
 
 def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
-    """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
+    """Return the new origin of each joint with a number of a leg, and whether it is rotated."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
-    found: dict[str, tuple[RigidTransform, bool]] = {}
-    moved = set[str]()  # motors that carry rods
+    origins: dict[str, tuple[RigidTransform, bool]] = {}
+    moved = set[str]()  # motors of rods that are done
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
-        """Move a joint by a motion that is given in a link of its body."""
+        """Move a joint by a motion given in a link of its body."""
         joint, T_body_link = handle.joint, handles.bodies.T_body_link
-        T_parent_origin, is_turned = found.get(joint.name, (joint.T_parent_origin, False))
+        T_parent_origin, is_turned = origins.get(joint.name, (joint.T_parent_origin, False))
         there = RigidTransform.from_matrix(
             matrix_product(matrix_inverse(T_body_link[joint.parent]), T_body_link[body])
         )
         seen = motion.seen_from(there) if body != joint.parent else motion
         seen = seen.inv() if handle.is_inverse else seen
-        found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
+        origins[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
     for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
         chain = leg.urdf_chain
@@ -69,13 +69,13 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
         move(handles.of(first, first.near, base, leg.name), at_base, base)
         move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
-    return found
+    return origins
 
 
 def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTransform]]:
-    """Return each arm that is not where the URDF draws it, and how its visual moves in its link."""
+    """Return the arms that differ from the URDF, with motions of their visuals in their links."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
-    found = []
+    arms = []
     for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
         arm, other, chain = leg.arm, wanted.arm, leg.urdf_chain
         if arm is None or other is None or chain.actuator is None:
@@ -84,21 +84,21 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
         carried = _carried(leg.actuator, wanted.actuator).motion
         before = arm.line.in_frame(T_base_link.inv().as_matrix())
         line = other.line.in_frame(carried.of(T_base_link).inv().as_matrix())
-        along = (before.point - line.point) @ line.axis  # where on its line it stands is no number
+        along = (before.point - line.point) @ line.axis  # the position along the line is arbitrary
         shift = line.point + along * line.axis - before.point
         motion = Motion(shift, before.point, _turn(before.axis, line.axis, directed=True))
         if motion.turn is not None or np.abs(shift).max() > _ROUNDING:
-            found.append((arm, motion.of(RigidTransform.identity())))
-    return found
+            arms.append((arm, motion.of(RigidTransform.identity())))
+    return arms
 
 
-def with_own_origins(
+def with_separate_origins(
     urdf: Urdf, closures: Sequence[Closure], machine: Machine
 ) -> tuple[Urdf, list[Closure]]:
     """Return the tree of a machine and its closures with an origin for every number of a leg.
 
-    Links are added where none is: between a joint and the link that it carries, and for frames of
-    closures on links that carry other things. Nothing is added to the layout that we write.
+    Links are added as needed: between a joint and its child link, and for closure frames on links
+    that carry other things. Our own layout needs none.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def with_own_origins(
                 patch.add_frame(
                     frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
                 )
-                # In this closure alone: frames that closures share get one link for each
+                # In this closure only: closures that share a frame get a link each.
                 changed[missing.closure] = _with_frame(changed[missing.closure], frame, link)
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
@@ -132,7 +132,7 @@ def with_own_origins(
 
 
 def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
-    """Find the origins of a leg."""
+    """Check that all origins of a leg can be found."""
     chain = leg.urdf_chain
     first, last = chain.steps[0], chain.steps[-1]
     handles.of(first, first.near, machine.base, leg.name)
@@ -152,7 +152,7 @@ def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
 
 
 def _with_frame(closure: Closure, old: str, new: str) -> Closure:
-    """Return a closure with another name of a frame."""
+    """Return a closure with one of its frames renamed."""
     frame_1, frame_2 = (
         new if frame == old else frame for frame in (closure.frame_1, closure.frame_2)
     )
@@ -163,11 +163,11 @@ class Handle(NamedTuple):
     """The joint of the URDF whose origin is moved."""
 
     joint: UrdfJoint
-    is_inverse: bool  # whether its origin moves the body against the leg's joint
+    is_inverse: bool  # its origin moves the body relative to the joint of the leg
 
 
 class NoOriginError(LookupError):
-    """No origin moves a joint or a frame of a closure alone."""
+    """There is no origin that moves a joint or a closure frame alone."""
 
     def __init__(
         self, *, joint: str | None = None, frame: str | None = None, closure: int = -1
@@ -177,7 +177,7 @@ class NoOriginError(LookupError):
 
 
 class Handles:
-    """Which origins of the URDF move the joints of legs in the bodies of a machine."""
+    """The origins of a URDF that move the joints of legs in the bodies of a machine."""
 
     def __init__(self, urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> None:
         self._urdf = urdf
@@ -187,7 +187,7 @@ class Handles:
         self._above = {joint.child: joint for joint in urdf.joints.values()}
 
     def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
-        """Return what moves a joint in a body."""
+        """Return the handle of a joint in a body."""
         connection = step.connection
         if connection.closure is not None:
             return Handle(self._carrier(connection.closure, side), False)
@@ -199,7 +199,7 @@ class Handles:
         return self._weld(joint, body, leg)
 
     def link(self, step: Step, side: int) -> str:
-        """Return the link that carries one side of a joint."""
+        """Return the link on one side of a joint."""
         connection = step.connection
         if connection.closure is not None:
             closure = self._closures[connection.closure]
@@ -208,14 +208,14 @@ class Handles:
         return (joint.parent, joint.child)[side]
 
     def at_zero(self, chain: LegChain, base: str, link: str) -> RigidTransform:
-        """Return the pose in the base link of the link behind a motor, with its reading zero."""
+        """Return the pose in the base link of the link behind a motor, at reading zero."""
         T_base_body = matrix_inverse(self.bodies.T_body_link[base])
         T_body_arm = matrix_product(matrix_inverse(chain.poses[0]), chain.poses[1])
         T_arm_link = self.bodies.T_body_link[link]
         return RigidTransform.from_matrix(T_base_body @ T_body_arm @ T_arm_link)
 
     def _onward(self, joint: UrdfJoint, body: str) -> UrdfJoint:
-        """Return the fixed joint that leads from the child of a joint to the rest of its body."""
+        """Return the fixed joint from the child of a joint to the rest of its body."""
         link, onward = body, None
         while link != joint.child and link in self._above:
             onward = self._above[link]
@@ -243,7 +243,7 @@ class Handles:
             raise problem
         raise OutOfClass(
             Problem(
-                f"leg '{leg}' is outside the method",
+                f"leg '{leg}' is not supported",
                 f"several welds between joint '{joint.name}' and the link '{body}'",
                 "one, which moves with the parameters of the leg",
                 "close the leg once",
@@ -252,7 +252,7 @@ class Handles:
         )
 
     def _carrier(self, closure: int, side: int) -> UrdfJoint:
-        """Return the fixed joint under a closure's frame, which must carry nothing else."""
+        """Return the fixed joint under a closure frame, which must carry nothing else."""
         frame = (self._closures[closure].frame_1, self._closures[closure].frame_2)[side]
         link = frame_link(self._urdf, frame)
         above = self._above.get(link)
@@ -261,11 +261,11 @@ class Handles:
         raise NoOriginError(frame=frame, closure=closure)
 
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
-        """Say whether a link carries one joint or none, and so many frames of closures."""
-        found = [joint for joint in self._urdf.joints.values() if joint.parent == link]
+        """Return whether a link carries at most one joint, and this number of closure frames."""
+        joints = [joint for joint in self._urdf.joints.values() if joint.parent == link]
         frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
         uses = sum(frame_link(self._urdf, frame) == link for frame in frames)
-        return found == ([] if below is None else [below]) and uses == closures
+        return joints == ([] if below is None else [below]) and uses == closures
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,10 +274,10 @@ class Motion:
 
     shift: Array  # (3,) displacement of the point *about* [m]
     about: Array  # (3,) [m]
-    turn: Rotation | None = None  # R; None where nothing turns, so that nothing is rounded
+    turn: Rotation | None = None  # R; None without rotation, which avoids rounding
 
     def inv(self) -> Motion:
-        """Return the motion back."""
+        """Return the inverse motion."""
         turn = None if self.turn is None else self.turn.inv()
         return Motion(-self.shift, self.about + self.shift, turn)
 
@@ -298,13 +298,13 @@ class Motion:
 
 
 class _Carried(NamedTuple):
-    """How the motor of a rod moves in the base link, with what it carries at reading zero."""
+    """The motion of the motor of a rod in the base link, with its link at reading zero."""
 
     joint: str
     motion: Motion
 
     def onward(self, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
-        """Return how the joint at A moves in the arm, which has moved with its motor."""
+        """Return the motion of the joint at A in the arm, after the motion of the motor."""
         before = self.motion.of(RigidTransform.from_translation(leg.A))
         axis = leg.base_axis
         if axis is not None and self.motion.turn is not None:
@@ -315,17 +315,17 @@ class _Carried(NamedTuple):
 
 
 def _carried(actuator: Actuator | None, wanted: Actuator | None) -> _Carried:
-    """Return how a motor moves: its axis onto another, its point with it where it turns."""
+    """Return the motion of a motor: its axis onto another, and its point if it turns."""
     if actuator is None or wanted is None:
         raise ValueError("a rod that hangs on a motor has its numbers")
     turn = _turn(actuator.axis, wanted.axis, directed=True)
     shift = wanted.point - actuator.point if actuator.turns else np.zeros(3)
-    along = shift @ wanted.axis  # where on its axis it stands is no number
+    along = shift @ wanted.axis  # the position along the axis is arbitrary
     return _Carried(actuator.joint, Motion(shift - along * wanted.axis, actuator.point, turn))
 
 
 def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
-    """Return how the ends of a leg move in the links of base and platform."""
+    """Return the motions of the ends of a leg in the links of base and platform."""
     is_fixed = leg.is_fixed_to_platform
     return (
         Motion(wanted.A - leg.A, leg.A, _turn(leg.base_axis, wanted.base_axis)),
@@ -338,7 +338,7 @@ def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
 
 
 def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -> Rotation | None:
-    """Return the smallest rotation of an axis, a line unless it is directed, onto another."""
+    """Return the smallest rotation of an axis onto another, as lines unless directed."""
     if axis is None or wanted is None:
         return None
     if not directed and axis @ wanted < 0.0:
@@ -348,7 +348,7 @@ def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -
 
 
 def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:
-    """Return how far the upper half of a leg turns about it, beside what its end does [rad]."""
+    """Return the rotation of the upper half of a leg about it, relative to its end [rad]."""
     if leg.twist is None or wanted.twist is None:
         return 0.0
     carried = leg.twist
@@ -360,7 +360,7 @@ def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:
 
 
 def _screw(along: Array, point: Array, grown: tuple[float, float]) -> Motion:
-    """Return the motion of the upper half of a leg: growth along its line, and turn about it."""
+    """Return the motion of the upper half of a leg: growth along its line, rotation about it."""
     growth, twist = grown
     turn = None if twist == 0.0 else Rotation.from_rotvec(twist * along)
     return Motion(growth * along, point, turn)
@@ -369,11 +369,11 @@ def _screw(along: Array, point: Array, grown: tuple[float, float]) -> Motion:
 def _at_slider(
     handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
 ) -> tuple[Handle, Motion, str]:
-    """Return what moves the upper half of a leg at its slider, how, and the body that says so."""
+    """Return handle and motion of the upper half of a leg at its slider, and the body of these."""
     slider = chain.slider
     if slider is None:
         raise ValueError("a rod has no slider")
-    body = slider.connection.bodies[0]  # that of the joint's parent
+    body = slider.connection.bodies[0]  # body of the parent of the joint
     if slider.near == 0:
         point, along = chain.line_in(chain.n_lower, chain.A)
     else:
@@ -385,7 +385,7 @@ def _at_slider(
 def _in_rod(
     handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
 ) -> tuple[Handle, Motion, str]:
-    """Return what moves the upper end of a rod against its lower one, how, and the body."""
+    """Return handle and motion of the upper end of a rod against its lower one, and the body."""
     below, above = chain.steps[chain.n_lower - 1], chain.steps[chain.n_lower]
     body = chain.bodies[chain.n_lower - 1]
     try:

@@ -1,12 +1,12 @@
-"""Names of parameters, and what they say: whose number, of what kind, which component."""
+"""Names of parameters, and their parts: owner, kind, component."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-JOINTS = ("base", "platform")  # kinds: coordinates of joints at both ends of a leg
-AXES = ("base_axis", "platform_axis")  # kinds: turns of the axes there
-ARMS = ("arm_axis", "arm_point")  # kinds: the line of an arm
+JOINTS = ("base", "platform")  # kinds of joint coordinates at both ends of a leg
+AXES = ("base_axis", "platform_axis")  # kinds of rotations of the axes there
+ARMS = ("arm_axis", "arm_point")  # kinds of the line of an arm
 _XYZ, _TWO = ("x", "y", "z"), ("1", "2")
 _COMPONENTS = {
     **dict.fromkeys(JOINTS, _XYZ),
@@ -17,12 +17,12 @@ _RADIUS = ".radius."
 
 @dataclass(frozen=True, slots=True)
 class ParameterId:
-    """A parameter, as ``<owner>.<kind>`` or ``<owner>.<kind>.<component>`` names it.
+    """A parameter, named ``<owner>.<kind>`` or ``<owner>.<kind>.<component>``.
 
     Attributes
     ----------
     owner : str
-        The leg, motor or view; it may have dots.
+        The leg, motor or view; it may contain dots.
     kind : str
         ``base``, ``platform``, ``offset``, ``length``, ``base_axis``, ``platform_axis``,
         ``twist``, ``radius`` of legs; ``direction``, ``axis``, ``axis_point``, ``arm_axis``,
@@ -37,7 +37,7 @@ class ParameterId:
 
     @classmethod
     def parse(cls, name: str) -> ParameterId:
-        """Return the parameter of a name; the owner is empty where it has no dot."""
+        """Return the parameter of a name; the owner is empty if the name has no dot."""
         head, _, component = name.rpartition(".")
         owner, _, kind = head.rpartition(".")
         if owner and component in _COMPONENTS.get(kind, ()):

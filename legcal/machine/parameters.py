@@ -1,7 +1,8 @@
-"""The parameter vector of legs: names, units, where each number stands, and steps on it.
+"""The parameter vector of legs: names, units, positions of numbers, and steps.
 
-Parameters are joint centres in R_b and R_e, without those that are zero by the definition of these
-frames (their gauge), lengths, two turns of each axis that is a parameter, and twists where asked.
+Parameters are joint centres in R_b and R_e, without the coordinates that are zero by definition of
+these frames (the gauge), lengths, two rotations of each axis that is a parameter, and twists on
+request.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from legcal.machine.model import Machine
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.rods import actuators_of
 
-_STEP = 1e-6  # of numerical derivatives: [rad], and of the extent of the joints
-# Of LegColumns, in this order
+_STEP = 1e-6  # step of numerical derivatives [rad], and relative to the extent of the joints
+# Blocks of LegColumns, in parameter order.
 _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
-    *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # of its actuator
+    *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # those of its actuator
 )
 _LOCAL_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
@@ -46,19 +47,19 @@ _LOCAL_NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class Parametrization:
-    """Where the numbers of each leg stand in a parameter vector."""
+    """The positions of the numbers of each leg in a parameter vector."""
 
     names: tuple[str, ...]  # leg2.base.x, leg1.offset, leg1.length, leg1.base_axis.1, leg1.twist
     units: tuple[str, ...]  # m or rad
-    # (n_legs, 21) of each leg's numbers (LegColumns); -1 for no parameter. Those of an actuator are
-    # shared by all legs on it
+    # (n_legs, 21) index of each number (LegColumns), -1 if it is no parameter; legs on one actuator
+    # share its numbers
     place: IntArray
 
     def __len__(self) -> int:
         return len(self.names)
 
     def scatter(self, by_local: Array, leg: int) -> Array:
-        """Return derivatives (..., 21) by a leg's numbers as derivatives by all parameters."""
+        """Return derivatives (..., 21) by the numbers of a leg as derivatives by all parameters."""
         place = self.place[leg]
         wide = np.zeros((*by_local.shape[:-1], len(self)))
         wide[..., place[place >= 0]] = by_local[..., place >= 0]
@@ -70,7 +71,7 @@ def parametrize(
 ) -> Parametrization:
     """Return the parameters of legs in R_b and R_e.
 
-    Without *twists* these are fixed, and so are the gains of actuators and the lines of arms.
+    Without *twists* the twists, the gains of actuators and the lines of arms are fixed.
     """
     columns = LegColumns
     free = np.zeros((len(legs), columns.COUNT), dtype=np.bool_)
@@ -87,9 +88,9 @@ def parametrize(
             has_arm = twists and leg.actuator.arm is not None
             free[j, ActuatorColumns.ARM_AXIS] = free[j, ActuatorColumns.ARM_POINT] = has_arm
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
-            # B is anywhere on the line
+            # B is arbitrary on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
-    found: list[tuple[str, str]] = []
+    parameters: list[tuple[str, str]] = []
     place = np.full(free.shape, -1, dtype=np.intp)
     for block in _BLOCKS:
         for j, leg in enumerate(legs):
@@ -100,23 +101,23 @@ def parametrize(
                     name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
                 else:
                     name, unit = _name_of_actuator(leg, column)
-                    shared = next((i for i, (n, _) in enumerate(found) if n == name), None)
+                    shared = next((i for i, (n, _) in enumerate(parameters) if n == name), None)
                     if shared is not None:
                         place[j, column] = shared
                         continue
-                place[j, column] = len(found)
-                found.append((name, unit))
-    return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
+                place[j, column] = len(parameters)
+                parameters.append((name, unit))
+    return Parametrization(tuple(n for n, _ in parameters), tuple(u for _, u in parameters), place)
 
 
 def _local_name(leg: Leg, column: int) -> str:
-    """Return the name of one of a leg's own numbers."""
+    """Return the name of a number of the leg itself."""
     is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
     return "length" if is_length else _LOCAL_NAMES[column]
 
 
 def _unit(column: int) -> str:
-    """Return its unit."""
+    """Return the unit of a number."""
     return "m" if column <= LegColumns.LENGTH else "rad"
 
 
@@ -128,9 +129,9 @@ def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
     if column == ActuatorColumns.GAIN:
         return f"{actuator.joint}.gain", ""
     axis = "axis" if actuator.turns else "direction"
-    what, columns, unit = next(
-        (what, columns, unit)
-        for what, columns, unit in (
+    vector, columns, unit = next(
+        (vector, columns, unit)
+        for vector, columns, unit in (
             (axis, ActuatorColumns.AXIS, "rad"),
             ("axis_point", ActuatorColumns.POINT, "m"),
             ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
@@ -138,13 +139,13 @@ def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
         )
         if columns.start <= column < columns.stop
     )
-    return f"{actuator.joint}.{what}.{column - columns.start + 1}", unit
+    return f"{actuator.joint}.{vector}.{column - columns.start + 1}", unit
 
 
 def is_held_by_default(name: str) -> bool:
-    """Say whether a parameter is known unless somebody frees it: a twist, a gain, a line of an arm.
+    """Return whether a parameter is fixed by default: a twist, a gain, a line of an arm.
 
-    That of an arm which is seen is estimated about where the model draws it.
+    The line of a visible arm is estimated, near its line in the model.
     """
     return ParameterId.parse(name).kind in ("twist", "gain", *ARMS)
 
@@ -160,15 +161,15 @@ def n_frame_legs(*, spatial: bool) -> int:
 
 
 def is_spatial(frame_legs: Sequence[int]) -> bool:
-    """Say whether legs whose joints define a frame are of a platform in space, not in a plane."""
+    """Return whether frames defined by these legs are of a spatial platform, not a planar one."""
     return len(frame_legs) == n_frame_legs(spatial=True)
 
 
 def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
-    """Return which joint coordinates, (n_legs, 3), are not zero by the frame's definition.
+    """Return which joint coordinates, (n_legs, 3), are not zero by definition of the frame.
 
-    The frame legs' joints are origin, x axis and xy plane; a planar machine has two, and heights z
-    are no parameters.
+    The joints of the frame legs are origin, x axis and xy plane; a planar machine has two, and
+    heights z are no parameters.
     """
     free = np.ones((n_legs, 3), dtype=np.bool_)
     free[:, 2] = is_spatial(frame_legs)
@@ -177,7 +178,7 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     return free
 
 
-@lru_cache(maxsize=8)  # a job asks dozens of times about one or two machines
+@lru_cache(maxsize=8)  # a job needs those of one or two machines dozens of times
 def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
     parameters = machine.parameters
@@ -189,7 +190,7 @@ def geometries(machine: Machine) -> tuple[Leg, ...]:
 
 
 def legs_in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
-    """Return legs in R_b and R_e as they stand in the links, the inverse of :func:`geometries`."""
+    """Return legs in R_b and R_e transformed to the links, the inverse of :func:`geometries`."""
     return _in_frames(legs, machine.T_base_Rb, machine.T_platform_Re)
 
 
@@ -219,7 +220,7 @@ def _in_frames(
 
 
 def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
-    """Return parameters as one vector [m], passive or not, as :func:`parametrize` orders them."""
+    """Return parameters as one vector [m], passive or not, in the order of :func:`parametrize`."""
     free = free_coordinates(len(parameters.offsets), frame_legs)
     return np.concatenate(
         [parameters.base_joints[free], parameters.platform_joints[free], parameters.offsets]
@@ -227,7 +228,7 @@ def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Arr
 
 
 def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:
-    """Return the parameters of a vector laid out as in :func:`to_vector`."""
+    """Return the parameters of a vector in the order of :func:`to_vector`."""
     free = free_coordinates(n_legs, frame_legs)
     base, platform = np.zeros((n_legs, 3)), np.zeros((n_legs, 3))
     base[free], platform[free], offsets = np.split(vector, [free.sum(), 2 * free.sum()])
@@ -237,7 +238,7 @@ def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> Kinema
 def vector_of(
     parametrization: Parametrization, legs: Sequence[Leg], nominal: Sequence[Leg]
 ) -> Array:
-    """Return the parameters of legs as a vector [m, rad], axes by angles from the nominal ones."""
+    """Return the parameters of legs as a vector [m, rad]; axes are angles from the nominal ones."""
     numbers, is_parameter = numbers_of(legs, nominal), parametrization.place >= 0
     vector = np.zeros(len(parametrization))
     vector[parametrization.place[is_parameter]] = numbers[is_parameter]
@@ -247,7 +248,7 @@ def vector_of(
 def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
     """Return the numbers of legs, (n_legs, 21), in the order of :class:`LegColumns` [m, rad].
 
-    Axes are ``axis_angles`` from the nominal ones, zero for legs without one.
+    Axes are ``axis_angles`` from the nominal axes, zero for legs without.
     """
     numbers = np.zeros((len(legs), LegColumns.COUNT))
     for row, leg, start in zip(numbers, legs, nominal, strict=True):
@@ -265,45 +266,48 @@ def numbers_of(legs: Sequence[Leg], nominal: Sequence[Leg]) -> Array:
 def with_numbers(
     legs: Sequence[Leg], nominal: Sequence[Leg], numbers: Array, given: BoolArray
 ) -> tuple[Leg, ...]:
-    """Return legs of which some numbers, *given* (n_legs, 21), are those of :func:`numbers_of`.
+    """Return legs with some numbers, *given* (n_legs, 21), replaced by those of :func:`numbers_of`.
 
-    Where an axis at the platform or a twist is given the leg has its twist as given.
+    If a platform axis or a twist is given, the twist is taken from the numbers.
     """
-    found = []
-    for leg, start, row, own in zip(legs, nominal, numbers, given, strict=True):
-        if not own.any():
-            found.append(leg)
+    moved_legs = []
+    for leg, start, row, is_given in zip(legs, nominal, numbers, given, strict=True):
+        if not is_given.any():
+            moved_legs.append(leg)
             continue
         axes = []
         for columns, axis, origin in (
             (LegColumns.BASE_AXIS, leg.base_axis, start.base_axis),
             (LegColumns.PLATFORM_AXIS, leg.platform_axis, start.platform_axis),
         ):
-            if axis is not None and origin is not None and own[columns].any():
+            if axis is not None and origin is not None and is_given[columns].any():
                 turned = turned_axis(origin, row[columns])
                 axis = turned if turned @ axis > 0.0 else -turned
             axes.append(axis)
         moved = replace(
             leg,
-            A=np.where(own[LegColumns.A], row[LegColumns.A], leg.A),
-            B=np.where(own[LegColumns.B], row[LegColumns.B], leg.B),
-            q0=float(row[LegColumns.LENGTH]) if own[LegColumns.LENGTH] else leg.q0,
+            A=np.where(is_given[LegColumns.A], row[LegColumns.A], leg.A),
+            B=np.where(is_given[LegColumns.B], row[LegColumns.B], leg.B),
+            q0=float(row[LegColumns.LENGTH]) if is_given[LegColumns.LENGTH] else leg.q0,
             base_axis=axes[0],
             platform_axis=axes[1],
         )
-        if leg.twist is not None and own[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any():
+        if (
+            leg.twist is not None
+            and is_given[LegColumns.PLATFORM_AXIS.start : LegColumns.OWN].any()
+        ):
             moved = replace(moved, twist=tied_twist(moved, start, float(row[LegColumns.TWIST])))
-        of_actuator = own[LegColumns.ACTUATOR]
+        of_actuator = is_given[LegColumns.ACTUATOR]
         if leg.actuator is not None and start.actuator is not None and of_actuator.any():
             numbers_there = leg.actuator.numbers(start.actuator)
             wanted = np.where(of_actuator, row[LegColumns.ACTUATOR], numbers_there)
             moved = replace(moved, actuator=leg.actuator.with_numbers(start.actuator, wanted))
-        found.append(moved)
-    return tuple(found)
+        moved_legs.append(moved)
+    return tuple(moved_legs)
 
 
 def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, ...]:
-    """Return legs after a small step of the parameters, which stand at *place* of it."""
+    """Return legs after a small step of the parameters, with their indices *place*."""
     columns, padded = LegColumns, np.append(step, 0.0)
     moved = []
     for leg, local in zip(legs, padded[place], strict=True):
@@ -334,10 +338,10 @@ def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, 
 def reframed(
     legs: Sequence[Leg], frame_legs: Sequence[int], origin: Array | None = None
 ) -> tuple[Leg, ...]:
-    """Return the same machine with B where models put it, in the frames that these points define.
+    """Return the machine with B at conventional points, in the frames defined by these points.
 
-    *origin* is that of :func:`with_platform_points`; legs without a frame leg that is fixed to the
-    platform stay where they are.
+    *origin* as in :func:`with_platform_points`. Without a frame leg fixed to the platform the
+    frames are unchanged.
     """
     legs = with_platform_points(legs, frame_legs, origin)
     if not any(legs[j].is_fixed_to_platform for j in frame_legs):
@@ -346,15 +350,16 @@ def reframed(
     zero = ~free_coordinates(len(legs), frame_legs)
     moved = _in_frames(legs, RigidTransform.identity(), T)
     return tuple(
-        replace(leg, B=np.where(own, 0.0, leg.B)) for leg, own in zip(moved, zero, strict=True)
+        replace(leg, B=np.where(is_zero, 0.0, leg.B))
+        for leg, is_zero in zip(moved, zero, strict=True)
     )
 
 
 def twist_after(leg: Leg, turn: Rotation) -> float | None:
-    """Return the twist of a leg after its platform axis has been turned, and what is tied to it.
+    """Return the twist of a leg after a rotation of its platform axis, with directions tied to it.
 
-    The twist of a leg that is fixed to the platform counts to the first :func:`normal_basis` vector
-    of its direction, which is not turned with it.
+    The twist of a leg fixed to the platform refers to the first :func:`normal_basis` vector of its
+    direction, which does not rotate with it.
     """
     if leg.twist is None or leg.platform_axis is None or not leg.is_fixed_to_platform:
         return leg.twist
@@ -365,20 +370,20 @@ def twist_after(leg: Leg, turn: Rotation) -> float | None:
 
 
 def tied_twist(leg: Leg, nominal: Leg, twist: float) -> float | None:
-    """Return the twist of a leg that had another one where its platform axis was nominal [rad].
+    """Return the twist of a leg with a given twist at its nominal platform axis [rad].
 
-    The axis went from there by the smallest rotation: what is tied to it has turned about it on any
-    other way.
+    The axis is reached by the smallest rotation from there; on any other path the directions tied
+    to it rotate about it as well.
     """
     turn = _turn_between(nominal.platform_axis, leg.platform_axis)
     return twist_after(replace(nominal, twist=twist), turn)
 
 
 def tied_twist_slope(leg: Leg, nominal: Leg) -> Array:
-    """Return the derivative (2,) of :func:`tied_twist` by turns of the platform axis.
+    """Return the derivative (2,) of :func:`tied_twist` by rotations of the platform axis.
 
-    Beyond the turn that :func:`twist_after` knows: the angle by which the nominal axis, the leg's
-    and the turned one, as corners of a spherical triangle, exceed pi.
+    In addition to the rotation of :func:`twist_after` it contains the spherical excess of the
+    triangle of the nominal axis, the axis of the leg and the rotated axis.
     """
     u, n = leg.platform_axis, nominal.platform_axis
     if u is None or n is None or not leg.is_fixed_to_platform:
@@ -389,7 +394,7 @@ def tied_twist_slope(leg: Leg, nominal: Leg) -> Array:
 
 
 def _twist(leg: Leg, nominal: Leg) -> float:
-    """Return the twist that a leg has with its axes turned back, nearest to the nominal one [rad].
+    """Return the twist of a leg with its axes rotated back, nearest to the nominal twist [rad].
 
     Twists are angles between lines.
     """
@@ -402,7 +407,7 @@ def _twist(leg: Leg, nominal: Leg) -> float:
 
 
 def _turn_between(nominal: Array | None, axis: Array | None) -> Rotation:
-    """Return the smallest rotation that takes a nominal axis to an axis, both as lines."""
+    """Return the smallest rotation of a nominal axis onto an axis, as lines."""
     if nominal is None or axis is None:
         return Rotation.identity()
     return rotation_between(nominal, axis if axis @ nominal >= 0.0 else -axis)
@@ -411,7 +416,7 @@ def _turn_between(nominal: Array | None, axis: Array | None) -> Rotation:
 def nominal_axes(
     leg_names: Sequence[str], nominal: Sequence[Leg]
 ) -> dict[str, dict[str, list[float]]]:
-    """Return the axes that turns count from, at the base in R_b and at the platform in R_e."""
+    """Return the reference axes of rotations, at the base in R_b and at the platform in R_e."""
     named = list(zip(leg_names, nominal, strict=True))
     return {
         "base": {name: leg.base_axis.tolist() for name, leg in named if leg.base_axis is not None},
@@ -426,9 +431,9 @@ def turns_between(
     calibrated: Sequence[Leg],
     nominal: Sequence[Leg],
 ) -> Array:
-    """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
+    """Return the derivative (p, p) of parameters with calibrated axes by those with nominal axes.
 
-    Twists, which are tied to axes, depend on these and on the turns of the axes.
+    Twists are tied to axes and depend on their rotations.
     """
     extent = float(np.ptp([leg.B for leg in calibrated], axis=0).max())
     steps = _STEP * np.where([unit == "m" for unit in parametrization.units], extent, 1.0)
@@ -448,6 +453,6 @@ def turns_between(
 def calibrated_axis(
     nominal: Sequence[float], leg: str, side: str, values: Mapping[str, float]
 ) -> Array:
-    """Return the axis (3,) that a result has, from the nominal one and its turns."""
+    """Return the axis (3,) of a result, from the nominal axis and its rotations."""
     w = np.array([values.get(f"{leg}.{side}_axis.{k}", 0.0) for k in (1, 2)])
     return np.asarray(turned_axis(np.array(nominal), w))

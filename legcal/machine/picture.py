@@ -1,8 +1,8 @@
 """A drawing of a machine at home as SVG: from above and from the side, with numbers of joints.
 
-A joint of the base is a disc ``A1``, one of the platform a disc ``B1``; those that define R_b and
-R_e, the gauge of a calibration, have a ring. Legs are as thick as what is seen of them, axes of
-the frames red (x), green (y) and blue (z). Rails, carriages and arms are brown.
+A joint of the base is a disc ``A1``, a joint of the platform a disc ``B1``; those that define R_b
+and R_e, the gauge of a calibration, have a ring. Legs have the thickness of their visible parts,
+frame axes are red (x), green (y) and blue (z). Rails, carriages and arms are brown.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from legcal.machine.drawing import (
 )
 from legcal.machine.model import Machine, vectors_A_to_B
 
-_SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # of a panel, its margin, title, text [px]
-_ARM = 34.0  # of the axis of a frame [px]
+_SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # panel, margin, title, text line [px]
+_ARM = 34.0  # length of the axis of a frame [px]
 _MARK = b"<!-- legcal inspect -->"
 
 
@@ -40,7 +40,7 @@ MACHINE_PICTURE = OutputFile(
 def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
     """Return a machine as SVG: from above (x to the right, y up) and from the side (z up).
 
-    Of a file these stand side by side; *in_page*, which is narrow, one stands below the other.
+    The views are side by side in a file; *in_page*, which is narrow, one below the other.
     """
     sketch = sketch_of(machine)
     views = sketch.panels
@@ -64,8 +64,8 @@ def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
     ]
     for k, panel in enumerate(views):
         ends = (panel.standing.reshape(-1, 2), panel.moving.reshape(-1, 2))
-        both = np.concatenate([panel.A, panel.B, *ends])
-        middle = 0.5 * (both.min(axis=0) + both.max(axis=0))
+        corners = np.concatenate([panel.A, panel.B, *ends])
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         left, top = _SIDE * (k % across), _HEAD + _SIDE * (k // across)
         corner = np.array([left, top]) + 0.5 * _SIDE
 
@@ -93,7 +93,7 @@ def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
 
 
 def _outline(joints: Array, colour: str) -> Iterator[str]:
-    """Yield the polygon of joints, in the order of their angles about their middle."""
+    """Yield the polygon of joints, in the order of their angles about their centroid."""
     corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in around(joints))
     yield (
         f'<polygon points="{corners}" fill="{colour}" fill-opacity="0.06" stroke="{colour}" '
@@ -104,7 +104,7 @@ def _outline(joints: Array, colour: str) -> Iterator[str]:
 def _joints(
     machine: Machine, end: str, joints: Array, colour: str, *, is_plan: bool
 ) -> Iterator[str]:
-    """Yield discs with numbers and names, a ring around those that define the frames."""
+    """Yield discs with numbers and names, with a ring if they define the frames."""
     middle = joints.mean(axis=0)
     sign = 1.0 if end == "base" else -1.0  # numbers of the base outside or below
     for j, (x, y) in enumerate(joints):
@@ -125,14 +125,14 @@ def _joints(
 
 
 def joint_letter(end: str) -> str:
-    """Return the letter of joints at the base, A, or at the platform, B, before their numbers."""
+    """Return the letter of joint numbers: A at the base, B at the platform."""
     return "A" if end == "base" else "B"
 
 
 def _frame(name: str, points: Array) -> Iterator[str]:
     """Yield the axes of a frame: its origin and the ends of x, y and z."""
     for axis, (end, colour) in enumerate(zip(points[1:], AXIS_COLOURS, strict=True)):
-        if np.linalg.norm(end - points[0]) < 3.0:  # towards the eye
+        if np.linalg.norm(end - points[0]) < 3.0:  # towards the viewer
             continue
         yield _line(points[0], end, colour, 2.0)
         at = points[0] + 1.2 * (end - points[0])
@@ -141,7 +141,7 @@ def _frame(name: str, points: Array) -> Iterator[str]:
 
 
 def _legend(machine: Machine, scale: float, y: float) -> Iterator[str]:
-    """Yield a length to compare with, and which leg has which number."""
+    """Yield a scale bar, and the numbers of the legs."""
     step = _round_length(100.0 / scale)
     yield _line((12, y), (12 + step * scale, y), BASE_COLOUR, 2.0)
     yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
@@ -158,20 +158,20 @@ def _legend(machine: Machine, scale: float, y: float) -> Iterator[str]:
 
 
 def _round_length(length: float) -> float:
-    """Return the greatest 1, 2 or 5 times a power of ten that is not longer."""
+    """Return the largest length of 1, 2 or 5 times a power of ten that is not longer."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
 
 
 def _line(
-    one: Sequence[float] | Array,
-    two: Sequence[float] | Array,
+    start: Sequence[float] | Array,
+    end: Sequence[float] | Array,
     colour: str,
     thick: float,
     opacity: float = 1.0,
 ) -> str:
     return (
-        f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{two[0]:.1f}" y2="{two[1]:.1f}" '
+        f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}" '
         f'stroke="{colour}" stroke-width="{thick:.1f}" stroke-opacity="{opacity:g}" '
         'stroke-linecap="butt"/>'
     )

@@ -1,13 +1,13 @@
-"""More motors than freedoms: readings that agree, and which of those that do not are wrong.
+"""Redundant motors: consistent readings, and the wrong readings among contradicting ones.
 
-What readings of redundant motors cannot have together is left of their equations by no motion of
-the platform. Every reading is tested as if it alone were wrong: its residual over the standard
-deviation that this has if the reading is right, the root of its redundancy (Baarda's data
-snooping). The largest test of a pose names the wrong reading, unless another one explains as much.
+The contradiction of redundant readings is the component of their equations that no platform motion
+changes. Every reading is tested as if it alone were wrong: its residual over the standard deviation
+of this residual for a correct reading, the root of its redundancy (Baarda's data snooping). The
+largest test of a pose identifies the wrong reading, unless another one explains as much.
 
-By a nominal model readings contradict each other although all are right, since joints are not where
-the model has them. Errors of joints, lengths and axes are the same at all poses, so that these tell
-them from wrong readings: they are estimated from the readings, with a prior.
+With a nominal model even correct readings contradict each other, because the joints of the model
+are inexact. Errors of joints, lengths and axes are the same at all poses, which distinguishes them
+from wrong readings: they are estimated from the readings, with a prior.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import actuator_index
 from legcal.machine.solved_poses import solve_poses
 
-# Standard deviation of rough readings, as far as they move a joint: of the mean leg length
+# Standard deviation of rough readings, as motion of a joint relative to the mean leg length.
 ROUGH_READING = 1.5e-4
-REJECTION = 4.5  # a test beyond is that of a wrong reading; of a right one in 150,000 it is
-AS_LIKELY = 25.0  # difference of squared tests from which one reading is clearly the wrong one
-MIN_REDUNDANCY = 1e-3  # of a reading that something else says anything about
-_MODEL = 0.005  # of the mean leg length, angles at it: errors of a nominal model
-_DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
-_AT_REST = 2.5e-6  # mean leg lengths, [rad]: last step of a pose that was found
-_ROUNDS = 20  # in each of which a pose is set aside whose readings contradict each other
-_SAYS = 1e-6  # redundancy of a reading that may explain a contradiction, however wrong it is
-_OF_MEDIAN = 0.6745  # of the standard deviation: the median of absolute values
+REJECTION = 4.5  # threshold of the test of a wrong reading; exceeded by 1 of 150,000 correct ones
+AS_LIKELY = 25.0  # largest difference of squared tests of readings that are equally likely wrong
+MIN_REDUNDANCY = 1e-3  # least redundancy of a reading that can be tested
+_MODEL = 0.005  # standard deviation of a nominal model, relative to the mean leg length
+_DEPENDENT = 1e-7  # singular value of dependent equations, relative to the largest
+_AT_REST = 2.5e-6  # last step of a converged pose [mean leg lengths, rad]
+_ROUNDS = 20  # largest number of poses with contradicting readings that are set aside
+_SAYS = 1e-6  # least redundancy of a reading that may explain a contradiction
+_OF_MEDIAN = 0.6745  # median of absolute values, relative to the standard deviation
 
 
 @dataclass(frozen=True, eq=False)
 class ReadingTests:
-    """How well readings agree with all else, each tested as if it alone were wrong."""
+    """Agreement of readings with all other data, each tested as if it alone were wrong."""
 
     pose: IntArray  # (n,)
-    leg: IntArray  # (n,) whose motor it is
+    leg: IntArray  # (n,) leg of the motor
     r: Array  # (n,) residuals over the standard deviations of the readings
-    redundancy: Array  # (n,) variance of r if the reading is right; 0 if nothing else measures it
+    redundancy: Array  # (n,) variance of r for a correct reading; 0 if nothing else measures it
 
     @cached_property
     def squared(self) -> Array:
-        """Squared residuals over their variance; 0 where nothing else measures what was read."""
+        """Squared residuals over their variance; 0 if nothing else measures the reading."""
         is_tested = self.redundancy > 0.0
         return np.where(is_tested, self.r**2 / np.where(is_tested, self.redundancy, 1.0), 0.0)
 
     @cached_property
     def scale(self) -> float:
-        """How many times their standard deviations the residuals of most readings are, from 1."""
+        """Robust ratio of residuals to their standard deviations, at least 1."""
         is_tested = self.redundancy > 0.0
         if not is_tested.any():
             return 1.0
@@ -68,11 +68,11 @@ class ReadingTests:
     def of_pose(self, pose: int, most: float, scale: float) -> list[int]:
         """Return the readings of a pose one of which is wrong, the likeliest first.
 
-        There are none if no test is beyond *most*, times the *scale* of residuals. Of several one
-        is as likely wrong as another.
+        There are none if no test exceeds *most* times the *scale* of residuals. Several readings
+        are equally likely.
         """
-        own = np.flatnonzero(self.pose == pose)
-        order = own[np.argsort(-self.squared[own], kind="stable")]
+        tests = np.flatnonzero(self.pose == pose)
+        order = tests[np.argsort(-self.squared[tests], kind="stable")]
         squared = self.squared[order]
         if not squared[0] > (scale * most) ** 2:
             return []
@@ -81,54 +81,54 @@ class ReadingTests:
 
 @dataclass(frozen=True, eq=False)
 class Contradiction:
-    """Readings of a pose that no pose of the platform has together."""
+    """Readings of a pose that no platform pose can have together."""
 
-    legs: tuple[int, ...]  # one of whose motors is wrong, that with the least error first
-    off: float  # how far the reading of the first is above what the others show [m or rad]
-    distances: tuple[float, ...]  # how far each, alone wrong, is from there [m at a joint]
-    allowed: float  # how far that of the first may be if readings agree [m]
+    legs: tuple[int, ...]  # legs of which one motor reads wrong, by increasing error
+    off: float  # error of the first reading relative to the others [m or rad]
+    distances: tuple[float, ...]  # error of each if it alone is wrong, as joint motion [m]
+    allowed: float  # largest error of the first if readings agree, as joint motion [m]
 
     def cause(self, machine: Machine) -> Cause:
-        """Return how far the redundant readings disagree, and how far they may."""
+        """Return the disagreement of the redundant readings, and its limit."""
         legs = [machine.legs[j] for j in self.legs]
         first, *others = [leg.motor_label for leg in legs]
         off, *distances = [1e3 * distance for distance in self.distances]
         also = list(zip(others, distances, strict=True))
         words = ", ".join(["{} by {:.1f} mm"] * len(also))
-        alike = f" (or as likely one of {words})" if also else ""
+        alike = f" (or, equally likely, of {words})" if also else ""
         whose = "leg" if legs[0].actuator is None else "motor"
         return Cause(
-            f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from where the other motors put it, "
-            "needed at most {:.1f} mm",
-            (first, *(one for pair in also for one in pair), off, 1e3 * self.allowed),
+            f"the reading of {whose} '{{}}'{alike} {{:.1f}} mm from the value given by the other "
+            "motors, needed at most {:.1f} mm",
+            (first, *(value for pair in also for value in pair), off, 1e3 * self.allowed),
         )
 
 
 def contradictions(
     machine: Machine, T_Rb_Re: Sequence[RigidTransform], readings: Array, sigma: Array | None = None
 ) -> dict[int, Contradiction]:
-    """Return the poses at which readings of redundant motors contradict each other, and which do.
+    """Return the contradictions between readings of redundant motors, by pose.
 
     Parameters
     ----------
     machine : Machine
         A nominal model.
     T_Rb_Re : sequence of RigidTransform
-        The poses of least squares at the readings.
+        The least-squares poses at the readings.
     readings : (n_poses, n_motors) array
         Readings [m, rad].
     sigma : (n_motors,) array, optional
-        Their standard deviations [m, rad]; rough ones where these are smaller, and without.
+        Standard deviations of the readings [m, rad], at least the rough ones (also the default).
     """
     if not machine.is_redundant or len(readings) == 0:
         return {}
     R, t = components(T_Rb_Re)
-    unit = np.array([machine.legs[j].reading_of(1.0) for j in machine.motors])  # of a metre
+    unit = np.array([machine.legs[j].reading_of(1.0) for j in machine.motors])  # reading per metre
     surplus = _Surplus.of(machine, R, t, readings)
     sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, surplus.rough)
     used, scale = np.ones(len(readings), dtype=np.bool_), 1.0
     model = _fitted_model(surplus, sigma_m, used)
-    # One after the other, since a wrong one bends the model, and others seem wrong in its place.
+    # One at a time, since a wrong reading distorts the model, so that others seem wrong.
     for _ in range(min(_ROUNDS, len(used))):
         tests = _tests(machine, surplus, sigma_m, model, used)
         worst = int(tests.pose[np.argmax(tests.squared)])
@@ -140,8 +140,8 @@ def contradictions(
         used, model = others, by_others
     if used.all():
         return {}
-    # A pose of all readings is off where one is wrong: each is tested where the others put it.
-    # One without which the pose is not determined explains all.
+    # A wrong reading shifts the pose of all readings: each is tested at the pose of the others. A
+    # reading without which the pose is undetermined explains everything.
     chi2, r, redundancy = _tested(surplus.at(~used), sigma_m, *model)
     R, t, suspected = R[~used], t[~used], readings[~used]
     is_told = redundancy > 0.0
@@ -153,27 +153,30 @@ def contradictions(
         lengthening = machine.sign * machine.at_readings(others)
         there = solve_poses(geometries(machine), machine.frame_legs, R, t, lengthening)
         at = _Surplus.of(machine, there.R, there.t, suspected)
-        left, own_r, own = (x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model))
-        good = (own > 0.0) & (there.size < _AT_REST)
-        redundancy[good, i], off[good, i] = own[good], own_r[good] / own[good]
-        explained[good, i] = np.maximum(chi2 - left + own * off[:, i] ** 2, 0.0)[good]
+        left, r_there, redundancy_there = (
+            x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model)
+        )
+        good = (redundancy_there > 0.0) & (there.size < _AT_REST)
+        redundancy[good, i] = redundancy_there[good]
+        off[good, i] = r_there[good] / redundancy_there[good]
+        explained[good, i] = np.maximum(chi2 - left + redundancy_there * off[:, i] ** 2, 0.0)[good]
     r = np.sqrt(explained * redundancy)
     judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
-    found = dict[int, Contradiction]()
+    by_pose = dict[int, Contradiction]()
     for k, pose in enumerate(np.flatnonzero(~used).tolist()):
-        alike = [one - k * len(unit) for one in judged.of_pose(pose, REJECTION, scale)]
+        alike = [reading - k * len(unit) for reading in judged.of_pose(pose, REJECTION, scale)]
         if not alike:
             continue
         distance = np.abs(off[k]) * sigma_m
         alike.sort(key=distance.__getitem__)
         i = alike[0]
-        found[pose] = Contradiction(
-            tuple(machine.motors[own] for own in alike),
+        by_pose[pose] = Contradiction(
+            tuple(machine.motors[motor] for motor in alike),
             float(off[k, i] * sigma_m[i] * unit[i]),
             tuple(distance[alike].tolist()),
             float(REJECTION * scale * sigma_m[i] / np.sqrt(redundancy[k, i])),
         )
-    return found
+    return by_pose
 
 
 def _numbers(machine: Machine, poses: BoolArray) -> tuple[IntArray, IntArray]:
@@ -189,47 +192,49 @@ def _tests(
     model: tuple[Array, Array],
     used: BoolArray,
 ) -> ReadingTests:
-    """Return the tests of the readings of poses by the model that they show."""
+    """Return the tests of the readings of poses, with a fitted model."""
     _, r, redundancy = _tested(surplus, sigma_m, *model, used)
     return ReadingTests(*_numbers(machine, used), r[used].ravel(), redundancy[used].ravel())
 
 
 @dataclass(frozen=True, eq=False)
 class _Surplus:
-    """What the equations of legs say beyond the pose, s numbers at each of k poses [m]."""
+    """The components of leg equations that no platform motion changes, s at each of k poses [m]."""
 
     values: Array  # (k, s)
-    by_reading: Array  # (k, s, n_motors) by what readings move joints [m]
-    by_model: Array  # (k, s, p) by parameters, over their standard deviations
-    is_told: BoolArray  # (k, n_motors) of which readings they say anything
-    rough: float  # standard deviation of what is not exact [m]
+    by_reading: Array  # (k, s, n_motors) derivative by joint motions due to readings [m]
+    by_model: Array  # (k, s, p) derivative by parameters in standard deviations
+    is_told: BoolArray  # (k, n_motors) readings that they contain
+    rough: float  # standard deviation of inexact equations [m]
 
     @classmethod
     def of(cls, machine: Machine, R: Array, t: Array, readings: Array) -> _Surplus:
-        """Return them of a nominal model at poses R, t of R_e in R_b and readings."""
+        """Return the components of a nominal model at poses R, t of R_e in R_b and readings."""
         legs, motors = geometries(machine), machine.motors
         lengthening = machine.sign * machine.at_readings(readings)
-        found = equations_at_readings(legs, R, t, lengthening, by_local=True)
-        by_pose = found.by_pose[:, :, list(freedoms(machine.frame_legs))]
-        left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # what no motion changes
-        on, by_reading = actuator_index(legs), np.zeros((*found.values.shape, len(motors)))
+        equations = equations_at_readings(legs, R, t, lengthening, by_local=True)
+        by_pose = equations.by_pose[:, :, list(freedoms(machine.frame_legs))]
+        left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # unchanged by motion
+        on, by_reading = actuator_index(legs), np.zeros((*equations.values.shape, len(motors)))
         for i, j in enumerate(motors):
             if on[j] >= 0:
-                by_reading[:, :, i] = found.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
+                by_reading[:, :, i] = equations.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
             else:
-                by_reading[:, found.measured & (found.leg == j), i] = -legs[j].sign
+                by_reading[:, equations.measured & (equations.leg == j), i] = -legs[j].sign
         parametrization = parametrization_of(machine)
         length = machine.size
         size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
-        by_model = found.by_parameters(parametrization) * (_MODEL * size)
-        values, own, of_model = (
-            np.einsum("kms,km...->ks...", left, x) for x in (found.values, by_reading, by_model)
+        by_model = equations.by_parameters(parametrization) * (_MODEL * size)
+        values, reading_effects, of_model = (
+            np.einsum("kms,km...->ks...", left, x) for x in (equations.values, by_reading, by_model)
         )
-        share = np.sum(own**2, axis=1) / np.maximum(np.sum(by_reading**2, axis=1), 1e-300)
-        return cls(values, own, of_model, share > _SAYS, ROUGH_READING * length)
+        share = np.sum(reading_effects**2, axis=1) / np.maximum(
+            np.sum(by_reading**2, axis=1), 1e-300
+        )
+        return cls(values, reading_effects, of_model, share > _SAYS, ROUGH_READING * length)
 
     def at(self, poses: BoolArray) -> _Surplus:
-        """Return those of some poses."""
+        """Return the components of some poses."""
         return replace(
             self,
             values=self.values[poses],
@@ -239,19 +244,19 @@ class _Surplus:
         )
 
     def information(self, sigma_m: Array) -> Array:
-        """Return the inverse covariance (k, s, s) if the model is right."""
+        """Return the inverse covariance (k, s, s) for a correct model."""
         moved = self.by_reading * sigma_m
         rough = self.rough**2 * np.eye(self.values.shape[1])  # constraints are not exact either
         return np.asarray(np.linalg.inv(moved @ np.swapaxes(moved, 1, 2) + rough))
 
 
 def _fitted_model(surplus: _Surplus, sigma_m: Array, used: BoolArray) -> tuple[Array, Array]:
-    """Return the errors of a model that some poses show, and their covariance."""
-    own = surplus.at(used)
-    weighted = np.swapaxes(own.by_model, 1, 2) @ own.information(sigma_m)
-    H = np.eye(own.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, own.by_model)
+    """Return the errors of a model, estimated from some poses, and their covariance."""
+    subset = surplus.at(used)
+    weighted = np.swapaxes(subset.by_model, 1, 2) @ subset.information(sigma_m)
+    H = np.eye(subset.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, subset.by_model)
     covariance = np.linalg.inv(H)
-    return -covariance @ np.einsum("kps,ks->p", weighted, own.values), covariance
+    return -covariance @ np.einsum("kps,ks->p", weighted, subset.values), covariance
 
 
 def _tested(
@@ -261,9 +266,9 @@ def _tested(
     covariance: Array,
     used: BoolArray | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return chi2 (k,) of poses, and of their readings residuals and redundancies (k, n_motors).
+    """Return chi2 (k,) of poses, and residuals and redundancies (k, n_motors) of their readings.
 
-    *used* are the poses that showed the errors of the model; without it, none of these did.
+    *used* are the poses from which the model was estimated; by default none of them.
     """
     e, P = surplus.values + surplus.by_model @ model, surplus.by_model
     W = surplus.information(sigma_m)
@@ -281,22 +286,22 @@ def _tested(
 
 
 def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
-    """Return what readings q (n_legs,) miss at a pose, (n_legs,) [m]; zero for legs without motor.
+    """Return the residuals of readings q (n_legs,) at a pose [m], zero for legs without motor.
 
-    They are zero up to rounding at the pose of forward kinematics unless motors are redundant.
+    Without redundant motors they vanish at the pose of forward kinematics, up to rounding.
     """
-    motors, found = list(machine.motors), np.zeros(machine.n_legs)
-    found[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
-    return found
+    motors, residuals = list(machine.motors), np.zeros(machine.n_legs)
+    residuals[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return residuals
 
 
 def consistent_readings(
     machine: Machine, readings: Array, at: RigidTransform | None = None
 ) -> Array:
-    """Return the nearest readings (k, n_motors) that motors can have together.
+    """Return the nearest consistent readings (k, n_motors), to first order.
 
-    They are so linearly, from home or another pose T_base_platform. Readings of motors that are not
-    redundant are returned as they are.
+    The linearisation is at home or another pose T_base_platform. Readings without redundancy are
+    returned unchanged.
     """
     if not machine.is_redundant:
         return readings
@@ -310,27 +315,27 @@ def consistent_readings(
 
 
 def determining_readings(machine: Machine, readings: Array) -> Array:
-    """Return readings (k, n_motors) near given ones, NaN of motors beyond the freedoms.
+    """Return readings (k, n_motors) near given ones, NaN for motors beyond the freedoms.
 
-    The others are those that tell most of the pose at home. What readings contradict each other by
-    far from home would have to be shared out among all, which takes many steps.
+    The other motors determine the pose at home best. Using all readings would require distributing
+    their contradiction far from home among all motors, which takes many steps.
     """
     if not machine.is_redundant:
         return readings
-    found = consistent_readings(machine, readings)
-    found[:, _surplus_motors(machine)] = np.nan
-    return found
+    determining = consistent_readings(machine, readings)
+    determining[:, _surplus_motors(machine)] = np.nan
+    return determining
 
 
 @lru_cache(maxsize=8)
 def _surplus_motors(machine: Machine) -> IntArray:
-    """Return which motors of a redundant machine tell least of the pose at home, by number."""
+    """Return the motors of a redundant machine that determine the pose at home least (indices)."""
     _, _, order = qr(reading_span(machine, machine.home).T, mode="economic", pivoting=True)
     return np.asarray(order[machine.mobility :])
 
 
 def reading_span(machine: Machine, T: RigidTransform) -> Array:
-    """Return a basis (n_motors, mobility) of how lengths change together near a pose."""
+    """Return a basis (n_motors, mobility) of joint changes of lengths near a pose."""
     equations = equations_at(machine, T)
     J = equations.by_pose[0][equations.measured]
     C = equations.by_pose[0][~equations.measured]

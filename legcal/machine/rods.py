@@ -1,4 +1,4 @@
-"""What carries the joints A of rods: which hang on which, where A is, and at which readings.
+"""Actuators that carry the joints A of rods: their rods, positions of A, and readings.
 
 See :mod:`legcal.machine.actuator` for how A moves with the reading of its actuator.
 """
@@ -17,20 +17,20 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
 
-AT_ZERO = ", where their motors read 0"  # what is said of joints A that move, after their name
+AT_ZERO = ", where their motors read 0"  # added after the name of moving joints A
 
 
 def actuators_of(legs: Sequence[Leg]) -> tuple[Actuator, ...]:
     """Return the actuators of legs, each once, in the order of their first legs."""
-    found: dict[str, Actuator] = {}
+    actuators: dict[str, Actuator] = {}
     for leg in legs:
         if leg.actuator is not None:
-            found.setdefault(leg.actuator.joint, leg.actuator)
-    return tuple(found.values())
+            actuators.setdefault(leg.actuator.joint, leg.actuator)
+    return tuple(actuators.values())
 
 
 def actuator_index(legs: Sequence[Leg]) -> list[int]:
-    """Return which of :func:`actuators_of` each leg hangs on, -1 for none."""
+    """Return the index of the actuator (:func:`actuators_of`) of each leg, -1 for none."""
     number = {actuator.joint: i for i, actuator in enumerate(actuators_of(legs))}
     return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
 
@@ -39,36 +39,36 @@ def actuator_index(legs: Sequence[Leg]) -> list[int]:
 class Carried:
     """The joints A of legs, each on the path of its actuator (:meth:`Actuator.path`)."""
 
-    on: IntArray  # (n,) which of :func:`actuators_of` carries each; -1 for none
-    gain: Array  # (n,) of actuators that turn
-    middle: Array  # (n, 3), as the others [m]
+    on: IntArray  # (n,) index of its actuator (:func:`actuators_of`), -1 for none
+    gain: Array  # (n,) gain of actuators that turn
+    middle: Array  # (n, 3) [m], like the following
     cos: Array
     sin: Array
     slide: Array
 
     def at(self, q: Array) -> Array:
         """Return the joints (k, n, 3) at readings of actuators (k, n_actuators)."""
-        own, angle = self._own(q)
-        found = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
-        return np.asarray(found + self.slide * own)
+        reading, angle = self._readings_and_angles(q)
+        joints = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
+        return np.asarray(joints + self.slide * reading)
 
     def by_reading(self, q: Array) -> Array:
-        """Return how each joint moves with the reading of its actuator there, (k, n, 3)."""
-        _, angle = self._own(q)
+        """Return the derivative of each joint by the reading of its actuator, (k, n, 3)."""
+        _, angle = self._readings_and_angles(q)
         turning = self.sin * np.cos(angle) - self.cos * np.sin(angle)
         return np.asarray(self.gain[:, None] * turning + self.slide)
 
-    def _own(self, q: Array) -> tuple[Array, Array]:
+    def _readings_and_angles(self, q: Array) -> tuple[Array, Array]:
         """Return the reading of the actuator of each joint, and its angle, (k, n, 1)."""
-        own = np.zeros((len(q), len(self.on)))
+        readings = np.zeros((len(q), len(self.on)))
         carried = self.on >= 0
-        own[:, carried] = q[:, self.on[carried]]
-        return own[..., None], (self.gain * own)[..., None]
+        readings[:, carried] = q[:, self.on[carried]]
+        return readings[..., None], (self.gain * readings)[..., None]
 
 
 @lru_cache(maxsize=16)
 def carried_at_A(legs: tuple[Leg, ...]) -> Carried:
-    """Return the joints A of legs, which ride on actuators."""
+    """Return the joints A of legs as carried by actuators."""
     middle = np.array([leg.A for leg in legs]).reshape(-1, 3)
     cos, sin, slide = (np.zeros_like(middle) for _ in range(3))
     gain = np.zeros(len(legs))
@@ -87,30 +87,30 @@ def joints_at(legs: Sequence[Leg], q: Array) -> Array:
 def arms_at(legs: Sequence[Leg], q: Array) -> dict[int, Array]:
     """Return the ends (k, 2, 3) [m] of arms at readings of actuators (k, n_actuators).
 
-    They are by the legs that have them as parts (:attr:`Leg.arm`), in the frame of A.
+    The keys are the legs that have arms as parts (:attr:`Leg.arm`); the ends are in the frame of A.
     """
-    on, found = actuator_index(legs), dict[int, Array]()
+    on, arms = actuator_index(legs), dict[int, Array]()
     for j, leg in enumerate(legs):
         if leg.actuator is not None and leg.arm is not None:
             ends = [leg.actuator.at(end, q[:, on[j]]) for end in leg.arm.ends]
-            found[j] = np.stack(ends, axis=1)
-    return found
+            arms[j] = np.stack(ends, axis=1)
+    return arms
 
 
 def ends_at_poses(
     legs: Sequence[Leg], R: Array, t: Array, q: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return A and B of legs (k, n_legs, 3) [m] in the frame of the base at poses R, t.
+    """Return A and B of legs (k, n_legs, 3) [m] in the base frame at poses R, t.
 
-    Joints at A that move are where readings q (k, n_actuators) have them, or without these where
-    the first rod on their actuator reaches the platform.
+    Moving joints at A follow readings q (k, n_actuators), or without these the position where the
+    first rod of their actuator reaches the platform.
     """
     q = readings_of_rods(legs, R, t) if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
     return joints_at(legs, q), _platform_joints(legs, R, t)
 
 
 def _platform_joints(legs: Sequence[Leg], R: Array, t: Array) -> Array:
-    """Return B of legs (k, n_legs, 3) [m] in the frame of the base at poses R, t."""
+    """Return B of legs (k, n_legs, 3) [m] in the base frame at poses R, t."""
     B = np.array([leg.B for leg in legs]).reshape(-1, 3)
     return np.asarray(B @ np.swapaxes(R, 1, 2) + t[:, None])
 
@@ -118,7 +118,7 @@ def _platform_joints(legs: Sequence[Leg], R: Array, t: Array) -> Array:
 def ends_in_base(
     legs: Sequence[Leg], T_base_Rb: RigidTransform, R: Array, t: Array, q: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return what :func:`ends_at_poses` does, of legs in R_b, in the base link."""
+    """Return :func:`ends_at_poses` of legs in R_b, transformed to the base link."""
     A, B = (
         T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
         for ends in ends_at_poses(legs, R, t, q)
@@ -127,7 +127,7 @@ def ends_in_base(
 
 
 def reading_legs(legs: Sequence[Leg]) -> tuple[int, ...]:
-    """Return the index of the leg whose encoder reads each leg: rods on one motor share one."""
+    """Return the index of the leg whose encoder reads each leg; rods on one motor share it."""
     first: dict[str | None, int] = {}
     return tuple(
         j if leg.actuator is None else first.setdefault(leg.actuator.joint, j)
@@ -141,7 +141,7 @@ def first_rods(legs: Sequence[Leg]) -> list[int]:
 
 
 def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
-    """Return the readings of actuators (k, n) at poses R, t: those of the first rod on each."""
+    """Return the readings of actuators (k, n) at poses R, t, from the first rod on each."""
     first = first_rods(legs)
     q = np.zeros((len(t), len(first)))
     if first:
@@ -152,21 +152,21 @@ def readings_of_rods(legs: Sequence[Leg], R: Array, t: Array) -> Array:
 
 
 def measured_readings(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:
-    """Return the readings of actuators (k, n) at poses R, t: the measured ones of q (k, n_legs).
+    """Return the readings of actuators (k, n) at poses R, t, the measured ones from q (k, n_legs).
 
-    Elsewhere, where it is NaN, the first rod on the actuator reaches the pose. Beyond a turning
-    point, where that rod stands square to its motion, the pose alone gives another reading.
+    Where q is NaN the first rod on the actuator determines it from the pose; beyond a turning
+    point, with the rod perpendicular to its motion, that gives a different reading.
     """
     read = np.asarray(q, dtype=np.float64)[:, first_rods(legs)]
     return np.where(np.isfinite(read), read, readings_of_rods(legs, R, t))
 
 
 def reading_of_rod(leg: Leg, B: Array) -> Array:
-    """Return the readings (k,) at which a rod reaches points B (k, 3) in the frame of the base.
+    """Return the readings (k,) at which a rod reaches points B (k, 3) in the base frame.
 
-    |A(q) - B| = l has two solutions; the one is taken in whose mode the rod is (``Leg.mode``), of a
-    motor that turns the one nearest to the middle of its travel in whole turns. Where the rod does
-    not reach B it is the reading at which it comes nearest.
+    |A(q) - B| = l has two solutions; the one in the mode of the rod (``Leg.mode``) is taken, for a
+    motor that turns modulo full turns nearest to the middle of its travel. If the rod does not
+    reach B it is the reading at which it comes nearest.
     """
     actuator = leg.actuator
     if actuator is None:
@@ -194,9 +194,9 @@ def reading_of_rod(leg: Leg, B: Array) -> Array:
 
 
 def rod_mode(leg: Leg, q: float, B: Array) -> int:
-    """Return the working mode of a rod at a reading, with B (3,) in the frame of the base.
+    """Return the working mode of a rod at a reading, with B (3,) in the base frame.
 
-    It is the sign of d|AB|/dq: of the two readings at which a rod reaches B, the larger or smaller.
+    It is the sign of d|AB|/dq, which selects one of the two readings at which the rod reaches B.
     """
     if leg.actuator is None:
         return leg.mode

@@ -1,4 +1,4 @@
-"""The YAML of a mechanism: its schema, read strictly and written."""
+"""The YAML of a mechanism: its schema, strict reading, and writing."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,24 +22,24 @@ from legcal.files.schema import (
 from legcal.machine.actuator import Actuator
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
-WHAT = "mechanism file"
+FILE_KIND = "mechanism file"
 MAX_LOOPS = 100
-GAINS = (0.5, 2.0)  # of motors that carry rods: further off the unit is another
-MAX_GAIN_ERROR = 1e-12  # of a gain that is 1
+GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a wrong unit
+MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
 
 
 class MotorEntry(FileSchema):
-    """What a URDF has no place for of a motor that carries rods."""
+    """Numbers of a motor that carries rods which have no place in a URDF."""
 
     gain: Annotated[Number, Field(ge=GAINS[0], le=GAINS[1])] = 1.0  # motion over reading
     centre_us: Number | None = None  # pulse at joint value 0 [us], of a hobby servo
-    us_per_deg: Number | None = None  # negative where longer pulses turn it backwards
+    us_per_deg: Number | None = None  # negative if longer pulses turn it backwards
 
 
 class LegcalBlock(FileSchema):
     """The block ``legcal``: what belongs to base, platform and legs.
 
-    What is missing is proposed, see :mod:`legcal.machine.topology`.
+    Missing entries are proposed, see :mod:`legcal.machine.topology`.
     """
 
     version: Version
@@ -49,8 +49,8 @@ class LegcalBlock(FileSchema):
     platform_joint: str | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
     home: MotionEntry | None = None
-    home_readings: dict[str, float] | None = None  # of actuators at home [m or rad]
-    motors: dict[str, MotorEntry] | None = None  # that carry rods, by their joints
+    home_readings: dict[str, float] | None = None  # readings of actuators at home [m or rad]
+    motors: dict[str, MotorEntry] | None = None  # motors that carry rods, by joint
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
 
     @field_validator("base_frame")
@@ -67,7 +67,7 @@ class LegcalBlock(FileSchema):
 
 
 class MechanismFile(BaseModel):
-    """A mechanism YAML; keys of other programs beside ours are left alone."""
+    """A mechanism YAML; keys of other programs are ignored."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
 
@@ -85,12 +85,12 @@ class MechanismFile(BaseModel):
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
-    """Return a mechanism YAML, checked in itself (its names are checked against the URDF later)."""
-    content = read_file(path, WHAT)
+    """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
+    content = read_file(path, FILE_KIND)
     try:
-        found = parse_yaml(content, path, WHAT)
-        _check_kind(found, path)
-        file = validate(MechanismFile, _without_nulls(found), path)
+        document = parse_yaml(content, path, FILE_KIND)
+        _check_kind(document, path)
+        file = validate(MechanismFile, _without_nulls(document), path)
     except DatasetError as error:
         raise ModelError(error.facts) from error
     problems = _contradictions(file, path)
@@ -99,13 +99,13 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     return file
 
 
-def _check_kind(found: Mapping[str, Any], path: Path) -> None:
-    """Refuse the other YAML files that legcal reads, with the command for each."""
-    if "legcal_table" in found:
+def _check_kind(document: Mapping[str, Any], path: Path) -> None:
+    """Refuse other YAML files of legcal, with the command for each."""
+    if "legcal_table" in document:
         raise ModelError(
             Problem(
-                f"the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
-                f"model; write the model of the table with: legcal new {path} -o DIR",
+                f"the {FILE_KIND} could not be read: found a table of legs (legcal_table), needed "
+                f"a model; write the model of the table with: legcal new {path} -o DIR",
                 file=str(path),
             )
         )
@@ -113,15 +113,15 @@ def _check_kind(found: Mapping[str, Any], path: Path) -> None:
         raise ModelError(what_a_dataset_is_for(path))
 
 
-def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
-    """Drop empty optional lists, which YAML reads as null."""
+def _without_nulls(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the mapping without empty optional lists, which YAML reads as null."""
     return {
-        k: v for k, v in found.items() if v is not None or k not in ("joint_name", "joint_type")
+        k: v for k, v in document.items() if v is not None or k not in ("joint_name", "joint_type")
     }
 
 
 def _contradictions(file: MechanismFile, path: Path) -> list[Problem]:
-    """Return what does not fit together within the file."""
+    """Return the contradictions within the file."""
     problems = []
     if len(file.type) != len(file.closed_loop):
         problems.append(
@@ -204,24 +204,24 @@ def _contradictions(file: MechanismFile, path: Path) -> list[Problem]:
 
 
 def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
-    """Return what the YAML says of actuators beside the URDF, by their joints."""
-    found = dict[str, dict[str, float]]()
+    """Return the YAML entries of actuators that a URDF cannot hold, by joint."""
+    entries = dict[str, dict[str, float]]()
     for actuator in actuators:
-        said = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
+        entry = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
         if actuator.pulses is not None:
-            said["centre_us"] = actuator.pulses.centre
-            said["us_per_deg"] = actuator.pulses.per_degree
-        if said:
-            found[actuator.joint] = said
-    return found
+            entry["centre_us"] = actuator.pulses.centre
+            entry["us_per_deg"] = actuator.pulses.per_degree
+        if entry:
+            entries[actuator.joint] = entry
+    return entries
 
 
 def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
-    """Return the YAML of a mechanism."""
+    """Return the YAML of a mechanism from closures (two frames, kind), motors and block."""
     document = {
-        "closed_loop": [[one, two] for one, two, _ in loops],
+        "closed_loop": [[first, second] for first, second, _ in loops],
         "type": [kind for *_, kind in loops],
         "name_mot": motors,
         "joint_name": [],

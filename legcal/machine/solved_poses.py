@@ -1,4 +1,4 @@
-"""Platform poses from the equations of the legs alone: nearest ones, and those at readings."""
+"""Platform poses from the equations of the legs alone: nearest poses, and poses at readings."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -26,18 +26,18 @@ from legcal.machine.mobility import leg_scale
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
 
-TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # of a leg length
-MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
-DEPENDENT = 1e-7  # of the largest singular value: equations that say the same
+TOLERANCE, ROUNDING = 1e-13, 2.5e-15  # residuals of a solved pose, in leg lengths
+MAX_POSE_ERROR = 0.01  # largest distance of a given pose from a closed one, in leg lengths
+DEPENDENT = 1e-7  # singular value of dependent equations, relative to the largest
 
 
 class SolvedPoses(NamedTuple):
-    """Platform poses of R_e in R_b at which legs miss least."""
+    """Platform poses of R_e in R_b with the least residuals of legs."""
 
     R: Array  # (k, 3, 3)
     t: Array  # (k, 3) [m]
-    missed: Array  # (k,) the largest of what legs still miss [m]
-    # (k,) the last step [rad], mean leg lengths: not small where a pose has not come to rest
+    missed: Array  # (k,) largest remaining residual [m]
+    # (k,) last step [rad, mean leg lengths]; not small if a pose has not converged
     size: Array
 
 
@@ -50,52 +50,52 @@ def solve_poses(
     steps: int = 60,
     scale: Array | None = None,
 ) -> SolvedPoses:
-    """Return the poses near R, t of R_e in R_b where the equations of legs hold at readings.
+    """Return the poses of R_e in R_b, near R, t, at which the leg equations hold at readings.
 
     *lengthening* (k, n_legs) is s q of actuated legs [m] and q of rods on actuators [m, rad], NaN
-    where unknown; without it poses move
-    to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
-    truth) the one with least squares is found; of redundant motors that with least squares of the
-    lengths, the constraints exact. After few *steps* poses are only nearer. Poses are near by their
-    numbers over *scale* (6,), by default 1 rad and the mean leg length.
+    if unknown; without it the nearest poses that meet the constraints are returned. If no pose
+    meets all equations (parameters far from the truth) the result is the least-squares pose; with
+    redundant motors it minimises the squares of the lengths, with exact constraints. After few
+    *steps* poses may not have converged. Distances are relative to *scale* (6,), by default 1 rad
+    and the mean leg length.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
 
     def equations(poses: Array) -> tuple[Array, Array]:
         if lengthening is None:
-            found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
-            found = found.of(~found.measured)
+            rows = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+            rows = rows.of(~rows.measured)
         else:
-            found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        jacobian = found.by_pose.copy()
+            rows = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        jacobian = rows.by_pose.copy()
         jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
+        return rows.values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
     length = mean_length(legs, poses[0]) if len(poses) else 1.0
     if scale is None:
         scale = np.repeat([1.0, length], 3)
     how: dict[str, Any] = {"tolerance": ROUNDING * length, "unit": scale, "rank": DEPENDENT}
-    found = solve(equations, poses_after, poses, steps=steps, **how)
-    poses, missed, size = found.points, found.worst, found.size
+    solution = solve(equations, poses_after, poses, steps=steps, **how)
+    poses, missed, size = solution.points, solution.worst, solution.size
     if lengthening is None or len(poses) == 0:
         return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
-    def with_known(poses: Array) -> PoseEquations:
-        found = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
-        found.by_pose[:, :, fixed] = 0.0
-        return found.of(~found.measured | np.isfinite(lengthening[0, found.leg]))
+    def constraints_and_readings(poses: Array) -> PoseEquations:
+        rows = equations_at_readings(legs, poses[:, :, :3], poses[:, :, 3], lengthening)
+        rows.by_pose[:, :, fixed] = 0.0
+        return rows.of(~rows.measured | np.isfinite(lengthening[0, rows.leg]))
 
-    if is_overdetermined(with_known(poses), freedoms(frame_legs)):
-        found = solve(
-            lambda poses: least_squares_equations(with_known(poses)),
+    if is_overdetermined(constraints_and_readings(poses), freedoms(frame_legs)):
+        solution = solve(
+            lambda poses: least_squares_equations(constraints_and_readings(poses)),
             poses_after,
             poses,
             steps=steps,
             **how,
         )
-        poses, size = found.points, found.size
+        poses, size = solution.points, solution.size
         missed = np.abs(equations(poses)[0]).max(axis=1, initial=0.0)
     return SolvedPoses(poses[:, :, :3], poses[:, :, 3], missed, size)
 
@@ -105,17 +105,17 @@ def solve_postures(
 ) -> tuple[SolvedPoses, Array]:
     """Return the poses near R, t and readings near q (k, n) at which all constraints hold.
 
-    Both move together, as little as possible over *scale* (6 + n,); q are those of actuators.
+    Both move as little as possible, relative to *scale* (6 + n,); q are readings of actuators.
     """
     free = [*freedoms(frame_legs), *range(6, 6 + q.shape[1])]
     fixed = np.setdiff1d(np.arange(6 + q.shape[1]), free)
 
     def equations(points: Array) -> tuple[Array, Array]:
         poses = points[:, :12].reshape(-1, 3, 4)
-        found = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
-        jacobian = np.concatenate([found.by_pose, found.by_q], axis=2)
+        rows = posture_constraints(legs, poses[:, :, :3], poses[:, :, 3], points[:, 12:])
+        jacobian = np.concatenate([rows.by_pose, rows.by_q], axis=2)
         jacobian[:, :, fixed] = 0.0
-        return found.values, jacobian
+        return rows.values, jacobian
 
     def retract(points: Array, step: Array) -> Array:
         poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
@@ -124,20 +124,20 @@ def solve_postures(
     points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
     points = np.concatenate([points, q], axis=1)
     length = mean_length(legs, points[0, :12].reshape(3, 4)) if len(points) else 1.0
-    found = solve(
+    solution = solve(
         equations, retract, points, tolerance=ROUNDING * length, unit=scale, rank=DEPENDENT
     )
-    poses = found.points[:, :12].reshape(-1, 3, 4)
-    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], found.worst, found.size)
-    return solved, found.points[:, 12:]
+    poses = solution.points[:, :12].reshape(-1, 3, 4)
+    solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], solution.worst, solution.size)
+    return solved, solution.points[:, 12:]
 
 
 def project_pose(
     machine: Machine, T: RigidTransform, max_error: float = MAX_POSE_ERROR
 ) -> tuple[RigidTransform, str | None]:
-    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
+    """Return the nearest pose that meets all constraints, and the obstacle if none is near.
 
-    Constraints may be missed by *max_error* leg lengths at the start, T_base_platform.
+    Residuals at the start, T_base_platform, may be up to *max_error* leg lengths.
     """
     if not is_constrained(machine):
         return T, None
@@ -150,15 +150,15 @@ def project_pose(
         return T, describe_worst(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        constraints = ~found.measured
-        return found.values[:, constraints], found.by_pose[:, constraints]
+        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        constraints = ~rows.measured
+        return rows.values[:, constraints], rows.by_pose[:, constraints]
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    found = solve(
+    solution = solve(
         equations, poses_after, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit
     )
-    projected = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-    if found.worst[0] <= 1e-9 * scale:
+    projected = motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
+    if solution.worst[0] <= 1e-9 * scale:
         return projected, None
     return projected, describe_worst(machine, constraints_at(machine, projected))

@@ -1,9 +1,9 @@
 """Roots and least squares of equations, for many points of a manifold at once.
 
-One solver for platform poses and for configurations of the closed chain: Gauss-Newton steps of
-least norm, damped where they do not lead downhill (Levenberg-Marquardt). Where a solution has to be
-the one that belongs to the start, steps are not damped but must shrink; :func:`walk_in_steps` then
-divides the way.
+One solver for platform poses and for configurations of the closed chain: minimum-norm Gauss-Newton
+steps, damped if they do not reduce the cost (Levenberg-Marquardt). If the solution must be the one
+connected to the start, steps are not damped but must contract; :func:`walk_in_steps` then divides
+the path.
 """
 
 from collections.abc import Callable
@@ -17,24 +17,24 @@ from legcal.geometry.types import Array, BoolArray
 Equations = Callable[[Array], tuple[Array, Array]]  # points (k, ...) to (k, m) and (k, m, n)
 Retraction = Callable[[Array, Array], Array]  # points (k, ...) and steps (k, n) to points
 
-RANK = 1e-9  # of the largest singular value: what is smaller counts as dependent
-INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e6  # of the mean eigenvalue
-MIN_STEP = 1e-14  # of the unit
-MAX_TURN = 0.5  # [rad] in one step of a pose
+RANK = 1e-9  # singular value below which directions are dependent, relative to the largest
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e6  # relative to the mean eigenvalue
+MIN_STEP = 1e-14  # least step, in units
+MAX_TURN = 0.5  # largest rotation of a pose in one step [rad]
 
 
 class Solved(NamedTuple):
-    """Where steps ended."""
+    """The result of an iteration."""
 
     points: Array  # (k, ...)
-    values: Array  # (k, m) what is left
+    values: Array  # (k, m) residuals
     jacobian: Array  # (k, m, n)
-    size: Array  # (k,) the largest component of the last step, in its unit
-    converged: BoolArray  # (k,) residual below the tolerance, or least squares at rest
+    size: Array  # (k,) largest component of the last step, in its unit
+    converged: BoolArray  # (k,) residual below the tolerance, or a least-squares minimum
 
     @property
     def worst(self) -> Array:
-        """The largest of what is left, (k,)."""
+        """The largest residual of each point, (k,)."""
         return np.asarray(np.abs(self.values).max(axis=1, initial=0.0))
 
 
@@ -50,11 +50,11 @@ def solve(
     steps: int = 60,
     max_stalled: int | None = None,
 ) -> Solved:
-    """Return the points (k, ...) to which damped steps lead.
+    """Return the solutions (k, ...) from start points, by damped Gauss-Newton steps.
 
-    *tolerance* is that of residuals; *unit* (n,) divides the components of steps before their size
-    counts. Steps are damped from the first if *damped*, else where one does not lead downhill.
-    Points that hardly improve in more than *max_stalled* steps are given up.
+    *tolerance* applies to residuals; sizes of steps are relative to *unit* (n,). Steps are damped
+    from the start if *damped*, else after one that does not reduce the cost. Points with little
+    improvement in more than *max_stalled* steps are given up.
     """
     values, jacobian = equations(points)
     points, values, jacobian = points.copy(), values.copy(), jacobian.copy()
@@ -99,10 +99,11 @@ def newton(
     unit: Array | float = 1.0,
     steps: int = 12,
 ) -> Solved:
-    """Return where steps from points (k, ...) lead, each smaller than the one before.
+    """Return the result of contracting Newton steps from points (k, ...).
 
-    *first* bounds the first step by the same *contraction*. Where steps do not shrink a point has
-    not converged, unless its residual is below the tolerance.
+    Each step must be shorter than the one before, times *contraction*; *first* bounds the first one
+    in the same way. Otherwise a point has not converged, unless its residual is below the
+    tolerance.
     """
     values, jacobian = equations(points)
     size = np.full(len(points), first)
@@ -126,10 +127,10 @@ def newton(
 
 
 def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
-    """Return which part of a way is done, walked in steps that are halved where one fails.
+    """Return the completed fraction of a path, walked in steps that are halved on failure.
 
-    ``attempt(part)`` tries to reach a part of the way from where the last successful one ended; no
-    step is shorter than a part *min_step* of the way.
+    ``attempt(part)`` tries to reach a fraction of the path from the end of the last success; no
+    step is shorter than the fraction *min_step*.
     """
     done, step = 0.0, 1.0
     while done < 1.0:
@@ -144,9 +145,9 @@ def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
 
 
 def poses_after(poses: Array, step: Array) -> Array:
-    """Return poses (k, 3, 4), rotation beside position, after rotations and displacements (k, 6).
+    """Return poses (k, 3, 4) after rotations and displacements (k, 6).
 
-    Steps that turn far are shortened.
+    Steps with large rotations are shortened.
     """
     turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step = step * np.minimum(1.0, MAX_TURN / np.maximum(turn, 1e-300))
@@ -155,12 +156,12 @@ def poses_after(poses: Array, step: Array) -> Array:
 
 
 def _rows(chosen: BoolArray) -> BoolArray | slice:
-    """Return an index of the chosen rows that makes no copies where all are."""
+    """Return an index of the chosen rows, without a copy if all are chosen."""
     return slice(None) if chosen.all() else chosen
 
 
 def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Array:
-    """Return steps (k, n), damped by parts of the mean eigenvalue."""
+    """Return steps (k, n), with damping relative to the mean eigenvalue."""
     free = damping < MIN_DAMPING
     if free.all():
         return -_least(jacobian, values, rank)
@@ -176,7 +177,7 @@ def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Arra
 
 
 def _least(jacobian: Array, values: Array, rank: float) -> Array:
-    """Return the shortest least-squares solutions (k, n) of linear equations."""
+    """Return the minimum-norm least-squares solutions (k, n) of linear equations."""
     if len(values) == 1:
         return _shortest(jacobian[0], values[0], rank)[None]
     if jacobian.shape[1] == jacobian.shape[2]:
@@ -196,7 +197,7 @@ def _shortest_many(jacobian: Array, values: Array, rank: float) -> Array:
 
 
 def _shortest(jacobian: Array, values: Array, rank: float) -> Array:
-    """Return the shortest least-squares solution (n,) of one set of linear equations."""
+    """Return the minimum-norm least-squares solution (n,) of one set of linear equations."""
     if jacobian.shape[0] == jacobian.shape[1]:
         try:
             change = np.linalg.solve(jacobian, values)

@@ -1,8 +1,8 @@
-"""Models of other formats rewritten as a tree with pairs of frames that coincide.
+"""Models of other formats, converted to a tree with pairs of coincident frames.
 
-:class:`Source` is what every reader returns, :class:`UrdfBuilder` writes the URDF of the tree.
-A joint that closes a loop (:class:`Loop`) becomes a pair of frames: a point a ``3d`` pair, a weld a
-``6d`` pair; a revolute or universal joint becomes one or two revolute joints with massless links,
+All readers return a :class:`Source`; :class:`UrdfBuilder` writes the URDF of the tree. A joint that
+closes a loop (:class:`Loop`) is converted to a pair of frames: a point to a ``3d`` pair, a weld to
+a ``6d`` pair, a revolute or universal joint to one or two revolute joints with massless links,
 welded to the other side.
 """
 
@@ -28,16 +28,16 @@ from legcal.machine.urdf import Urdf
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A mechanism as one of its formats has it."""
+    """A mechanism as read from one of the formats."""
 
-    path: Path  # closes the loops; messages name it
+    path: Path  # file with the loops, for messages
     file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
-    notes: tuple[str, ...] = ()  # what the reader should know of the conversion, one sentence each
+    notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
-    is_drawn_open: bool = False  # poses close what a file with all travels draws open
-    drawn: Mapping[str, float] = field(default_factory=dict)  # values of motors there [m, rad]
+    is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
+    drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
 
 
 FULL_TURN = 2.0 * pi
@@ -55,19 +55,19 @@ class TextCylinder:
 
 @dataclass
 class UrdfBuilder:
-    """The lines of a URDF while it is put together."""
+    """The lines of a URDF under construction."""
 
-    links: dict[str, str] = field(default_factory=dict)  # the line of every link and joint, by name
-    joints: dict[str, str] = field(default_factory=dict)  # the line of every link and joint
+    links: dict[str, str] = field(default_factory=dict)  # lines of all links, by name
+    joints: dict[str, str] = field(default_factory=dict)  # lines of all joints, by name
 
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
-        """Return a name that no link and no joint has yet: the given one, or it with a number."""
+        """Return a name unused by links and joints: the given one, or it with a number."""
         taken = self.links.keys() | self.joints.keys() | others
-        number, found = 1, name
-        while found in taken:
+        number, unused = 1, name
+        while unused in taken:
             number += 1
-            found = f"{name}_{number}"
-        return found
+            unused = f"{name}_{number}"
+        return unused
 
     def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
         """Add a link with its visible cylinders."""
@@ -79,7 +79,7 @@ class UrdfBuilder:
         )
 
     def show(self, name: str, visuals: str) -> None:
-        """Add a link, or write it anew where it stands, with its visuals."""
+        """Add or replace a link with its visuals."""
         inside = f">{visuals}</link>" if visuals else "/>"
         self.links[name] = f"  <link name={_quoted(name)}{inside}"
 
@@ -93,14 +93,14 @@ class UrdfBuilder:
         axis: Array | None = None,
         limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
-        """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
+        """Add a joint; ``axis`` and ``limits`` [rad or m] apply to moving joints."""
         moving = ""
         if axis is not None:
             moving = axis_xml(axis) + limit_xml(limits)
         self.connect(name, kind, (parent, child), origin_xml(T_parent_origin) + moving)
 
     def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
-        """Add a joint between parent and child with its elements, the origin first."""
+        """Add a joint between parent and child with its XML elements, the origin first."""
         parent, child = (_quoted(link) for link in links)
         self.joints[name] = (
             f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
@@ -155,17 +155,17 @@ def limit_xml(limits: tuple[float, float] | None) -> str:
 
 
 def _numbers(values: Array) -> str:
-    """Return numbers so that they are read back exactly, rounding noise of zero as zero."""
+    """Return numbers that are read back exactly, with rounding noise of zero as zero."""
     return " ".join(repr(float(x)) if abs(x) > 1e-15 else "0.0" for x in values)
 
 
 def _quoted(text: str) -> str:
-    """Return a text as the value of an attribute."""
+    """Return a text as a quoted attribute value."""
     return f'"{escape(text)}"'
 
 
 def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Path) -> None:
-    """Check that a file holds one mechanism: loops that share a body other than the ground."""
+    """Check that a file holds one mechanism: all loops share a body other than the ground."""
     groups = moving_groups(urdf, closures)
     closed = [links for links, is_closed in groups if is_closed]
     if len(closed) > 1:
@@ -182,7 +182,7 @@ def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Pat
 
 
 def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
-    """Return the links that joints and closures join, without those of the ground."""
+    """Return the groups of connected links, without those on the ground."""
     group = {link: link for link in urdf.links}
 
     def find(link: str) -> str:
@@ -196,10 +196,10 @@ def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[l
             group[find(joint.child)] = find(joint.parent)
     ground = find(urdf.root)
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
-    ends = [(frame_link(urdf, one), frame_link(urdf, two)) for one, two in closures]
-    for one, two in (*pairs, *ends):
-        if ground not in (find(one), find(two)):
-            group[find(two)] = find(one)
+    ends = [(frame_link(urdf, first), frame_link(urdf, second)) for first, second in closures]
+    for first, second in (*pairs, *ends):
+        if ground not in (find(first), find(second)):
+            group[find(second)] = find(first)
     closed = {find(link) for pair in ends for link in pair} - {ground}
     groups: dict[str, list[str]] = {}
     for link in urdf.links:
@@ -228,13 +228,13 @@ TRAVEL_OF_SIZE = 0.05
 
 
 def sliders_without_travel(urdf: Urdf) -> list[str]:
-    """Return the prismatic joints of a URDF that have no limits."""
+    """Return the prismatic joints of a URDF without limits."""
     joints = urdf.joints.values()
     return [joint.name for joint in joints if joint.type == "prismatic" and joint.limits is None]
 
 
 def assumed_travel(poses: Mapping[str, RigidTransform]) -> tuple[float, float]:
-    """Return a travel for sliders that have none written: 5 % of the mechanism to either side."""
+    """Return a default travel for sliders: 5 % of the mechanism to either side."""
     points = np.array([pose.translation for pose in poses.values()])
     size = float(np.ptp(points, axis=0).max())
     reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
@@ -242,11 +242,11 @@ def assumed_travel(poses: Mapping[str, RigidTransform]) -> tuple[float, float]:
 
 
 def travel_note(sliders: Sequence[str], travel: tuple[float, float]) -> str:
-    """Return what the reader must know of sliders whose travel was assumed."""
+    """Return the note on sliders with assumed travel."""
     names = ", ".join(f"'{name}'" for name in sliders[:6])
     return (
         f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[1]:g} m to either "
-        "side of where it is closed was assumed; write their limits."
+        "side of the closed pose was assumed; add their limits."
     )
 
 
@@ -274,10 +274,10 @@ _X, _Y, _Z = np.eye(3)
 class Loop:
     """A joint between two links that closes a loop of the tree."""
 
-    name: str  # new links and joints are named after it
-    kind: LoopKind  # what of both frames coincides
+    name: str  # prefix of new links and joints
+    kind: LoopKind  # coincidence of both frames
     links: tuple[str, str]  # the two links
-    T_link_frame: tuple[RigidTransform, RigidTransform]  # the frame of the joint in either link
+    T_link_frame: tuple[RigidTransform, RigidTransform]  # frame of the joint in either link
     axes: tuple[Array, Array] = (_X, _X)  # unit axis in either frame
 
 
@@ -285,12 +285,12 @@ def close_loop(
     loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
 ) -> tuple[list[str], str]:
     """Add the frames of a loop to a tree and return the closure."""
-    one, two = loop.T_link_frame
+    T_first_frame, T_second_frame = loop.T_link_frame
     if loop.kind in ("revolute", "universal"):
-        one, two = _with_axes(loop, poses)
+        T_first_frame, T_second_frame = _with_axes(loop, poses)
     ends = []
     for number, (link, T_link_frame) in enumerate(
-        zip(loop.links, (one, two), strict=True), start=1
+        zip(loop.links, (T_first_frame, T_second_frame), strict=True), start=1
     ):
         frame = text.unused(f"{loop.name}_{number}")
         text.link(frame)
@@ -308,34 +308,34 @@ def close_loop(
 def _with_axes(
     loop: Loop, poses: Mapping[str, RigidTransform]
 ) -> tuple[RigidTransform, RigidTransform]:
-    """Return the frames turned onto the axes of the joint, alike where the loop is closed."""
-    one, two = loop.T_link_frame
+    """Return the frames turned onto the axes of the joint, equal if the loop is closed."""
+    T_first_frame, T_second_frame = loop.T_link_frame
     first, second = (
         T.rotation.apply(axis) for T, axis in zip(loop.T_link_frame, loop.axes, strict=True)
     )
-    R_two_one = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
+    R_second_first = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
     if loop.kind == "revolute":
         across = _across(first, np.roll(first, 1))
-        across_two = _across(second, R_two_one.apply(across))
+        across_second = _across(second, R_second_first.apply(across))
         rotations = (
             _columns(across, cross(first, across), first),
-            _columns(across_two, cross(second, across_two), second),
+            _columns(across_second, cross(second, across_second), second),
         )
     else:
-        along_y = _across(first, R_two_one.inv().apply(second))
-        along_x = _across(second, R_two_one.apply(first))
+        along_y = _across(first, R_second_first.inv().apply(second))
+        along_x = _across(second, R_second_first.apply(first))
         rotations = (
             _columns(first, along_y, cross(first, along_y)),
             _columns(along_x, second, cross(along_x, second)),
         )
     return (
-        RigidTransform.from_components(one.translation, rotations[0]),
-        RigidTransform.from_components(two.translation, rotations[1]),
+        RigidTransform.from_components(T_first_frame.translation, rotations[0]),
+        RigidTransform.from_components(T_second_frame.translation, rotations[1]),
     )
 
 
 def _across(axis: Array, direction: Array) -> Array:
-    """Return the unit part of a direction across an axis, or another one where it has none."""
+    """Return the unit component of a direction across an axis, or another unit vector across it."""
     for candidate in (direction, np.eye(3)[int(np.argmin(np.abs(axis)))]):
         part = candidate - (candidate @ axis) * axis
         if np.linalg.norm(part) > 1e-3 * np.linalg.norm(candidate):

@@ -1,4 +1,4 @@
-"""A table to start from: that of a family as commented YAML, of a hexapod as CSV too."""
+"""A table template: a family as commented YAML, a hexapod also as CSV."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ platform_joints:
 {platform_joints}
 
 # Shortest and longest length of a leg, from joint centre to joint centre. Readings are zero at the
-# shortest then. If yours are not, give in place of these the length at reading zero and the lowest
-# and highest reading:
+# shortest then. Otherwise give instead the length at reading zero and the lowest and highest
+# reading:
 #   offsets: 380
 #   travel: [0, 120]
 min_length: {min_length}
 max_length: {max_length}
 
-# Radius (half of the diameter) of what is seen of a leg: the thick part at the base, the thin one
-# at the platform.
+# Radius (half of the diameter) of the visible parts of a leg: the thick one at the base, the thin
+# one at the platform.
 radius: {radius}
 
-# Height of the platform's origin over that of the base when the machine stands level.
+# Height of the platform origin above the base origin at home, with a level platform.
 home: {home}
 
 # Rods of constant length that hang on carriages or arms (type 6-PSS, 6-RSS, 3-PRS) need motors:
@@ -77,15 +77,15 @@ platform_joints:
 lengths: {lengths}
 radius: {radius}
 
-# Height of the platform's origin over that of the base when the machine stands level.
+# Height of the platform origin above the base origin at home, with a level platform.
 home: {home}
 """
 
 
 def write_template(folder: Path, given: Dimensions, *, force: bool = False) -> list[Path]:
-    """Write ``NAME.yaml``, of a hexapod ``NAME.csv`` too; files that are there only with *force*.
+    """Write ``NAME.yaml``, and ``NAME.csv`` of a hexapod; existing files only with *force*.
 
-    The numbers are those of a family with the given dimensions.
+    The numbers are of a family with the given dimensions.
     """
     family = str(given.family or "hexapod").lower()
     name = str(given.name or f"my-{family}")
@@ -139,7 +139,7 @@ def _csv(table: dict[str, Any]) -> str:
 
 
 def _flow(value: Any) -> str:
-    """Return a value as YAML writes it in one line."""
+    """Return a value as YAML on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in value.items()) + "}"
     if isinstance(value, list):

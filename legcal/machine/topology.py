@@ -1,10 +1,10 @@
-"""The legs of a machine as a graph: chains of joints between bodies, their plane, and proposals.
+"""The legs of a machine as a graph: chains of joints between bodies, plane of motion, proposals.
 
-A file that does not name base, platform and legs means these: the base is the body of the URDF's
-root, the platform the body where most chains end. Legs come in the order of ``name_mot``, those
-without a motor after them in the order of the URDF; they are named by what their joints' names have
-in front of the first underscore, where that tells them apart. The frames stand on the legs whose
-joints span the largest triangle, or lie farthest apart in a plane.
+Defaults for base, platform and legs: the base is the root body of the URDF, the platform the body
+where most chains end. Legs are in the order of ``name_mot``, followed by legs without a motor in
+the order of the URDF; their names are the prefixes of their joint names before the first
+underscore, if these are distinct. The frames are defined by the legs whose joints span the largest
+triangle, or are farthest apart in a plane.
 """
 
 from collections.abc import Sequence
@@ -38,10 +38,10 @@ from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
 VIRTUAL = ("floating", "planar")
-TIE = 1e-6  # of the largest triangle
+TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
-MAX_JOINTS_OF_LEG = 12  # a sphere written as three revolutes at each end, and a slider, are seven
+MAX_JOINTS_OF_LEG = 12  # three revolutes for a sphere at each end and a slider are seven
 
 
 def find_chains(
@@ -49,7 +49,7 @@ def find_chains(
 ) -> list[LegChain]:
     """Return the legs between two links, each classified as joint, slider or rod, joint.
 
-    Several rods may hang on what one of the *motors* on the base moves.
+    One of the *motors* on the base may carry several rods.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def find_chains(
 
 
 def _joints_on(bodies: Bodies, body: str) -> list[Array]:
-    """Return where the joints of a body stand in it, (3,) each [m]."""
+    """Return the positions of the joints of a body in it, (3,) each [m]."""
     return [
         T[:3, 3]
         for connection in bodies.connections
@@ -153,7 +153,7 @@ def _paths(
 def propose_block(
     urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str], path: Path
 ) -> LegcalBlock:
-    """Return the block ``legcal`` that a file without one means.
+    """Return the default block ``legcal`` for a file without one.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def propose_block(
     link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
     bodies = rigid_bodies(urdf, closures, joint)
     chains = in_order(find_chains(bodies, urdf, urdf.root, link, motors), motors, urdf)
-    joints = [own_joint(chain) for chain in chains]
+    joints = [distinct_joint(chain) for chain in chains]
     names = _leg_names(joints)
     block = LegcalBlock(
         version=1,
@@ -185,7 +185,7 @@ def propose_block(
 
 
 def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]:
-    """Return the legs to define frames with: those whose joints span most on base and platform."""
+    """Return the legs that define the frames: largest span of joints on base and platform."""
     normals = plane_of_motion(chains)
     count = n_frame_legs(spatial=normals is None)
     if len(names) <= count:
@@ -200,7 +200,7 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
     of_motors = [
         [chains[j].motor if chains[j].actuator is not None else names[j] for j in c] for c in chosen
     ]
-    most = max(len(set(of_legs)) for of_legs in of_motors)  # one of each actuator, where possible
+    most = max(len(set(of_legs)) for of_legs in of_motors)  # one leg per actuator, if possible
     chosen = [c for c, m in zip(chosen, of_motors, strict=True) if len(set(m)) == most]
     spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
     first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
@@ -208,23 +208,23 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
 
 
 def level_rotation(A: Array, B: Array) -> Rotation:
-    """Return the rotation of a platform whose joints B (n, 3) lie over those of the base A (n, 3).
+    """Return the rotation of a platform with its joints B (n, 3) over those of the base A (n, 3).
 
-    It turns the directions of the joints from their mean onto each other as well as possible
-    (Kabsch 1976), whatever frames their links have: the platform is level and not turned.
+    It aligns the directions of the joints from their mean in the least-squares sense (Kabsch 1976),
+    independent of the link frames: the platform is level and not turned.
     """
     return Rotation.align_vectors(A - A.mean(axis=0), B - B.mean(axis=0))[0]
 
 
 def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:
-    """Return legs in the order of their motors, then those without one in the order of the URDF."""
+    """Return legs in the order of their motors, then the others in the order of the URDF."""
     rank = {name: i for i, name in enumerate([*urdf.joints, *motors])}
     rank |= {name: i - len(motors) for i, name in enumerate(motors)}
     return sorted(chains, key=lambda chain: rank[any_joint(chain)])
 
 
-def own_joint(chain: LegChain) -> str:
-    """Return a joint that names one leg only: on an actuator not that of the motor."""
+def distinct_joint(chain: LegChain) -> str:
+    """Return a joint that identifies a single leg: on an actuator not the motor."""
     if chain.actuator is None:
         return any_joint(chain)
     named = [s.connection.joint for s in chain.steps[1:] if s.connection.joint]
@@ -232,7 +232,7 @@ def own_joint(chain: LegChain) -> str:
 
 
 def any_joint(chain: LegChain) -> str:
-    """Return a joint that names a leg: its slider, or the first one that it has."""
+    """Return a joint that identifies a leg: its slider, or its first joint."""
     named = [s.connection.joint for s in chain.steps if s.connection.joint]
     return chain.motor or (named[0] if named else "")
 
@@ -240,8 +240,8 @@ def any_joint(chain: LegChain) -> str:
 def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
     """Return the normal of the plane in which a mechanism moves, None if it moves in space.
 
-    All joints must be revolutes, all of their axes parallel; the sliders are perpendicular to
-    them in every leg of the class.
+    All joints must be revolutes with parallel axes; sliders of supported legs are perpendicular to
+    them.
     """
     normals = [_normals(chain) for chain in chains]
     first = normals[0]
@@ -256,7 +256,7 @@ def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
 def normals_in_links(normals: Normals, T_body_link: tuple[Array, Array]) -> Normals:
     """Return the normals in the links of base and platform.
 
-    The last component that is not zero is positive in the base.
+    The last nonzero component is positive in the base.
     """
     base, platform = (T[:3, :3].T @ normal for normal, T in zip(normals, T_body_link, strict=True))
     return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
@@ -265,11 +265,11 @@ def normals_in_links(normals: Normals, T_body_link: tuple[Array, Array]) -> Norm
 def normals_of_closures(
     in_link_frames: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
 ) -> list[Array | None]:
-    """Return for which closures it is enough to hold in the plane, with its normal there.
+    """Return the normals of closures that need to hold in the plane only, None for others.
 
-    Closures of a planar mechanism repeat that it is planar, and contradict each other by what
-    its axes are rounded. All are held in the plane alone; but where a floating joint carries the
-    platform, one more is needed to hold that in the plane.
+    Closures of a planar mechanism all imply that it is planar, and contradict each other by the
+    rounding of its axes. So all hold in the plane only, except one if a floating joint carries the
+    platform, to keep it in the plane.
     """
     if in_link_frames is None:
         return [None] * len(closures)
@@ -290,7 +290,7 @@ def normals_of_closures(
 
 
 def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint, if there is one, has a type that is covered.
+    """Check that the type of the virtual joint, if any, is supported.
 
     Raises
     ------
@@ -303,7 +303,7 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
     if joint.type not in ("floating", "planar"):
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"a {joint.type} joint",
                 "a floating or planar one, which only says where the platform is",
                 "correct it, or write null if a leg carries the platform",
@@ -314,7 +314,7 @@ def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
         axis = ", ".join(f"{x:g}" for x in joint.axis)
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+                f"legcal.platform_joint '{joint.name}' is not supported: found a planar joint "
                 f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
                 "plane of its frame; turn its origin rpy instead.",
                 file=str(path),
@@ -333,11 +333,11 @@ def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> 
     if block.platform_joint is None:
         return
     joint = urdf.joints[block.platform_joint]
-    found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
-    if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
+    carrying = bodies.body_of[joint.parent], bodies.body_of[joint.child]
+    if carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"it between the parent '{joint.parent}' and the child '{joint.child}'",
                 f"'{block.base}' and '{block.platform}'",
                 "name the joint that carries the platform, or write null",
@@ -364,7 +364,7 @@ def check_plane(
     if normals is None:
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 "a planar joint",
                 "a floating one, because the axes of the legs do not let the platform "
                 "move in one plane",
@@ -378,7 +378,7 @@ def check_plane(
         tilt = 90.0 - np.degrees(off_square(z, normal))
         raise OutOfClass(
             Problem(
-                f"legcal.platform_joint '{joint.name}' is not covered",
+                f"legcal.platform_joint '{joint.name}' is not supported",
                 f"its plane {tilt:.4g} deg from the plane in which the legs move",
                 "the same plane within 0.057 deg",
                 "correct its origin rpy",
@@ -388,7 +388,7 @@ def check_plane(
 
 
 def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
-    """Refuse loops of other bodies than those that hang together with the platform."""
+    """Refuse loops of bodies that are not connected with the platform."""
     group = {body: body for body in bodies.body_of.values()}
 
     def find(body: str) -> str:
@@ -398,8 +398,8 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
 
     for connection in bodies.connections:
         if base not in connection.bodies:
-            one, two = (find(body) for body in connection.bodies)
-            group[two] = one
+            first, second = (find(body) for body in connection.bodies)
+            group[second] = first
     others = [
         next(find(body) for body in c.bodies if body != base)
         for c in bodies.connections
@@ -421,10 +421,10 @@ def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: st
 
 
 def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
-    """Refuse a platform that carries, by a joint, another body on which legs end.
+    """Refuse a platform with a further body, connected by a joint, on which legs end.
 
-    Seen from such a body, the legs without base and platform reach the base by several joints, and
-    the platform by this one.
+    From such a body, without passing base or platform, several joints lead to the base and only
+    this one to the platform.
     """
     for connection in bodies.connections:
         if platform not in connection.bodies or connection.joint is None:
@@ -439,13 +439,13 @@ def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str)
 
 
 def _most_joined(bodies: Bodies, members: set[str]) -> str:
-    """Return the body of some where most joints meet."""
+    """Return the body with the most joints."""
     ends = [body for c in bodies.connections for body in c.bodies if body in members]
     return max(sorted(members), key=ends.count)
 
 
 def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
-    """Return a connection as passed from one of its bodies."""
+    """Return a connection passed from one of its bodies to the other."""
     axis = urdf.joints[connection.joint].axis if connection.joint else np.zeros(3)
     return Step(connection, near, 1 - near, axis)
 
@@ -458,7 +458,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     ):
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
                 "at most the virtual one that carries the platform",
                 "name that one in legcal.platform_joint",
@@ -468,7 +468,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     if connection.bodies[0] == connection.bodies[1]:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{_name(connection)} between two links that are rigidly connected",
                 "a joint that can move",
                 "remove it",
@@ -478,7 +478,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
     if set(connection.bodies) == {base, platform}:
         raise OutOfClass(
             Problem(
-                "this mechanism is outside the method",
+                "this mechanism is not supported",
                 f"{_name(connection)} directly between base and platform",
                 "legs",
                 "name it in legcal.platform_joint if it is the virtual joint that "
@@ -491,23 +491,23 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
 def _several_bodies(
     bodies: Bodies, urdf: Urdf, steps: Sequence[Step], body: str, ends: tuple[str, str]
 ) -> Problem | None:
-    """Return which loop inside a leg, or platform of several bodies, a body belongs to, if any.
+    """Return the problem of a body in a loop inside a leg, or in a platform of several bodies.
 
-    Seen from the body without base and platform, the joints of a loop inside a leg reach the base
-    by one joint, and those of a part of the platform by those of several legs.
+    From the body, without passing base or platform, a loop inside a leg leads to the base by one
+    joint, a part of the platform by the joints of several legs.
     """
     on_base, on_platform = _reached(bodies, body, ends)
     if len(on_platform) != 1:
         return None
     if len(on_base) == 1:
         return Problem(
-            "this machine is outside the method",
+            "this machine is not supported",
             f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
             f"closed at link '{body}'",
             "chains without loops that end on the platform itself",
             "if these are the rods of a parallelogram on an arm or a carriage, close "
             "each on the platform as a leg of its own, otherwise this machine cannot "
-            "be calibrated this way",
+            "be calibrated with legcal",
             str(urdf.path),
         )
     if len(on_base) > 1:
@@ -516,14 +516,14 @@ def _several_bodies(
 
 
 def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Problem:
-    """Return why a platform that carries a body on which legs end is refused."""
+    """Return the problem of a platform that carries a body on which legs end."""
     return Problem(
-        "this machine is outside the method",
+        "this machine is not supported",
         "a platform of several bodies (as of an H4 or I4), because legs end on "
         f"link '{body}', which {_name(joint)} connects to the platform",
         "legs that end on one rigid platform",
         f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-        "cannot be calibrated this way",
+        "cannot be calibrated with legcal",
         str(urdf.path),
     )
 
@@ -531,7 +531,7 @@ def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Pro
 def _reached(
     bodies: Bodies, body: str, ends: tuple[str, str]
 ) -> tuple[list[Connection], list[Connection]]:
-    """Return by which joints what hangs together with a body is on base and on platform."""
+    """Return the joints on base and on platform that are connected with a body."""
     base, platform = ends
     reached, new = {body}, [body]
     on_base, on_platform = list[Connection](), list[Connection]()
@@ -560,36 +560,38 @@ def _not_a_chain(
     motors: Sequence[str],
     within: float,
 ) -> Problem:
-    """Return why the leg that starts with some joints is not a chain."""
+    """Return the problem of a leg, given by its first joints, that is not a chain."""
     needed, remedy = "one unbranched chain from base to platform for each leg", ""
     first = steps[0].connection
     last = steps[-1].connection
     if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
         moves = first.joint in motors
         return Problem(
-            f"the leg that starts with {_name(first)} is outside the method",
+            f"the leg that starts with {_name(first)} is not supported",
             f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}",
             "the motor of an arm or a carriage on the base itself",
-            "arms on arms cannot be calibrated this way"
+            "arms on arms cannot be calibrated with legcal"
             if moves
             else "make joints between it and the base fixed if they do not move, otherwise "
-            "this machine cannot be calibrated this way",
+            "this machine cannot be calibrated with legcal",
             str(urdf.path),
         )
     if body == base:
-        found = "returns to the base"
+        course = "returns to the base"
     elif n_onward == 0:
-        found = f"ends at link '{body}' without reaching the platform"
+        course = f"ends at link '{body}' without reaching the platform"
     elif n_onward > 1 and _is_an_arm(steps, within):
-        found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        course = (
+            f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        )
         moved = "a motor in name_mot that moves this link"
         needed = f"joints whose centres are fixed in the base, or {moved}"
         remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
     else:
-        found = f"shares link '{body}' with another leg or branches there"
+        course = f"shares link '{body}' with another leg or branches there"
     return Problem(
         "this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}",
+        f"{_name(first)} {course}",
         "",
         needed,
         f"{remedy}check {urdf.wording.closures}, or {urdf.wording.correct_ends}",
@@ -598,20 +600,22 @@ def _not_a_chain(
 
 
 def _is_an_arm(steps: list[Step], within: float) -> bool:
-    """Say whether joints make an arm whose end moves: one revolute, or several apart."""
+    """Return whether joints form an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
     if len(steps) == 1:
         return True
-    for one, two in pairwise(steps):
-        near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
+    for lower, upper in pairwise(steps):
+        near, far = nearest(
+            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
+        )
         if near is None or far is None or float(np.linalg.norm(far - near)) > within:
             return True
     return False
 
 
 def _name(connection: Connection) -> str:
-    """Return a joint or closure as a message names it."""
+    """Return a joint or closure in words."""
     if connection.joint is not None:
         return f"joint '{connection.joint}'"
     return f"the 3d closure number {(connection.closure or 0) + 1}"
@@ -637,7 +641,7 @@ def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
 def _platform_body(
     bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path, motors: Sequence[str]
 ) -> str:
-    """Return the body where the legs end: every chain from the base to it is a leg of the class."""
+    """Return the body where the legs end: every chain from the base to it is a supported leg."""
     at: dict[str, list[str]] = {}
     for connection in bodies.connections:
         for here, there in (connection.bodies, connection.bodies[::-1]):
@@ -658,21 +662,21 @@ def _platform_body(
     candidates = meeting or [body for body in at if body != base]
     candidates = [body for body in candidates if body in carried] or candidates
     candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last
-    found, reasons = [], list[OutOfClass]()
+    platforms, reasons = [], list[OutOfClass]()
     for body in candidates:
         try:
             find_chains(bodies, urdf, urdf.root, body, motors)
         except OutOfClass as error:
             reasons.append(error)
         else:
-            found.append(body)
-    if len(found) == 1:
-        return found[0]
-    if found:
+            platforms.append(body)
+    if len(platforms) == 1:
+        return platforms[0]
+    if platforms:
         raise OutOfClass(
             Problem(
                 "no platform could be proposed",
-                f"several links where legs could end ({', '.join(found)})",
+                f"several links where legs could end ({', '.join(platforms)})",
                 "one",
                 urdf.wording.state_ends,
                 str(path),
@@ -682,19 +686,19 @@ def _platform_body(
         raise reasons[0]
     raise OutOfClass(
         Problem(
-            "this mechanism is outside the method",
+            "this mechanism is not supported",
             "one closed chain in which no link is a platform on legs, because on "
             "each side of any link more than a slider or a rod moves the joint at A; "
             "needed legs of type joint, slider or rod, joint",
             "",
-            "this machine cannot be calibrated this way",
+            "this machine cannot be calibrated with legcal",
             str(path),
         )
     )
 
 
 def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: str) -> str:
-    """Return the link of a body that most others hang from, or close on."""
+    """Return the link of a body with the most children and closures."""
     links = [link for link in urdf.links if bodies.body_of[link] == body]
     uses = dict.fromkeys(links, 0)
     for joint in urdf.joints.values():
@@ -708,7 +712,7 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
 
 
 def _leg_names(joints: Sequence[str]) -> list[str]:
-    """Return names of legs made of the names of their joints where these tell them apart."""
+    """Return leg names from the names of their joints, if these are distinct."""
     fronts = [joint.split("_")[0] for joint in joints]
     if len(set(fronts)) == len(fronts) and all(map(is_plain_name, fronts)):
         return fronts
@@ -716,7 +720,7 @@ def _leg_names(joints: Sequence[str]) -> list[str]:
 
 
 def _flat(points: Array, normal: Array) -> Array:
-    """Return points without their heights along a normal."""
+    """Return points projected along a normal."""
     return np.asarray(points - (points @ normal)[:, None] * normal)
 
 

@@ -1,4 +1,4 @@
-"""URDF files: read as a checked tree, and written again with other numbers."""
+"""URDF files: reading as a checked tree, and writing with other numbers."""
 
 import math
 import re
@@ -33,7 +33,7 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
         raise ModelError(
             Problem(
                 f"the URDF could not be read: found <{robot.tag}> "
-                "as its outermost element, needed <robot>; give the URDF of the mechanism.",
+                "as its root element, needed <robot>; give the URDF of the mechanism.",
                 file=str(path),
                 line=cast("int", robot.sourceline),
             )
@@ -59,8 +59,8 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
     return robot
 
 
-def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
-    """Return the outermost element of an XML file, without comments, entities or the network."""
+def parse_xml(path: Path, content: bytes, kind: str) -> etree._Element:
+    """Return the root element of an XML file, without comments, entities or the network."""
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False,
         remove_comments=True, remove_pis=True,
@@ -71,7 +71,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
         line = error.lineno or 1
         raise ModelError(
             Problem(
-                f"the {what} could not be read: found {error.msg}, needed "
+                f"the {kind} could not be read: found {error.msg}, needed "
                 "well-formed XML; mend that line, or copy the file again if it was cut off.",
                 file=str(path),
                 line=line,
@@ -81,7 +81,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 f"more than {MAX_ELEMENTS} elements",
                 "fewer",
                 "give the file of one mechanism",
@@ -92,7 +92,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     if document.doctype or document.internalDTD is not None:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 "a document type (<!DOCTYPE>), whose entities are never expanded",
                 "plain XML",
                 "remove it",
@@ -104,7 +104,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
     except UnicodeDecodeError as error:
         raise ModelError(
             Problem(
-                f"the {what} could not be read",
+                f"the {kind} could not be read",
                 "text in another encoding",
                 "UTF-8",
                 "save it as UTF-8",
@@ -116,11 +116,9 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
-MAX_NUMBER = (
-    1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
-)
+MAX_NUMBER = 1e12  # largest plausible length, angle or limit; squares of larger numbers overflow
 
-# element -> attribute -> how many numbers it holds, and whether they must be positive
+# element -> attribute -> number of values, and whether they must be positive
 _NUMERIC: dict[str, dict[str, tuple[int, bool]]] = {
     "origin": {"xyz": (3, False), "rpy": (3, False)},
     "axis": {"xyz": (3, False)},
@@ -145,12 +143,12 @@ class Problems:
     def __len__(self) -> int:
         return len(self.all)
 
-    def add(self, element: etree._Element, found: str, remedy: str) -> None:
-        """Note what is wrong with an element of the file and how to mend it."""
+    def add(self, element: etree._Element, mistake: str, remedy: str) -> None:
+        """Add a problem of an element of the file, with its remedy."""
         name = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
         self.all.append(
             Problem(
-                f"{name} could not be used: it {found}",
+                f"{name} could not be used: it {mistake}",
                 remedy=remedy,
                 file=str(self.path),
                 line=cast("int", element.sourceline),
@@ -159,9 +157,9 @@ class Problems:
             )
         )
 
-    def add_of_file(self, what: str, found: str, needed: str, remedy: str) -> None:
-        """Note what is wrong with the whole file."""
-        self.all.append(Problem(what, found, needed, remedy, str(self.path)))
+    def add_of_file(self, consequence: str, found: str, needed: str, remedy: str) -> None:
+        """Add a problem of the whole file."""
+        self.all.append(Problem(consequence, found, needed, remedy, str(self.path)))
 
     def raise_if_any(self) -> None:
         """Raise all problems as one error."""
@@ -170,7 +168,7 @@ class Problems:
 
 
 def number_list(text: str, count: int) -> list[float] | None:
-    """Return ``count`` finite numbers of sensible size, with spaces between them, or None."""
+    """Return ``count`` finite numbers of plausible size, separated by spaces, or None."""
     words = text.split()
     if len(words) != count or not all(_NUMBER.match(word) for word in words):
         return None
@@ -179,7 +177,7 @@ def number_list(text: str, count: int) -> list[float] | None:
 
 
 def check_numbers(element: etree._Element, problems: Problems) -> None:
-    """Check every number that describes a link or a joint."""
+    """Check every number of a link or a joint."""
     for part in element.iter(*_NUMERIC):
         for attribute, (count, positive) in _NUMERIC[str(part.tag)].items():
             text = part.get(attribute)
@@ -209,7 +207,7 @@ def check_tree(
     """Check that links and joints are one tree, and return its root link."""
     for elements in (links, joints):
         _check_names(elements, problems)
-    known = {e.get("name", "") for e in links}
+    names = {e.get("name", "") for e in links}
     children: dict[str, list[str]] = {}
     parent_joint: dict[str, str] = {}
     for joint in joints:
@@ -219,7 +217,7 @@ def check_tree(
             link = None if end is None else end.get("link")
             if link is None:
                 problems.add(joint, f"has no <{tag} link=...>", "name the link")
-            elif link not in known:
+            elif link not in names:
                 problems.add(
                     joint, f"names the {tag} link '{link}', which is not in the file",
                     "correct the name",
@@ -268,7 +266,7 @@ def _root(
     children: dict[str, list[str]],
     problems: Problems,
 ) -> str:
-    """Return the one link without a parent, from which all others must hang."""
+    """Return the one link without a parent, the root of all others."""
     roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
         problems.add_of_file(
@@ -307,7 +305,7 @@ def _root(
 
 
 def _short(text: str) -> str:
-    """Return a value, cut to what a message can show."""
+    """Return a value, shortened for a message."""
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -327,7 +325,7 @@ class UrdfJoint:
     T_parent_origin: RigidTransform  # the joint frame in the parent link, at joint value zero [m]
     axis: Array  # (3,) unit axis in the joint frame
     limits: tuple[float, float] | None  # lower and upper limit [rad] or [m]
-    line: int  # the line of the file
+    line: int  # line in the file
 
     @property
     def moves(self) -> bool:
@@ -341,13 +339,13 @@ class Urdf:
     """A URDF whose tree, names and numbers have been checked."""
 
     path: Path  # the file
-    content: bytes  # the file as it stands on disk, or the URDF that was made of another format
+    content: bytes  # the file on disk, or the URDF converted from another format
     name: str  # the robot's name
     links: tuple[str, ...]  # link names in the order of the file
     joints: dict[str, UrdfJoint]  # joints by name in the order of the file
     root: str  # the link without a parent
     has_cylinders: bool  # whether any visual is a cylinder
-    wording: Wording = BLOCK  # of messages about the mechanism
+    wording: Wording = BLOCK  # words for messages about the mechanism
 
     @property
     def text(self) -> str:
@@ -361,7 +359,7 @@ def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
 
 
 def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
-    """Return the tree of a URDF that was read before."""
+    """Return the tree of a URDF from its content."""
     robot = parse_robot(path, content)
     problems = Problems(path)
     for element in robot:
@@ -382,20 +380,20 @@ def checked_tree(
     *,
     travel_needed: bool = True,
 ) -> Urdf:
-    """Return the tree of a ``<robot>``, whatever else it holds; see :func:`parse_urdf`."""
+    """Return the tree of a ``<robot>``, ignoring other elements; see :func:`parse_urdf`."""
     links = [e for e in robot if e.tag == "link"]
     joints = [e for e in robot if e.tag == "joint"]
     n_moving = sum(e.get("type") != "fixed" for e in joints)
-    for found, most, what in (
+    for number, most, counted in (
         (len(links), MAX_LINKS, "links"),
         (len(joints), MAX_LINKS, "joints"),
         (n_moving, MAX_MOVING, "joints that move"),
     ):
-        if found > most:
+        if number > most:
             raise ModelError(
                 Problem(
                     "the mechanism could not be read",
-                    f"{found} {what}",
+                    f"{number} {counted}",
                     f"at most {most}",
                     "give one mechanism, with fixed joints where nothing moves",
                     str(path),
@@ -425,7 +423,7 @@ def checked_tree(
 def _joint(
     element: etree._Element, origin: RigidTransform, problems: Problems, travel_needed: bool
 ) -> UrdfJoint | None:
-    """Return a joint, or None with its problems noted."""
+    """Return a joint, or None after noting its problems."""
     n_before = len(problems)
     for tag in ("parent", "child", "origin", "axis", "limit"):
         if len(element.findall(tag)) > 1:
@@ -462,7 +460,7 @@ def _joint(
 
 
 def origins_of(elements: Sequence[etree._Element]) -> Array:
-    """Return the poses (n, 4, 4) that the ``<origin>`` of joints or visuals give."""
+    """Return the poses (n, 4, 4) of the ``<origin>`` of joints or visuals."""
     origins = [element.find("origin") for element in elements]
     rpy, xyz = (
         np.array([_vector(origin, name, (0.0, 0.0, 0.0)) for origin in origins]).reshape(-1, 3)
@@ -474,10 +472,10 @@ def origins_of(elements: Sequence[etree._Element]) -> Array:
 def _vector(
     element: etree._Element | None, attribute: str, default: tuple[float, float, float]
 ) -> Array:
-    """Return three numbers of an attribute, or the default where they are missing or wrong."""
+    """Return three numbers of an attribute, or the default if missing or wrong."""
     text = None if element is None else element.get(attribute)
-    found = None if text is None else number_list(text, 3)
-    return np.array(default if found is None else found)
+    numbers = None if text is None else number_list(text, 3)
+    return np.array(default if numbers is None else numbers)
 
 
 def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
@@ -521,7 +519,7 @@ def _limits(
         )
         return None
     if not bounds_written:
-        return None  # of a revolute, as onshape-to-robot writes joints that turn freely
+        return None  # a revolute without limits, from onshape-to-robot, turns freely
     bounds = [number_list(limit.get(key, "0"), 1) for key in ("lower", "upper")]
     if bounds[0] is None or bounds[1] is None:
         return None
@@ -532,10 +530,9 @@ def _limits(
 
 
 class UrdfPatch:
-    """A URDF whose numbers change; comments, order, unknown tags and line ends stay.
+    """A URDF with changed numbers; comments, order, unknown tags and line ends are kept.
 
-    A file in which nothing changed is left byte for byte. Numbers are written so that they are read
-    back exactly.
+    A file without changes is identical byte for byte. Numbers are read back exactly.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -545,7 +542,7 @@ class UrdfPatch:
         self._changed = False
 
     def set_origin(self, joint: str, xyz: Array | None = None, rpy: Array | None = None) -> None:
-        """Write position [m] and angles about fixed x, y, z [rad] of a joint; None lets them be.
+        """Write position [m] and angles about fixed x, y, z [rad] of a joint; None keeps them.
 
         Raises ModelError if the file has no such joint.
         """
@@ -562,11 +559,11 @@ class UrdfPatch:
         self._write(origin, xyz=xyz, rpy=rpy)
 
     def set_radius(self, link: str, number: int, radius: float) -> None:
-        """Write the radius [m] of one of the visual cylinders of a link, counted from 0."""
+        """Write the radius [m] of a visual cylinder of a link, by its index."""
         self._write(self._cylinders(link)[number][1], radius=np.array([radius]))
 
     def move_cylinder(self, link: str, size: tuple[float, float], T: RigidTransform) -> None:
-        """Move the visual cylinder of a link that has a radius and a length [m] in the link."""
+        """Move the visual cylinder with a radius and a length [m] within its link."""
         visual = next(
             visual
             for visual, shape in self._cylinders(link)
@@ -581,7 +578,7 @@ class UrdfPatch:
         self._write(origin, xyz=np.asarray(after.translation), rpy=rpy)
 
     def _cylinders(self, link: str) -> list[tuple[etree._Element, etree._Element]]:
-        """Return the visuals of a link that are cylinders, with their shapes."""
+        """Return the visual cylinders of a link, as visual and shape."""
         return [
             (visual, shape)
             for element in self._robot.findall("link")
@@ -593,7 +590,7 @@ class UrdfPatch:
         ]
 
     def add_frame(self, parent: str, child: str, link: str, joint: str, T: RigidTransform) -> None:
-        """Add a link, and a fixed joint between parent and child, of which it is one."""
+        """Add a link with a fixed joint; it is the parent or the child of this joint."""
         robot = self._robot
         body = etree.SubElement(robot, "link", name=link)
         element = etree.SubElement(robot, "joint", name=joint, type="fixed")
@@ -609,7 +606,7 @@ class UrdfPatch:
         body.tail, element.tail = "\n  ", "\n"
 
     def add_link_below(self, joint: str, link: str, fixed: str) -> None:
-        """Add a link between a joint and its child, which a fixed joint carries in its place."""
+        """Insert a link between a joint and its child, which is fixed to the new link."""
         element = next(e for e in self._robot.findall("joint") if e.get("name") == joint)
         for child in element.findall("child"):
             carried = str(child.get("link"))
@@ -617,7 +614,7 @@ class UrdfPatch:
             self.add_frame(link, carried, link, fixed, RigidTransform.identity())
 
     def content(self) -> bytes:
-        """Return the file as it is now."""
+        """Return the content of the file with its changes."""
         if not self._changed:
             return self._content
         before = self._content

@@ -1,8 +1,8 @@
-"""What a file calls what a mechanism YAML states, and how it is mended there, for messages.
+"""Names of parts of a mechanism file and clauses of remedies, by file format, for messages.
 
-A mechanism YAML with a block ``legcal`` names home, base, platform and legs; without the block they
-follow from its tree and the pose that this draws. MJCF files and URDFs with loops of their own have
-no place for a block.
+A mechanism YAML with a block ``legcal`` states home, base, platform and legs; without the block
+they follow from the tree and its drawn pose. MJCF files and URDFs with loops have no place for a
+block.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Wording:
-    """Nouns for parts of a file, and the clauses of remedies."""
+    """Nouns for parts of a file, and clauses of remedies."""
 
     closures: str = "closed_loop"
     root: str = "the root of the URDF"

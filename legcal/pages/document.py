@@ -1,4 +1,4 @@
-"""What a page consists of: sections of blocks, with texts as they are and nothing of HTML.
+"""The content of a page: sections of blocks with plain texts, without HTML.
 
 The template has one macro for each class of blocks and escapes every text.
 """
@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from legcal.errors import printable
 
-MAX_ROWS = 2000  # of a table
+MAX_ROWS = 2000  # maximum number of rows shown of a table
 Light = Literal["good", "doubtful", "bad"]
 
 
@@ -24,7 +24,7 @@ Light = Literal["good", "doubtful", "bad"]
 class Number:
     """A number of a table."""
 
-    value: float | None  # in the unit of the column; None shows nothing
+    value: float | None  # in the unit of the column; None for an empty cell
     text: str
 
 
@@ -68,14 +68,14 @@ class Facts:
 
 @dataclass(frozen=True)
 class Table:
-    """A table, which sorts by any column or not; the first :data:`MAX_ROWS` rows are shown."""
+    """A table, sortable by its columns or not; the first :data:`MAX_ROWS` rows are shown."""
 
     kind: ClassVar = "table"
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     note: str = ""
-    first: str = "first"  # which rows are shown of too many: "worst"
+    first: str = "first"  # adjective for the shown rows of too many: "worst"
     folded: bool = False
     sortable: bool = True
 
@@ -86,7 +86,7 @@ class Table:
 
     @property
     def left_out(self) -> str:
-        """What is said where rows are left out."""
+        """The note on rows that are left out."""
         n = len(self.rows)
         return f"The {self.first} {MAX_ROWS} of {n} rows are shown." if n > MAX_ROWS else ""
 
@@ -113,7 +113,7 @@ class Row:
 class Plot:
     """A chart or a scene of plotly, drawn when it comes into sight.
 
-    A scene may have ``modes``, see ``page.js``: what its sliders move.
+    A scene may have ``modes``, see ``page.js``: the motions of its sliders.
     """
 
     kind: ClassVar = "plot"
@@ -142,7 +142,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pieces of images; one that is chosen is enlarged."""
+    """Pieces of images; a click enlarges one."""
 
     kind: ClassVar = "gallery"
     crops: Sequence[Crop]
@@ -156,7 +156,7 @@ class Picture:
     kind: ClassVar = "picture"
     file: str  # its place, relative to the page; or a data URL
     caption: str
-    warning: str = ""  # what is said in red
+    warning: str = ""  # text in red
     edit: int | None = None  # its place in the editor of outlines of the page
     place: int | None = None  # its place in the editor of landmarks, if it is offered there
 
@@ -170,9 +170,9 @@ class Picture:
 class OutlineEditor:
     """A table of outlines that people correct over their photographs and download.
 
-    An image has ``view`` and ``image`` as the table names it, a ``label``, its ``photograph``
-    relative to the page, ``width`` and ``height`` [px], the number of its ``camera``, and
-    ``expected``: both ends [px] of outlines that were not found, by leg, part and edge. A camera
+    An image has ``view`` and ``image`` as in the table, a ``label``, its ``photograph`` relative to
+    the page, ``width`` and ``height`` [px], the number of its ``camera``, and ``expected``: both
+    ends [px] of outlines that were not detected, by leg, part and edge. A camera
     has ``K``, ``distortion`` and ``model``. ``reasons`` has the words of each code of a rejection,
     without a detail and with one in place of ``{}``.
     """
@@ -182,7 +182,7 @@ class OutlineEditor:
     table: str  # its text
     images: Sequence[Mapping[str, Any]]
     cameras: Sequence[Mapping[str, Any]]
-    sigma: float  # of ends that are placed by hand, unless people say otherwise [px]
+    sigma: float  # default standard deviation of ends placed by hand [px]
     reasons: Mapping[str, tuple[str, str]]
 
     @cached_property
@@ -196,10 +196,10 @@ class OutlineEditor:
 class LandmarkEditor:
     """Joints that people click in photographs, and a table of them to download.
 
-    An image has ``view`` and ``image`` as the table names it, a ``label``, its ``photograph``
-    relative to the page, ``width`` and ``height`` [px]. A joint has its ``name`` in the table and
-    its ``label`` in the drawing, whose discs have the name in ``data-joint``. Clicks are numbers of
-    image and joint, u and v [px], and sigma as the table has it.
+    An image has ``view`` and ``image`` as in the table, a ``label``, its ``photograph`` relative to
+    the page, ``width`` and ``height`` [px]. A joint has its ``name`` in the table and its ``label``
+    in the drawing, whose discs have the name in ``data-joint``. Clicks are numbers of image and
+    joint, u and v [px], and sigma as in the table.
     """
 
     kind: ClassVar = "landmarks"
@@ -208,9 +208,9 @@ class LandmarkEditor:
     joints: Sequence[Mapping[str, str]]
     clicks: Sequence[tuple[int, int, float, float, str]]
     drawing: Markup  # of the machine
-    sigma: float  # of a click, unless people say otherwise [px]
+    sigma: float  # default standard deviation of a click [px]
     first: int = 0  # the image that is shown first
-    token: str = ""  # what a server knows its page by; "" where the page is a file
+    token: str = ""  # identifies the page to its server; "" if the page is a file
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a result is worth."""
+    """The verdict on a result."""
 
     light: Light
     word: str
@@ -243,7 +243,7 @@ class Page:
 
 
 def plain(text: str, most: int = 60) -> str:
-    """Return a text for plotly, which would take tags in it for its own; long ones are cut."""
+    """Return a text for plotly, which would interpret tags in it; long texts are cut."""
     shown = printable(text)
     return str(escape(shown if len(shown) <= most else f"{shown[: most - 3]}..."))
 

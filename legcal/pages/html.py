@@ -18,7 +18,7 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-MARK = "legcal-page"  # the name by which a page of legcal is known
+MARK = "legcal-page"  # the name that identifies a page of legcal
 PAGE = OutputFile(
     "the page", "page", "", "a new file or an earlier page of legcal", mark=MARK.encode()
 )
@@ -27,9 +27,9 @@ _EDITORS = {OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
 
 
 def time_of_page() -> str:
-    """Return the time that a page states: now, or that of ``SOURCE_DATE_EPOCH`` if it is set.
+    """Return the time on a page: now, or ``SOURCE_DATE_EPOCH`` if it is set.
 
-    By that variable those who compare files have them made the same again.
+    The variable makes pages reproducible for comparison.
     """
     stated = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now()
@@ -76,7 +76,7 @@ def _environment() -> Environment:
 
 
 def _shown(value: Any) -> Any:
-    """Return what is written of a value: texts without control characters."""
+    """Return a value for the page: texts without control characters."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return printable(value)
     return value

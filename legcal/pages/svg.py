@@ -1,4 +1,4 @@
-"""Drawings that need no script: bars with error bars, histograms, grids of numbers."""
+"""Drawings without scripts: bars with error bars, histograms, grids of numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from legcal.errors import printable
 from legcal.geometry.types import Array
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
-_MAX_BARS = 14  # of a histogram
+_MAX_BARS = 14  # maximum number of bars of a histogram
 _FONT = 'font-family="system-ui, sans-serif"'
 
 
@@ -37,7 +37,7 @@ class Canvas:
     def box(
         self, x: float, y: float, width: float, height: float, colour: str, tip: str = ""
     ) -> None:
-        """Draw a filled rectangle, with a text that shows where the pointer rests."""
+        """Draw a filled rectangle, with a tooltip."""
         inside = f"<title>{escape(printable(tip))}</title>" if tip else ""
         self.parts.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{max(width, 0.0):.1f}" height="{height:.1f}" '
@@ -124,9 +124,9 @@ def error_bars(
     sigmas: Sequence[float | None],
     unit: str,
 ) -> Markup:
-    """Return errors before and after on a scale of decades, with what was predicted of the latter.
+    """Draw errors before and after on a logarithmic scale, with the predicted errors after.
 
-    They are positive; those below a hundred-thousandth of the largest reach the left border.
+    They are positive; errors below a hundred-thousandth of the largest reach the left border.
     """
     left, width, step, top = 190.0, 900.0, 21.0, 48.0
     shown = [x for x in (*before, *after, *(s or 0.0 for s in sigmas)) if x > 0.0] or [1.0]
@@ -163,7 +163,7 @@ def error_bars(
 
 
 def histogram(values: Array, label: str) -> Markup:
-    """Return how many values, none below zero, lie where from zero on."""
+    """Draw a histogram of values that are not negative, from zero on."""
     left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
     canvas = Canvas(width, height, label)
     low, high = 0.0, 1.05 * float(values.max()) or 1.0
@@ -204,18 +204,23 @@ def shade(share: float) -> str:
 def number_grid(
     x: Sequence[float], y: Sequence[float], values: Array, title: str, most: float, digits: int
 ) -> Markup:
-    """Return a map of numbers over x (columns) and y (rows, upwards); NaN leaves a field empty.
+    """Draw a map of numbers over x (columns) and y (rows, upwards); NaN leaves a field empty.
 
-    Each field has its number, darker for more: it can be read without colours.
+    Each field has its number, darker for larger ones: it can be read without colours.
     """
     left, top, size = 44.0, 24.0, 37.0
     width, height = left + size * len(x) + 8.0, top + size * len(y) + 34.0
     canvas = Canvas(width, height, title)
     canvas.text(left, 15.0, title, size=12.5)
-    for row, at in enumerate(y):
+    for row, coordinate in enumerate(y):
         v = top + size * (len(y) - 1 - row)
         canvas.text(
-            left - 6.0, v + 0.5 * size + 4.0, f"{at:z.0f}", anchor="end", size=10.5, colour=DIM
+            left - 6.0,
+            v + 0.5 * size + 4.0,
+            f"{coordinate:z.0f}",
+            anchor="end",
+            size=10.5,
+            colour=DIM,
         )
         for column in range(len(x)):
             u, value = left + size * column, float(values[row, column])
@@ -230,19 +235,19 @@ def number_grid(
                 anchor="middle", size=11 if digits < 4 else 9, colour=colour,
             )  # fmt: skip
     base = top + size * len(y)
-    for column, at in enumerate(x):
+    for column, coordinate in enumerate(x):
         canvas.text(
-            left + size * (column + 0.5), base + 13.0, f"{at:z.0f}", anchor="middle", size=10.5,
-            colour=DIM,
+            left + size * (column + 0.5), base + 13.0, f"{coordinate:z.0f}", anchor="middle",
+            size=10.5, colour=DIM,
         )  # fmt: skip
     canvas.text(left, base + 28.0, "x to the right, y up [mm]", size=11, colour=DIM)
     return canvas.markup()
 
 
 def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
-    """Return a symmetric matrix of numbers from -1 to 1: the area of a square is its size.
+    """Draw a symmetric matrix of numbers from -1 to 1 as squares of proportional area.
 
-    Positive ones are filled, negative ones are outlines.
+    Squares of positive numbers are filled, of negative numbers outlined.
     """
     n = len(names)
     size = float(np.clip(700.0 / max(n, 1), 5.0, 22.0))
@@ -250,11 +255,11 @@ def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
     canvas = Canvas(left + size * n + 10.0, top + size * n + 10.0, title)
     if size > 8.0:
         for k, name in enumerate(names):
-            at = left + size * (k + 0.5)
+            middle = left + size * (k + 0.5)
             shown = name if len(name) < 20 else f"{name[:17]}..."
-            canvas.text(left - 6.0, at + 3.5, shown, anchor="end", size=min(11.0, 0.8 * size))
+            canvas.text(left - 6.0, middle + 3.5, shown, anchor="end", size=min(11.0, 0.8 * size))
             canvas.parts.append(
-                f'<text transform="translate({at + 3.5:.1f} {top - 6:.1f}) rotate(-90)" '
+                f'<text transform="translate({middle + 3.5:.1f} {top - 6:.1f}) rotate(-90)" '
                 f'font-size="{min(11.0, 0.8 * size):g}" fill="{INK}">'
                 f"{escape(printable(shown))}</text>"
             )

@@ -1,8 +1,8 @@
-"""Where a camera may have stood that saw some of the base joints and axes, in closed form.
+"""Candidate camera poses from observed base joints and axes, in closed form.
 
-Three joints not on a line fix it. Joints on one line leave a turn about it, which revolute axes
-across the line fix as lines: often one way, sometimes in several that look nearly alike, as both
-sides of the plane of a planar machine do.
+Three joints not on a line determine the pose. Joints on one line leave a rotation about it, which
+revolute axes across the line determine as lines: often uniquely, sometimes with several nearly
+equal solutions, such as both sides of the plane of a planar machine.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from legcal.geometry.motions import register_points
 from legcal.geometry.types import Array
 from legcal.paper.gibbs import axis_frames
 
-_ON_A_LINE = 0.05  # spread of joints across their line, in that along it
-_ALONG = 0.1  # sine of the angle between an axis and the line: less does not fix a camera
-_MAX_DIFFERENCE = 0.07  # of the mean squared sine of angles between axes, of alike candidates
+_ON_A_LINE = 0.05  # maximum ratio of the spreads of collinear joints across and along their line
+_ALONG = 0.1  # minimum sine of the angle between the line and an axis that determines a camera
+_MAX_DIFFERENCE = 0.07  # between mean squared sines of angles to axes of equivalent candidates
 _TURNS = 720
 
 
 def candidate_camera_poses(
     A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array
 ) -> tuple[list[RigidTransform], bool]:
-    """Return the T_Rb_camera where a camera may have stood, most likely first, and if that is all.
+    """Return the candidates of T_Rb_camera, most likely first, and whether they are all.
 
-    Joints (n, 3) and revolute axes (r, 3) of a view, which are lines, as a model has them and as it
-    sees them. There is none for fewer than two separate joints.
-    The flag is False where the pose is one of a continuum, turned about the line of the joints.
+    Joints (n, 3) and revolute axes (r, 3) of a view are given in the model and in the camera; axes
+    are lines without a sign. There are no candidates for fewer than two separate joints.
+    The flag is False if the pose is one of a continuum, rotated about the line of the joints.
     """
     if len(A_Rb) < 2:
         return [], False
@@ -59,24 +59,24 @@ def signs_seen(v_Rb: Array, v_camera: Array, T_Rb_camera: RigidTransform) -> Arr
 
 
 def _laid_along(A_Rb: Array, line: Array, A_camera: Array) -> RigidTransform:
-    """Return a T_camera_Rb that lays joints along a line on those seen, turned about it anyhow."""
+    """Return a T_camera_Rb that aligns collinear joints, with any rotation about their line."""
     height = (A_Rb - A_Rb.mean(axis=0)) @ line
-    seen = height @ (A_camera - A_camera.mean(axis=0))
-    of_seen, of_line = axis_frames(np.array([seen / np.linalg.norm(seen), line]))
+    seen_line = height @ (A_camera - A_camera.mean(axis=0))
+    of_seen, of_line = axis_frames(np.array([seen_line / np.linalg.norm(seen_line), line]))
     rotation = Rotation.from_matrix(of_seen @ of_line.T)
     shift = A_camera.mean(axis=0) - rotation.apply(A_Rb.mean(axis=0))
     return RigidTransform.from_components(shift, rotation)
 
 
-def _candidate_turns(along: Array, v: Array, seen: Array) -> Array:
-    """Return the turns about a unit vector that lay axes v (r, 3) on those seen, best first."""
+def _candidate_turns(along: Array, v: Array, v_seen: Array) -> Array:
+    """Return the rotations about a unit vector that align axes v (r, 3) with v_seen, best first."""
     turn = 2.0 * np.pi / _TURNS * np.arange(_TURNS)
     axial = (v @ along)[:, None] * along
     across = v - axial
     product = (
-        np.sum(seen * axial, axis=1)
-        + np.cos(turn)[:, None] * np.sum(seen * across, axis=1)
-        + np.sin(turn)[:, None] * np.sum(seen * cross(along, across), axis=1)
+        np.sum(v_seen * axial, axis=1)
+        + np.cos(turn)[:, None] * np.sum(v_seen * across, axis=1)
+        + np.sin(turn)[:, None] * np.sum(v_seen * cross(along, across), axis=1)
     )
     error = 1.0 - np.mean(product**2, axis=1)
     least = np.flatnonzero((error <= np.roll(error, 1)) & (error < np.roll(error, -1)))

@@ -1,13 +1,13 @@
-"""The paper's conditions of identifiability as printed: eqs (10)-(12), (15), (17) and their words.
+"""The paper's conditions of identifiability as printed: eqs (10)-(12), (15), (17) and the text.
 
-They count equations and unknowns. Counts are neither sufficient (n points carry at most
-3n - 6 distances, however often they are seen) nor necessary (everything at once knows more
-than the steps): ranks decide.
+They count equations and unknowns. Counts are neither sufficient (n points have at most 3n - 6
+independent distances, however often they are observed) nor necessary (a joint fit uses more
+information than the steps): ranks decide.
 
-The paper has no joints at A that move. Where actuators carry them the counts are made by analogy
-and marked as ours: (12) counts the axis of every actuator among the revolute axes, with four
-unknowns of an arm and two of a carriage, and the middle of the circle of every rod on an arm as a
-further point; (6') asks for three readings of a carriage, or five of an arm, in one view.
+The paper has no moving joints at A. Where actuators carry them, the counts are made by analogy and
+marked as ours: (12) counts the axis of every actuator among the revolute axes, with four unknowns
+of an arm and two of a carriage, and the centre of the circle of every rod on an arm as a further
+point; (6') needs three readings of a carriage, or five of an arm, in one view.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.parameters import n_frame_legs
 
-MIN_IMAGES = {False: 3, True: 5}  # of one view, for (6'), by whether the actuator turns
-_SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
-_AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
+MIN_IMAGES = {False: 3, True: 5}  # images of one view for (6'), by whether the actuator turns
+_SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of eq (6)
+_AT_ONCE = 3  # legs that determine the pose of the platform in the camera frame, eq (18)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One condition of the paper, a count or a word about legs."""
+    """One condition of the paper, a count or a requirement on legs."""
 
     name: str  # eq12, eq15, eq17, every_leg_seen, two_directions or three_legs_at_once
     ok: bool
     equations: int | None = None  # both sides of a count
     unknowns: int | None = None
-    legs: tuple[int, ...] = ()  # for which it does not hold
+    legs: tuple[int, ...] = ()  # legs that do not fulfil it
     needed: bool = True  # (12) is not, where a calibration board ties the cameras to each other
     by_analogy: bool = False  # ours and not the paper's: joints at A move
 
@@ -57,9 +57,9 @@ def count_conditions(
 ) -> tuple[Condition, ...]:
     """Return (12), (15), (17) and "every leg seen" from the legs that each camera position shows.
 
-    As printed. Of E = l + 2(n - N_d) the first term is read as 1; passive legs count in E
-    although (19) finds them. ``revolute`` are the legs with a revolute joint at the base,
-    ``actuators`` those on each actuator that moves joints at A, and whether it turns.
+    As printed. The first term of E = l + 2(n - N_d) is read as 1; passive legs count in E although
+    (19) determines them. ``revolute`` are the legs with a revolute joint at the base,
+    ``actuators`` the legs on each actuator that moves joints at A, and whether it turns.
     """
     n_d = n_frame_legs(spatial=spatial)  # N_d: joint centres that define a frame
     joints_base = 3 + 3 * (n_legs - n_d) + 2 * len(revolute) if spatial else 2 + 2 * (n_legs - n_d)
@@ -71,7 +71,7 @@ def count_conditions(
         middles = sum(len(set(legs) & set(on)) for on, turns in actuators if turns)
         r += sum(not set(legs).isdisjoint(on) for on, _ in actuators)
         n += middles
-        # The arm of a rod is square to the axis of its actuator, which says nothing
+        # The product of the arm of a rod and the axis of its actuator is zero: no information
         products += comb(r, 2) + comb(n, 2) + r * max(n - 1, 0) - middles
         distances += comb(len(set(legs) - set(passive)), 2)
     n_offsets, ours = n_legs - len(set(passive)), bool(actuators)
@@ -87,7 +87,7 @@ def count_conditions(
 
 
 def two_directions(view: IntArray, leg: IntArray, u: Array, n_legs: int) -> Condition:
-    """Return whether each leg is seen in two different directions from one camera position.
+    """Return the condition that each leg is seen in two directions from one camera position.
 
     ``u`` (k, 3) are observed directions, in one frame for all of a view.
     """
@@ -98,25 +98,26 @@ def two_directions(view: IntArray, leg: IntArray, u: Array, n_legs: int) -> Cond
     np.add.at(information, (view, leg), normal)
     np.add.at(number, (view, leg), 1.0)
     smallest = np.linalg.eigvalsh(information)[..., 0]
-    found = ((number > 0) & (smallest > _SAME_DIRECTION * number)).any(axis=0)
-    return _without("two_directions", set(np.flatnonzero(~found).tolist()))
+    has_two = ((number > 0) & (smallest > _SAME_DIRECTION * number)).any(axis=0)
+    return _without("two_directions", set(np.flatnonzero(~has_two).tolist()))
 
 
 def enough_readings(
     view: IntArray, leg: IntArray, q: Array, legs: Sequence[Leg]
 ) -> tuple[Condition, ...]:
-    """Return whether each rod on an actuator is seen at enough readings from one position, (6').
+    """Return the condition that each rod on an actuator is seen at enough readings, (6').
 
-    ``q`` (k,) are the readings of observed rods ``leg`` (k,). None where no joint at A moves.
+    They are counted for one camera position. ``q`` (k,) are the readings of observed rods ``leg``
+    (k,). There is no condition where no joint at A moves.
     """
     carried = {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator is not None}
     if not carried:
         return ()
     missing = set()
     for j, actuator in carried.items():
-        here = leg == j
-        seen = [len(np.unique(q[here & (view == v)])) for v in np.unique(view[here])]
-        if max(seen, default=0) < MIN_IMAGES[actuator.turns]:
+        of_leg = leg == j
+        n_readings = [len(np.unique(q[of_leg & (view == v)])) for v in np.unique(view[of_leg])]
+        if max(n_readings, default=0) < MIN_IMAGES[actuator.turns]:
             missing.add(j)
     return (replace(_without("enough_readings", missing), by_analogy=True),)
 
@@ -124,7 +125,7 @@ def enough_readings(
 def three_legs_at_once(
     views: Sequence[Collection[int]], legs: Sequence[Leg], *, spatial: bool = True
 ) -> Condition:
-    """Return whether the legs of which (18) or (19) speaks are seen with enough others at once.
+    """Return the condition that the legs in (18) and (19) are seen with enough others at once.
 
     A revolute joint on the platform (18) and the axes of a universal joint in a leg without an S
     joint need a view that shows the leg and three legs in all; the end of a passive leg (19) a

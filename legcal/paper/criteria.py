@@ -1,4 +1,4 @@
-"""The weights of the four steps: the choice that commands offer, without anything heavy."""
+"""The weights of the four steps: the choices for options of commands, without heavy imports."""
 
 from typing import Literal
 

@@ -1,12 +1,12 @@
 """The paper's equations (6) to (19), each as one CasADi expression.
 
-Every function is one of the unknowns, of errors of what was observed, and of what was observed:
-(local, error, *observed) -> residuals. Errors are zero where residuals are evaluated; covariances
+Every function depends on the unknowns, on errors of the observed values, and on these values:
+(local, error, *observed) -> residuals. Errors are zero in the evaluation of residuals; covariances
 of axes become weights by the derivatives with respect to them. Of the three residuals of a vector
-product two are independent: (6), (18) and (19) have those across the direction.
+product two are independent: (6), (18) and (19) have the two across the direction.
 
 An observed direction is u + e1 alpha1 + e2 alpha2, its normal basis E being e1, e2 as rows. An
-error of a pose is a step as :func:`~legcal.paper.gibbs.moved_points` has it.
+error of a pose is a step of :func:`~legcal.paper.gibbs.moved_points`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
 from legcal.machine.leg import JointType
 from legcal.paper.gibbs import moved_points, turned_frame, turned_points
 
-END_ERRORS = 3  # of the end of a leg (13): two of its direction, and that of its reading
+END_ERRORS = 3  # errors of the end of a leg (13): two of its direction, one of its reading
 
 
 @cache
@@ -31,7 +31,7 @@ def joint_on_axis() -> ca.Function:
     """Return (6) and (6'): (A_1, A_2, A_3; alpha, beta; b, u, M, E) -> (M - A) x u (2,) [m].
 
     The joint is at A = b_1 A_1 + b_2 A_2 + b_3 A_3, the numbers b being functions of its reading:
-    1, 0, 0 of a joint that stands, 1, q, 0 on a carriage, 1, cos q, sin q on an arm.
+    1, 0, 0 for a fixed joint, 1, q, 0 on a carriage, 1, cos q, sin q on an arm.
     """
     local, error, b = ca.SX.sym("local", 9), ca.SX.sym("error", 4), ca.SX.sym("b", 3)
     u, M, E = ca.SX.sym("u", 3), ca.SX.sym("M", 3), ca.SX.sym("E", 2, 3)
@@ -42,11 +42,11 @@ def joint_on_axis() -> ca.Function:
 
 @cache
 def joint_of_motion(*, turns: bool) -> ca.Function:
-    """Return what (6') found as a joint: (A_1..A_n; -) -> (A, w, c) (9,).
+    """Return the joint from the solution of (6'): (A_1..A_n; -) -> (A, w, c) (9,).
 
     A is the joint at reading 0, w the unit axis of the actuator and c a point of it. On a carriage
     A_1 + q A_2 is the joint; on an arm A_1 + cos q A_2 + sin q A_3, where A_2 and A_3 are replaced
-    by the nearest vectors that are square to each other and of one length.
+    by the nearest vectors that are orthogonal and of equal length.
     """
     n = 3 if turns else 2
     local = ca.SX.sym("local", 3 * n)
@@ -76,11 +76,11 @@ def leg_across_axis() -> ca.Function:
 
 @dataclass(frozen=True)
 class LegInView:
-    """A leg in a view, and what of it is a vector of V (8), (8')."""
+    """A leg in a view, and its vectors in V (8), (8')."""
 
     places: tuple[int, ...]  # of A (3), turns of v, of w and displacements of c among the unknowns
     has_axis: bool  # its revolute axis v is located
-    has_actuator: bool  # the axis w of what moves its joint at A is a vector
+    has_actuator: bool  # the axis w of the actuator of its joint at A is a vector
     has_arm: bool  # so is the arm to its joint, from the nearest point of w
 
 
@@ -96,36 +96,40 @@ def pairs_of_vectors(legs: Sequence[LegInView]) -> list[tuple[int, int]]:
 def vectors_of_view(legs: tuple[LegInView, ...]) -> ca.Function:
     """Return (8): (-; errors; A, v, w, c of each leg) -> the vectors of V in a camera, (3 n,).
 
-    Errors are those of A, v, w and c, leg by leg; c is a point of the axis w.
+    Errors are of A, v, w and c, leg by leg; c is a point of the axis w.
     """
     n = len(legs)
-    none, error, seen = ca.SX.sym("local", 0), ca.SX.sym("error", 12 * n), ca.SX.sym("seen", 12, n)
-    shifted = seen + ca.reshape(error, 12, n)
+    none, error, observed = (
+        ca.SX.sym("local", 0),
+        ca.SX.sym("error", 12 * n),
+        ca.SX.sym("seen", 12, n),
+    )
+    shifted = observed + ca.reshape(error, 12, n)
     of_legs = [tuple(ca.vertsplit(shifted[:, j], 3)) for j in range(n)]
-    return ca.Function("vectors", [none, error, seen], [ca.vertcat(*_vectors(legs, of_legs))])
+    return ca.Function("vectors", [none, error, observed], [ca.vertcat(*_vectors(legs, of_legs))])
 
 
 @cache
 def products_in_base(legs: tuple[LegInView, ...], n_unknowns: int) -> ca.Function:
-    """Return (9) and (9') of a view: (unknowns; -; ...) -> V_p . V_q in R_b less that in R_c.
+    """Return (9) and (9') of a view: (unknowns; -; ...) -> V_p . V_q in R_b minus R_c.
 
     Observed are, a column a leg, the known coordinates of A, the frames of v and of w and points of
     w; then the products of :func:`pairs_of_vectors` in the camera, and the units of residuals.
     """
     n, pairs = len(legs), pairs_of_vectors(legs)
-    x, error, seen, unit = (ca.SX.sym("x", m) for m in (n_unknowns, 0, len(pairs), len(pairs)))
+    x, error, products, unit = (ca.SX.sym("x", m) for m in (n_unknowns, 0, len(pairs), len(pairs)))
     observed = [ca.SX.sym(f"o{k}", 3, size * n) for k, size in enumerate((1, 3, 3, 1))]
-    known, frames, of_actuators, points = observed
+    known_A, frames, of_actuators, points = observed
     padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ...]]()
     for j, leg in enumerate(legs):
-        own, each = padded[list(leg.places)], slice(3 * j, 3 * j + 3)
-        v = turned_frame(own[3:5], frames[:, each])[:, 0]
-        w = turned_frame(own[5:7], of_actuators[:, each])[:, 0]
-        c = points[:, j] + of_actuators[:, each][:, 1:] @ own[7:9]
-        of_legs.append((own[:3] + known[:, j], v, w, c))
+        values, columns = padded[list(leg.places)], slice(3 * j, 3 * j + 3)
+        v = turned_frame(values[3:5], frames[:, columns])[:, 0]
+        w = turned_frame(values[5:7], of_actuators[:, columns])[:, 0]
+        c = points[:, j] + of_actuators[:, columns][:, 1:] @ values[7:9]
+        of_legs.append((values[:3] + known_A[:, j], v, w, c))
     V = _vectors(legs, of_legs)
-    residuals = ca.vertcat(*[ca.dot(V[p], V[q]) for p, q in pairs]) - seen
-    return ca.Function("products", [x, error, *observed, seen, unit], [residuals / unit])
+    residuals = ca.vertcat(*[ca.dot(V[p], V[q]) for p, q in pairs]) - products
+    return ca.Function("products", [x, error, *observed, products, unit], [residuals / unit])
 
 
 def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ...]]) -> list[ca.SX]:
@@ -171,15 +175,15 @@ def change_of_distance() -> ca.Function:
 
 @cache
 def mean_distance() -> ca.Function:
-    """Return (16): (B_j, B_g; error; known, mean) -> |B_j B_g| in R_e less that of ends [m].
+    """Return (16): (B_j, B_g; error; known, mean) -> |B_j B_g| in R_e minus the mean [m].
 
-    *known* (3, 2) are the coordinates that are no unknowns.
+    *known* (3, 2) are the known coordinates, zero for unknown ones.
     """
-    local, error, known = ca.SX.sym("local", 6), ca.SX.sym("error"), ca.SX.sym("known", 3, 2)
+    local, error, known_B = ca.SX.sym("local", 6), ca.SX.sym("error"), ca.SX.sym("known", 3, 2)
     mean = ca.SX.sym("mean")
-    apart = local[3:] + known[:, 1] - local[:3] - known[:, 0]
+    apart = local[3:] + known_B[:, 1] - local[:3] - known_B[:, 0]
     residual = ca.norm_2(apart) - (mean + error)
-    return ca.Function("mean_distance", [local, error, known, mean], [residual])
+    return ca.Function("mean_distance", [local, error, known_B, mean], [residual])
 
 
 @cache
@@ -187,48 +191,48 @@ def point_on_ray() -> ca.Function:
     """Return (18): (P, step; error; known, R, t, centre, N, seen) -> (R P + t) x P_c (2,), range.
 
     Both sides of the product [m^2] begin at the centre of the camera; N has two directions across
-    it. The third residual is what the product leaves out: by how much the point is too far along
-    the ray [m]. *known* are the coordinates of P that are no unknowns.
+    it. The third residual is missing in the product: the error of the point along the ray [m].
+    *known* are the known coordinates of P, zero for unknown ones.
     """
-    local, error, seen = ca.SX.sym("local", 9), ca.SX.sym("error", 3), ca.SX.sym("seen", 3)
-    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
-    point = moved_points(local[3:], R, t, local[:3] + known)
-    residual = _off_ray(point, seen + error, centre, N)
-    return ca.Function("ray", [local, error, known, R, t, centre, N, seen], [residual])
+    local, error, observed = ca.SX.sym("local", 9), ca.SX.sym("error", 3), ca.SX.sym("seen", 3)
+    known_point, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    point = moved_points(local[3:], R, t, local[:3] + known_point)
+    residual = _off_ray(point, observed + error, centre, N)
+    return ca.Function("ray", [local, error, known_point, R, t, centre, N, observed], [residual])
 
 
 @cache
 def end_on_ray() -> ca.Function:
     """Return (18) of the end of a leg (13): (q0, B, step; error; known, R, t, centre, N, leg).
 
-    The residuals are those of :func:`point_on_ray`; errors are those of u, the reading, and A.
+    The residuals are as in :func:`point_on_ray`; errors are of u, the reading, and A.
     """
     local, error = ca.SX.sym("local", 10), ca.SX.sym("error", END_ERRORS + 3)
-    known, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
+    known_B, (R, t), (centre, N) = ca.SX.sym("known", 3), _pose(), _ray()
     leg = ca.SX.sym("leg", 13)
-    point = moved_points(local[4:], R, t, local[1:4] + known)
+    point = moved_points(local[4:], R, t, local[1:4] + known_B)
     end = leg_end(local[0], leg, error) + error[END_ERRORS:]
     residual = _off_ray(point, end, centre, N)
-    return ca.Function("end_on_ray", [local, error, known, R, t, centre, N, leg], [residual])
+    return ca.Function("end_on_ray", [local, error, known_B, R, t, centre, N, leg], [residual])
 
 
 @cache
 def end_on_axis() -> ca.Function:
     """Return (19): (B; alpha, step; known, R, t, A, u, E) -> u x (B - A) (2,) [m]."""
-    B, error, known = ca.SX.sym("B", 3), ca.SX.sym("error", 8), ca.SX.sym("known", 3)
+    B, error, known_B = ca.SX.sym("B", 3), ca.SX.sym("error", 8), ca.SX.sym("known", 3)
     (R, t), A, (u, E) = _pose(), ca.SX.sym("A", 3), _direction()
-    end = moved_points(error[2:], R, t, B + known)
+    end = moved_points(error[2:], R, t, B + known_B)
     residual = E @ ca.cross(u + E.T @ error[:2], end - A)
-    return ca.Function("end_on_axis", [B, error, known, R, t, A, u, E], [residual])
+    return ca.Function("end_on_axis", [B, error, known_B, R, t, A, u, E], [residual])
 
 
 @cache
 def closure_of_leg(base_joint: JointType, platform_joint: JointType) -> ca.Function:
-    """Return the closure of a leg without an S joint, by which 3.5 finds universal axes.
+    """Return the closure of a leg without an S joint, which determines universal axes in 3.5.
 
-    (turns of a, of b, change of the twist; alpha, step; u, E, R, a, b, twist, unit) -> the sine of
-    how far the leg is from its twist, over the unit. a and b are the frames (3, 3) of the axes at
-    base and platform; of a leg fixed to the platform b has its direction there.
+    (rotations of a, of b, change of the twist; alpha, step; u, E, R, a, b, twist, unit) -> the sine
+    of the deviation of the leg from its twist, over the unit. a and b are the frames (3, 3) of the
+    axes at base and platform; for a leg fixed to the platform b has its direction there.
     """
     local, error, (u, E) = ca.SX.sym("local", 5), ca.SX.sym("error", 8), _direction()
     R, a, b = (ca.SX.sym(name, 3, 3) for name in ("R", "a", "b"))
@@ -250,7 +254,7 @@ def closure_of_leg(base_joint: JointType, platform_joint: JointType) -> ca.Funct
 
 @cache
 def nominal_value(n: int) -> ca.Function:
-    """Return (x (n,); -; row, target) -> row . x - target: what is known from the nominal model."""
+    """Return (x (n,); -; row, target) -> row . x - target: a prior from the nominal model."""
     x, row, target = ca.SX.sym("x", n), ca.SX.sym("row", n), ca.SX.sym("target")
     none = ca.SX.sym("error", 0)
     return ca.Function("nominal", [x, none, row, target], [ca.dot(row, x) - target])
@@ -266,10 +270,12 @@ def _distance(q0: ca.SX, legs: ca.SX, error: ca.SX) -> ca.SX:
     return ca.norm_2(first - second)
 
 
-def _off_ray(point: ca.SX, seen: ca.SX, centre: ca.SX, N: ca.SX) -> ca.SX:
-    """Return how far a point is from the one seen: across its ray as in (18), and along it."""
+def _off_ray(point: ca.SX, observed: ca.SX, centre: ca.SX, N: ca.SX) -> ca.SX:
+    """Return the offset of a point from the observed one: across its ray as in (18), and along."""
     along = ca.cross(N[0, :].T, N[1, :].T)
-    return ca.vertcat(N @ ca.cross(point - centre, seen - centre), ca.dot(along, point - seen))
+    return ca.vertcat(
+        N @ ca.cross(point - centre, observed - centre), ca.dot(along, point - observed)
+    )
 
 
 def _two_legs(name: str) -> ca.SX:

@@ -17,11 +17,11 @@ from legcal.paper.platform import locate_platform_joints
 
 @dataclass(frozen=True, eq=False)
 class StagedResult:
-    """What the four steps give."""
+    """The result of the four steps."""
 
     machine: NominalMachine  # identified
-    base: JointsInBase  # what steps 1 and 2 gave
-    diagnostics: tuple[str, ...]  # what was left out or left at nominal, and why
+    base: JointsInBase  # result of steps 1 and 2
+    diagnostics: tuple[str, ...]  # omissions and nominal values, with their reasons
 
     @property
     def legs(self) -> tuple[Leg, ...]:
@@ -45,9 +45,9 @@ def run_steps(
     """Identify all parameters from leg axes and readings by the four steps (3.2 to 3.5).
 
     Equations are (6), (7), (9), (14) and (16) to (19) as printed; all weights are one with
-    ``literal`` criteria, else those of the covariances of the axes. Twists of legs without an S
-    joint are nominal unless they are freed. Raises NotIdentifiable if the observations do not
-    determine the parameters, DidNotConverge if a step does not converge.
+    ``literal`` criteria, else from the covariances of the axes. Twists of legs without an S joint
+    are nominal unless they are freed. Raises NotIdentifiable if the observations do not determine
+    the parameters, DidNotConverge if a step does not converge.
     """
     base = run_base_steps(machine, axes, measurements, criteria=criteria)
     return run_platform_steps(base, measurements, criteria=criteria, free_twists=free_twists)

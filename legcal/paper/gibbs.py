@@ -1,4 +1,4 @@
-"""Unknown motions and axes inside the steps, in CasADi and for numbers.
+"""Unknown motions and axes inside the steps, in CasADi and numerically.
 
 Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
 have no branches and no square root. It is the chart of ``Frames``, except

@@ -6,12 +6,12 @@ all pairs of vectors of V, squares included, are equal in the camera and in R_b 
     C_1 = sum over views and pairs of (V_p . V_q in R_b - V_p . V_q in R_c)^2
 
 Scalar products are even in a coordinate normal to coplanar joints, and equal for a mirror image:
-(9) decides neither z nor the handedness. With weights, what it says less of than the nominal model
-stays nominal, until (18) of all joints in all cameras shows it.
+(9) determines neither z nor the handedness. With weights, directions with less information in (9)
+than in the nominal model stay nominal, until (18) of all joints in all cameras determines them.
 
-Where actuators move joints at A (ours, not the paper's) these count at reading 0. As printed (8',
-9'), V has also the axis of every actuator of the view, and the arm from that of a revolute to the
-joint.
+Where actuators move joints at A (our extension, not in the paper) these are taken at reading 0. As
+printed (8', 9'), V has also the axis of every actuator of the view, and the arm from the axis of a
+revolute actuator to the joint.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
 
 _PLACES = np.r_[
     LegColumns.A, LegColumns.BASE_AXIS, ActuatorColumns.AXIS, ActuatorColumns.POINT
-]  # of a leg among its numbers, as (9) has them
+]  # the numbers of a leg that are in (9)
 
 
 Cameras = tuple[RigidTransform | None, ...]
@@ -60,11 +60,11 @@ Cameras = tuple[RigidTransform | None, ...]
 class JointsInBase:
     """Base joint centres and revolute axes in R_b, and the cameras."""
 
-    # with A, the revolute axes at the base and actuators as they were located
+    # with located A, revolute axes at the base and actuators
     machine: NominalMachine
-    T_Rb_camera: Cameras  # None for a view whose joints do not fix it
-    in_cameras: JointsInCamera  # what they were located from
-    diagnostics: tuple[str, ...]  # what was left out or left at nominal, and why
+    T_Rb_camera: Cameras  # None for a view with too few joints
+    in_cameras: JointsInCamera  # the input of this step
+    diagnostics: tuple[str, ...]  # omissions and nominal values, with their reasons
 
     @property
     def A_Rb(self) -> Array:
@@ -75,10 +75,10 @@ class JointsInBase:
 def locate_joints_in_base(
     machine: NominalMachine, joints: JointsInCamera, measurements: Measurements, *, weighted: bool
 ) -> JointsInBase:
-    """Locate base joint centres and revolute axes in R_b from those in the camera frames.
+    """Locate base joint centres and revolute axes in R_b from the results in the camera frames.
 
-    With weights, joints in the cameras are those in R_b. Raises NotIdentifiable if a joint or an
-    axis is in no product, or products are too few, and DidNotConverge.
+    With weights, joints in the cameras are replaced by the joints in R_b. Raises NotIdentifiable if
+    a joint or an axis is in no product, or products are too few, and DidNotConverge.
     """
     unknowns = Unknowns.of_base(machine)
     _check_products(machine, joints)
@@ -112,7 +112,8 @@ def build_scalar_products(
 ) -> LeastSquares:
     """Build C_1 of (9), products of all pairs of vectors; the squares v . v = 1 are left out.
 
-    They are weighted one by one: there are more of them than joints and axes of a view can vary.
+    They are weighted individually: there are more products than degrees of freedom of the joints
+    and axes of a view, so that their joint covariance is singular.
     """
     unknowns = Unknowns.of_base(machine)
     revolute, terms = joints.axis_located & machine.revolute, []
@@ -131,16 +132,16 @@ def build_scalar_products(
     for legs, views in alike.items():
         if len(legs) < 2:
             continue
-        seen, sigma = _products_seen(joints, legs, views)
-        own = np.flatnonzero(joints.located[views[0]])
-        known = (
-            unknowns.known_A[own].T,
-            np.hstack(list(unknowns.base_frames[own])),
-            np.hstack(list(unknowns.actuator_frames[own])),
-            unknowns.actuator_points[own].T,
+        products, sigma = _products_seen(joints, legs, views)
+        view_legs = np.flatnonzero(joints.located[views[0]])
+        known_values = (
+            unknowns.known_A[view_legs].T,
+            np.hstack(list(unknowns.base_frames[view_legs])),
+            np.hstack(list(unknowns.actuator_frames[view_legs])),
+            unknowns.actuator_points[view_legs].T,
         )
         unit = sigma if weighted else np.ones_like(sigma)
-        observed = *(np.tile(values, (len(views), 1, 1)) for values in known), seen, unit
+        observed = *(np.tile(values, (len(views), 1, 1)) for values in known_values), products, unit
         index = np.tile(np.arange(len(unknowns)), (len(views), 1))
         terms.append(Term(products_in_base(legs, len(unknowns)), index, observed))
     start = unknowns.vector(machine.legs)
@@ -154,12 +155,15 @@ def _products_seen(
 ) -> tuple[Array, Array]:
     """Return the products (n_views, m) of (9) in views of the same legs, and standard deviations.
 
-    To second order: those of parallel unit vectors do not change to first order.
+    They are of second order: products of parallel unit vectors do not change to first order.
     """
-    own = np.flatnonzero(joints.located[views[0]]).tolist()
-    columns, C = np.zeros((len(views), 12, len(own))), np.zeros((len(views), *[12 * len(own)] * 2))
+    view_legs = np.flatnonzero(joints.located[views[0]]).tolist()
+    columns, C = (
+        np.zeros((len(views), 12, len(view_legs))),
+        np.zeros((len(views), *[12 * len(view_legs)] * 2)),
+    )
     for k, v in enumerate(views):
-        for i, j in enumerate(own):
+        for i, j in enumerate(view_legs):
             columns[k, :6, i] = *joints.A[v, j], *joints.v[v, j]
             if (v, j) in joints.actuators:
                 actuator = joints.actuators[v, j]
@@ -171,27 +175,27 @@ def _products_seen(
     C = by_error @ C @ np.swapaxes(by_error, 1, 2)
     C = np.moveaxis(C.reshape(*V.shape, *V.shape[1:]), 3, 2)  # (n_views, p, q, 3, 3)
     p, q = np.array(pairs_of_vectors(legs), dtype=np.intp).T
-    of_p, of_q, both = C[:, p, p], C[:, q, q], C[:, p, q]
+    of_p, of_q, of_both = C[:, p, p], C[:, q, q], C[:, p, q]
     Vp, Vq = V[:, p], V[:, q]
     variance = (
         np.einsum("vmi,vmij,vmj->vm", Vq, of_p, Vq)
         + np.einsum("vmi,vmij,vmj->vm", Vp, of_q, Vp)
-        + 2.0 * np.einsum("vmi,vmij,vmj->vm", Vq, both, Vp)
+        + 2.0 * np.einsum("vmi,vmij,vmj->vm", Vq, of_both, Vp)
         + np.einsum("vmij,vmji->vm", of_p, of_q)
-        + np.einsum("vmij,vmji->vm", both, both)
+        + np.einsum("vmij,vmji->vm", of_both, of_both)
     )
     return np.einsum("vmi,vmi->vm", Vp, Vq), np.sqrt(variance)
 
 
 def register_views(machine: NominalMachine, joints: JointsInCamera) -> Cameras:
-    """Return T_Rb_camera of each view whose joints and axes fix it, in closed form, unweighted."""
-    found = list[RigidTransform | None]()
+    """Return T_Rb_camera of each view with sufficient joints, in closed form, unweighted."""
+    cameras = list[RigidTransform | None]()
     for v, with_axis in enumerate(joints.axis_located):
         A_Rb, A_camera = points_in_both(machine, joints, v)
         v_Rb, v_camera = machine.base_normals[with_axis], joints.v[v, with_axis]
         poses, is_all = candidate_camera_poses(A_Rb, v_Rb, A_camera, v_camera)
-        found.append(poses[0] if is_all and len(poses) == 1 else None)
-    return tuple(found)
+        cameras.append(poses[0] if is_all and len(poses) == 1 else None)
+    return tuple(cameras)
 
 
 # Cameras, and joints with them
@@ -209,9 +213,9 @@ def _cameras_on_rays(
 def _joints_on_rays(
     machine: NominalMachine, unknowns: Unknowns, joints: JointsInCamera, cameras: Cameras
 ) -> tuple[NominalMachine, Cameras, IntArray]:
-    """Return base joints and cameras by (18) together, and the unknowns that it shows.
+    """Return base joints and cameras by (18) together, and the unknowns that it determines.
 
-    What it shows less of than the nominal model stays where (9) has it.
+    Directions with less information in (18) than in the nominal model keep the result of (9).
     """
     points, (R, t), placed = _points_on_rays(machine, joints, cameras)
     leg = np.nonzero(joints.located[placed])[1]
@@ -225,31 +229,33 @@ def _joints_on_rays(
     start = np.concatenate([x[wanted], np.zeros(steps.size)])
     problem = LeastSquares("The base joints and the cameras (eq 18)", (term,), start)
     problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
-    found = solve_least_squares(problem, weighted=True).x
-    x[wanted] = found[: len(wanted)]
+    solution = solve_least_squares(problem, weighted=True).x
+    x[wanted] = solution[: len(wanted)]
     machine = replace(machine, legs=unknowns.legs(x, machine.legs))
-    cameras = _placed(cameras, placed, *stepped_poses(R, t, found[steps]))
+    cameras = _placed(cameras, placed, *stepped_poses(R, t, solution[steps]))
     return machine, cameras, np.setdiff1d(wanted, held)
 
 
 def _joints_of_base(
     machine: NominalMachine, joints: JointsInCamera, cameras: Cameras, measurements: Measurements
 ) -> JointsInCamera:
-    """Return joints in the cameras of views that are placed as all of these together have them.
+    """Return the joints in the cameras of placed views, averaged over all of these views.
 
-    Errors of the places of cameras are not counted.
+    Errors of the camera poses are not included.
     """
     A, C = joints.A.copy(), joints.covariance[:, :, :3, :3].copy()
     information = np.zeros((machine.n_legs, 3, 3))
     turns = [(v, T.rotation.as_matrix()) for v, T in enumerate(cameras) if T is not None]
     for v, R in turns:
-        seen = joints.located[v]
-        information[seen] += R @ np.linalg.inv(C[v, seen]) @ R.T
+        is_located = joints.located[v]
+        information[is_located] += R @ np.linalg.inv(C[v, is_located]) @ R.T
     for v, R in turns:
-        seen, T = joints.located[v], cameras[v]
-        C[v, seen] = R.T @ np.linalg.inv(information[seen]) @ R
-        A[v, seen] = (
-            A[v, seen] if T is None else T.inv().apply(machine.parameters.base_joints[seen])
+        is_located, T = joints.located[v], cameras[v]
+        C[v, is_located] = R.T @ np.linalg.inv(information[is_located]) @ R
+        A[v, is_located] = (
+            A[v, is_located]
+            if T is None
+            else T.inv().apply(machine.parameters.base_joints[is_located])
         )
     return adjusted_to_base(machine, joints, A, C, measurements)
 
@@ -257,7 +263,7 @@ def _joints_of_base(
 def _points_on_rays(
     machine: NominalMachine, joints: JointsInCamera, cameras: Cameras
 ) -> tuple[SeenPoints, tuple[Array, Array], IntArray]:
-    """Return base joints as placed cameras see them, R and t of R_b in these, and their views."""
+    """Return the base joints in placed cameras, R and t of R_b in these, and their views."""
     poses = {v: T.inv() for v, T in enumerate(cameras) if T is not None}
     placed = np.array(list(poses), dtype=np.intp)
     group, leg = np.nonzero(joints.located[placed])
@@ -268,35 +274,35 @@ def _points_on_rays(
 
 
 def _placed(cameras: Cameras, placed: IntArray, R: Array, t: Array) -> Cameras:
-    """Return cameras, T_Rb_camera, with those of some views from poses of R_b in them."""
-    found = list(cameras)
-    for v, own_R, own_t in zip(placed.tolist(), R, t, strict=True):
-        found[v] = motion_of(own_R, own_t).inv()
-    return tuple(found)
+    """Return cameras, T_Rb_camera, with new ones for some views from the poses of R_b in them."""
+    poses = list(cameras)
+    for v, view_R, view_t in zip(placed.tolist(), R, t, strict=True):
+        poses[v] = motion_of(view_R, view_t).inv()
+    return tuple(poses)
 
 
 # Refusals
 
 
 def _check_products(machine: NominalMachine, joints: JointsInCamera) -> None:
-    """Refuse when a joint or an axis is in no product of (9), which would leave it at nominal."""
+    """Refuse if a joint or an axis is in no product of (9), which would leave it at nominal."""
     several = joints.located.sum(axis=1) > 1
     shown = joints.located[several].any(axis=0)
     turning = machine.revolute & ~joints.axis_located[several].any(axis=0)
-    what = [
+    missing_in_words = [
         f"{kind} of {', '.join(np.array(machine.leg_names)[missing])}"
         for kind, missing in (("base joints", ~shown), ("revolute axes", turning & shown))
         if missing.any()
     ]
-    if what:
+    if missing_in_words:
         raise NotIdentifiable(
             f"The base could not be located (eq 9): found no view that locates the "
-            f"{' and the '.join(what)} together with the base joint of another leg (joints located "
-            f"by view: {_counts(joints.located)}), needed one; turn a camera so that it shows more "
-            "legs at once."
+            f"{' and the '.join(missing_in_words)} together with the base joint of another leg "
+            f"(joints located by view: {_counts(joints.located)}), needed one; turn a camera so "
+            "that it shows more legs at once."
         )
 
 
 def _counts(located: BoolArray) -> str:
-    """Return how many were located in each view."""
+    """Return the number of located joints in each view, in words."""
     return ", ".join(str(int(n)) for n in located.sum(axis=1))

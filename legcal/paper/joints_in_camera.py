@@ -7,14 +7,14 @@ normal to the revolute axis v of that joint:
 
 In a planar machine the axes v of a view are one common normal.
 
-A rod that hangs on a carriage or an arm has its joint at A(q) at the reading q (6'), which is ours
-and not the paper's: a + q d of a prismatic is linear in a and d, from three images; p + x cos q +
-y sin q of a revolute in p, x and y, from five. Afterwards |d| = 1 (readings and outlines that
-disagree on lengths show there), or x.y = 0 and |x| = |y|, with the axis w along x x y.
+A rod on a carriage or an arm has its joint at A(q) at the reading q (6'), our extension of the
+paper: a + q d of a prismatic is linear in a and d, from three images; p + x cos q + y sin q of a
+revolute in p, x and y, from five. Afterwards |d| = 1 (otherwise readings and outlines contradict
+each other in lengths), or x.y = 0 and |x| = |y|, with the axis w along x x y.
 
-What an image knows badly is the tilt of a leg towards the camera. With weights, directions are
-adjusted to the joints that all images of the view gave: an axis through A and its own M, which is
-known well, has a much better direction than its outlines.
+The most uncertain direction in an image is the tilt of a leg towards the camera. With weights,
+directions are adjusted to the joints from all images of the view: an axis through A and the point
+M, which is accurate, has a much better direction than its outlines give.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from legcal.paper.least_squares import (
 )
 from legcal.paper.nominal import NominalMachine
 
-_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
-_WRONG_SCALE = 0.02  # of the motion of a carriage: as wrong as radii may be
-_SURE = 5.0  # standard deviations
-_OUTLIER = 8.0  # standard deviations, or medians where these are too small
-_ROUNDING = 1e-14  # of a variance, in the difference that is left of it
+_SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of different directions
+_WRONG_SCALE = 0.02  # minimum relative error of the motion of a carriage: the tolerance of radii
+_SURE = 5.0  # minimum standard deviations of a wrong scale
+_OUTLIER = 8.0  # minimum standard deviations of an outlier, or medians where these are too small
+_ROUNDING = 1e-14  # relative rounding of a difference of variances
 _JOINT = np.r_[0:3, 6:12]  # A, w and c in the covariance of a joint
-_AXIS = slice(3, 6)  # v in it
+_AXIS = slice(3, 6)  # v in the covariance of a joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,25 +64,25 @@ class JointsInCamera:
     A: Array  # (n_views, n_legs, 3) [m]; on actuators at reading 0
     v: Array  # (n_views, n_legs, 3); the common normal in a plane; zero without an axis
     located: BoolArray  # (n_views, n_legs)
-    actuators: Mapping[tuple[int, int], Actuator]  # what moves located joints, by view and leg
-    # (n_views, n_legs, 12, 12) of A [m^2], of v, of the axis of what moves A, and of a point of
-    # that axis [m^2]; zero for what there is not, and without weights
+    actuators: Mapping[tuple[int, int], Actuator]  # actuators of located joints, by view and leg
+    # (n_views, n_legs, 12, 12) of A [m^2], of v, of the axis of the actuator of A, and of a point
+    # of that axis [m^2]; zero for absent parts, and without weights
     covariance: Array
     axes: LegAxes  # of located joints; with weights, adjusted to these
     observed: LegAxes  # the same as the images gave them
-    diagnostics: tuple[str, ...]  # which legs were left out of which views, and why
+    diagnostics: tuple[str, ...]  # legs that were left out of views, with reasons
 
     @property
     def axis_located(self) -> BoolArray:
-        """Which revolute axes are located, (n_views, n_legs)."""
+        """Mask of the located revolute axes, (n_views, n_legs)."""
         return np.asarray(np.any(self.v != 0.0, axis=2))
 
     def A_at(self, view: IntArray, leg: IntArray, q: Array) -> Array:
         """Return A in the cameras of views (k,) of legs (k,) at readings (k,), (k, 3) [m]."""
         A = self.A[view, leg]
         for (v, j), actuator in self.actuators.items():
-            here = (view == v) & (leg == j)
-            A[here] = actuator.at(self.A[v, j], q[here])
+            of_joint = (view == v) & (leg == j)
+            A[of_joint] = actuator.at(self.A[v, j], q[of_joint])
         return A
 
 
@@ -141,22 +141,22 @@ class _Bundles:
     view: IntArray  # (n,)
     leg: IntArray  # (n,)
     of_axis: IntArray  # (k,): the bundle of each axis
-    places: IntArray  # (n, 9): unknowns of (6) and (6'); -1 for what a joint does not have
+    places: IntArray  # (n, 9): indices of unknowns of (6) and (6'); -1 for absent ones
     problem: LeastSquares
 
     @classmethod
     def of(cls, machine: NominalMachine, axes: LegAxes, measurements: Measurements) -> _Bundles:
-        """Return those of a session, by view and leg, with (6) and (6') of all of them."""
+        """Return the bundles of a session, by view and leg, with (6) and (6') of all of them."""
         key = measurements.view[axes.row] * machine.n_legs + axes.leg
         distinct, of_axis = np.unique(key, return_inverse=True)
         view, leg = np.divmod(distinct, machine.n_legs)
         q, b = measurements.q[axes.row, axes.leg], np.zeros((len(axes), 3))
         b[:, 0], size = 1.0, np.full(machine.n_legs, 3)
         for j, actuator in machine.actuators.items():
-            here, size[j] = axes.leg == j, 9 if actuator.turns else 6
-            motion = actuator.gain * q[here]
-            b[here, 1] = np.cos(motion) if actuator.turns else motion
-            b[here, 2] = np.sin(motion) if actuator.turns else 0.0
+            of_leg, size[j] = axes.leg == j, 9 if actuator.turns else 6
+            motion = actuator.gain * q[of_leg]
+            b[of_leg, 1] = np.cos(motion) if actuator.turns else motion
+            b[of_leg, 2] = np.sin(motion) if actuator.turns else 0.0
         last = np.cumsum(size[leg])
         places = (last - size[leg])[:, None] + np.arange(9)
         places[np.arange(9) >= size[leg][:, None]] = -1
@@ -167,13 +167,13 @@ class _Bundles:
         return cls(axes, q, view, leg, of_axis.ravel(), places, problem)
 
     def undetermined(self, machine: NominalMachine) -> list[str]:
-        """Return why (6) or (6') of each bundle has no single solution, or an empty string."""
+        """Return for each bundle why (6) or (6') has no unique solution, or ""."""
         J, reasons = self.problem.jacobian(self.problem.start), list[str]()
         for i, (j, F) in enumerate(zip(self.leg.tolist(), self._blocks(J), strict=True)):
-            here, n = self.of_axis == i, int(np.sum(self.of_axis == i))
+            of_bundle, n = self.of_axis == i, int(np.sum(self.of_axis == i))
             reason = ""
             if j in machine.actuators:
-                actuator, n = machine.actuators[j], len(np.unique(self.q[here]))
+                actuator, n = machine.actuators[j], len(np.unique(self.q[of_bundle]))
                 least, size = MIN_IMAGES[actuator.turns], np.sqrt(np.diag(F))
                 if n < least:
                     readings = "reading" if n == 1 else "readings"
@@ -193,22 +193,26 @@ class _Bundles:
     def joints(
         self, machine: NominalMachine, measurements: Measurements, *, weighted: bool
     ) -> JointsInCamera:
-        """Return the joints by (6) and (6'), and the axes; with weights, adjusted to them."""
-        solution, said = solve_least_squares(self.problem), list[str]()
+        """Return the joints by (6) and (6'), and the axes, adjusted to them with weights."""
+        solution, diagnostics = solve_least_squares(self.problem), list[str]()
         axes = observed = self.axes
         C = np.zeros((len(self.leg), 9, 9))
         if weighted:
             problem = replace(self.problem, start=solution.x)
             solution = solve_least_squares(problem, weighted=True)
-            for found, F in zip(C, self._blocks(solution.jacobian), strict=True):
-                found[: len(F), : len(F)] = inverse_of(F)
+            for block, F in zip(C, self._blocks(solution.jacobian), strict=True):
+                block[: len(F), : len(F)] = inverse_of(F)
         local = np.append(solution.x, 0.0)[self.places]
         if weighted:
-            said += self._wrong_scales(machine, local, C)
+            diagnostics += self._wrong_scales(machine, local, C)
             of_axis = local[self.of_axis], C[self.of_axis]
             axes, chi = _adjusted(axes, self.problem.terms[0], *of_axis)
             right, left_out = _without_outliers(machine, axes, chi, measurements)
-            axes, observed, said = axes.choose(right), observed.choose(right), [*said, *left_out]
+            axes, observed, diagnostics = (
+                axes.choose(right),
+                observed.choose(right),
+                [*diagnostics, *left_out],
+            )
         shape = len(measurements.views), machine.n_legs
         A, located = np.zeros((*shape, 3)), np.zeros(shape, dtype=np.bool_)
         covariance, actuators = np.zeros((*shape, 12, 12)), dict[tuple[int, int], Actuator]()
@@ -217,23 +221,26 @@ class _Bundles:
             covariance[v, j, :3, :3] = C[i, :3, :3]
             if j in machine.actuators:
                 function = joint_of_motion(turns=machine.actuators[j].turns)
-                own = local[[i], : function.size1_in(0)]
-                A[v, j], axis, point = np.split(evaluated(function, own)[0], 3)
+                values = local[[i], : function.size1_in(0)]
+                A[v, j], axis, point = np.split(evaluated(function, values)[0], 3)
                 actuators[v, j] = replace(machine.actuators[j], axis=axis, point=point)
-                slope, n = derivatives(function, 0, own)[0], own.shape[1]
+                slope, n = derivatives(function, 0, values)[0], values.shape[1]
                 covariance[v, j][np.ix_(_JOINT, _JOINT)] = slope @ C[i, :n, :n] @ slope.T
         nowhere = np.zeros_like(A)
         return JointsInCamera(
-            A, nowhere, located, actuators, covariance, axes, observed, tuple(said)
+            A, nowhere, located, actuators, covariance, axes, observed, tuple(diagnostics)
         )
 
     def _blocks(self, jacobian: csc_array[np.float64]) -> list[Array]:
-        """Return the information of a Jacobian on the unknowns of each bundle."""
+        """Return the information matrices of the unknowns of each bundle."""
         information = (jacobian.T @ jacobian).tocsr()
-        return [information[own][:, own].toarray() for own in (p[p >= 0] for p in self.places)]
+        return [
+            information[indices][:, indices].toarray()
+            for indices in (p[p >= 0] for p in self.places)
+        ]
 
     def _wrong_scales(self, machine: NominalMachine, local: Array, C: Array) -> list[str]:
-        """Return which carriages surely move by other lengths than their readings say."""
+        """Return in words the carriages with motions that contradict their readings."""
         scales = dict[str, list[float]]()
         for j, x, of_x in zip(self.leg.tolist(), local[:, 3:6], C[:, 3:6, 3:6], strict=True):
             if j in machine.actuators and not machine.actuators[j].turns:
@@ -249,7 +256,7 @@ class _Bundles:
 
 
 def _needed(machine: NominalMachine, leg: int) -> str:
-    """Return in what a view must show a leg for its joint to be located."""
+    """Return in words the images of a leg that a view needs to locate its joint."""
     if leg not in machine.actuators:
         return "leg in two different directions"
     actuator = machine.actuators[leg]
@@ -257,10 +264,10 @@ def _needed(machine: NominalMachine, leg: int) -> str:
 
 
 def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> tuple[LegAxes, Array]:
-    """Return axes as they are likeliest to be if they fulfil an equation, and how far they do not.
+    """Return the likeliest axes given an equation, and their contradictions in standard deviations.
 
-    That is in standard deviations. The first errors of the equation are those of the directions;
-    C (k, n, n) are the covariances of its unknowns.
+    The first errors of the equation are the errors of the directions; C (k, n, n) are the
+    covariances of its unknowns.
     """
     if term.covariance is None:
         return axes, np.zeros(len(axes))
@@ -315,9 +322,9 @@ def adjusted_to_base(
 def _without_outliers(
     machine: NominalMachine, axes: LegAxes, chi: Array, measurements: Measurements
 ) -> tuple[IntArray, tuple[str, ...]]:
-    """Return which axes do not miss their joint by far, chi (n,) in sigmas, and words for others.
+    """Return the indices of axes near their joint, by chi (n,) in sigmas, and words for outliers.
 
-    These are wrong outlines, as a rule.
+    Outliers are usually wrong outlines.
     """
     wrong = chi > _OUTLIER * max(1.0, float(np.median(chi)))
     left_out = tuple(
@@ -344,12 +351,12 @@ class AcrossAxes:
     @cached_property
     def scatter(self) -> Array:
         """Sums of u u' in the body by axis, (n_axes, 3, 3)."""
-        found, u = (
+        sums, u = (
             np.zeros((int(self.axis.max()) + 1, 3, 3)),
             np.einsum("nij,ni->nj", self.R, self.u),
         )
-        np.add.at(found, self.axis, u[:, :, None] * u[:, None, :])
-        return found
+        np.add.at(sums, self.axis, u[:, :, None] * u[:, None, :])
+        return sums
 
     def term(self, v: Array) -> Term:
         """Return (7) with axes that begin at v (n_axes, 3)."""
@@ -358,8 +365,8 @@ class AcrossAxes:
         return Term(leg_across_axis(), index, observed, self.covariance)
 
     def solve(self, *, weighted: bool) -> tuple[Array, Array, Array]:
-        """Return where axes v begin (n_axes, 3), turns (n_axes, 2) from there and covariances."""
-        v = np.linalg.eigh(self.scatter)[1][:, :, 0]  # the solution with weights of one
+        """Return start axes v (n_axes, 3), rotations (n_axes, 2) from there, and covariances."""
+        v = np.linalg.eigh(self.scatter)[1][:, :, 0]  # the unweighted solution
         n = len(v)
         problem = LeastSquares("The revolute axes (eq 7)", (self.term(v),), np.zeros(2 * n))
         solution, columns = (
@@ -381,8 +388,8 @@ def _with_axes(
     some, R = axes.choose(rows), np.tile(np.eye(3), (len(rows), 1, 1))
     view, leg = measurements.view[some.row], some.leg
     for (v, j), actuator in joints.actuators.items():
-        here = (view == v) & (leg == j)
-        R[here] = actuator.rotations(measurements.q[some.row[here], j])
+        of_joint = (view == v) & (leg == j)
+        R[of_joint] = actuator.rotations(measurements.q[some.row[of_joint], j])
     axis = np.unique(view * machine.n_legs + leg * machine.spatial, return_inverse=True)[1].ravel()
     covariance = np.zeros((len(rows), 8, 8))
     covariance[:, :2, :2] = some.covariance[:, :2, :2]
@@ -394,29 +401,28 @@ def _with_axes(
         for name, part in parts.items():
             part[rows] = getattr(better, name)
         axes = replace(axes, **parts)
-    found, of_found = joints.v.copy(), joints.covariance.copy()
-    found[view, leg] = turned_axis(start, angles_of(turns))[axis]
-    slope = np.array([axis_slope(*each) for each in zip(start, turns, strict=True)])
-    of_found[view, leg, _AXIS, _AXIS] = (slope @ C @ np.swapaxes(slope, 1, 2))[axis]
-    return replace(joints, v=found, covariance=of_found, axes=axes)
+    axes_v, covariances = joints.v.copy(), joints.covariance.copy()
+    axes_v[view, leg] = turned_axis(start, angles_of(turns))[axis]
+    slope = np.array([axis_slope(*turned) for turned in zip(start, turns, strict=True)])
+    covariances[view, leg, _AXIS, _AXIS] = (slope @ C @ np.swapaxes(slope, 1, 2))[axis]
+    return replace(joints, v=axes_v, covariance=covariances, axes=axes)
 
 
 def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
-    """Return joints with their axes pointing to the side of the nominal axes.
+    """Return joints with the signs of their axes according to the nominal axes.
 
-    An axis in a camera is a line: (7) gives it up to its sign, while products of vectors need one.
-    The nominal base is laid on the joints of each view, and each axis takes the sign with which it
-    points to the side of its nominal axis. Where two turns about a line of joints agree alike, the
-    sign remains a matter of choice. That of an axis whose joint is alone in its view does not
-    matter.
+    An axis in a camera is a line: (7) gives it up to its sign, but products of vectors need a sign.
+    The nominal base is registered with the joints of each view, and each axis takes the sign of its
+    nominal axis. Where two rotations about a line of joints fit equally well, the sign is
+    arbitrary. The sign of an axis does not matter if its joint is alone in the view.
     """
     v_camera = joints.v.copy()
     for v, with_axis in enumerate(joints.axis_located):
-        seen, nominal = v_camera[v, with_axis], machine.base_normals[with_axis]
+        v_seen, nominal = v_camera[v, with_axis], machine.base_normals[with_axis]
         A_Rb, A_camera = points_in_both(machine, joints, v)
-        poses, _ = candidate_camera_poses(A_Rb, nominal, A_camera, seen)
+        poses, _ = candidate_camera_poses(A_Rb, nominal, A_camera, v_seen)
         if poses:
-            v_camera[v, with_axis] *= signs_seen(nominal, seen, poses[0])[:, None]
+            v_camera[v, with_axis] *= signs_seen(nominal, v_seen, poses[0])[:, None]
     return replace(joints, v=v_camera)
 
 
@@ -425,7 +431,7 @@ def points_in_both(
 ) -> tuple[Array, Array]:
     """Return points of the base (n, 3) that a view locates, in R_b and in the camera [m].
 
-    They are the joints, and of those that actuators move three places along the travel.
+    They are the joints; for joints moved by actuators, their positions at three readings.
     """
     A_Rb, A_camera = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for j in np.flatnonzero(joints.located[view]).tolist():

@@ -1,10 +1,10 @@
 """The nonlinear least-squares problem of all steps: built with CasADi, solved with IPOPT.
 
 A problem is a sum of terms. A term is one equation of the paper: a CasADi function of a few
-unknowns, mapped over its observations. The function is also one of the errors of what was observed:
-its derivative by these carries covariances of axes to covariances of residuals, which are the
-weights. What the observations saw are parameters of the compiled solver, so that problems of one
-structure (other numbers, other weights) are compiled once.
+unknowns, mapped over its observations. It is also a function of the errors of the observed values:
+its derivative by these propagates covariances of axes to covariances of residuals, which are the
+weights. Observed values are parameters of the compiled solver, so that problems of one structure
+(other numbers, other weights) are compiled once.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.signals import held_back_signals, is_waiting
 
-_RANK = 1e-7  # singular values of the scaled Jacobian below this are undetermined directions
+_RANK = 1e-7  # minimum singular value of the scaled Jacobian of a determined direction
 _REWEIGHTINGS = 10
-_OUTLIER = 4.0  # an observation this many times the median has half its weight
-_CONVERGED = 0.01  # relative change of a weight that no longer matters
+_OUTLIER = 4.0  # multiple of the median residual at which an observation has half its weight
+_CONVERGED = 0.01  # maximum relative change of converged weights
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
-_LEAST = 1e-13  # of the largest information: what is known worse is not known
+_LEAST = 1e-13  # minimum information of a determined direction, relative to the largest
 _NONE = np.zeros(0, dtype=np.intp)
-_CACHE_SIZE = 20  # compiled structures: those of one run of the steps, with either criteria
+_CACHE_SIZE = 20  # compiled structures, enough for one run of the steps with either criteria
 _INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")  # return statuses
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
@@ -39,7 +39,7 @@ _OPTIONS: dict[str, bool | int | float | str] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.tol": 1e-8,
-    "ipopt.acceptable_tol": 1e-6,  # of a standard deviation: where rounding ends the progress
+    "ipopt.acceptable_tol": 1e-6,  # in standard deviations: rounding prevents further progress
     "ipopt.acceptable_iter": 8,
     "ipopt.max_iter": 300,
     "ipopt.mu_init": 1e-9,
@@ -49,17 +49,17 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One equation, and the observations that have it."""
+    """One equation, and its observations."""
 
-    # (local, error, *observed) -> residuals of one observation, as printed; error (k,) of what was
-    # observed, zero where the residuals are evaluated
+    # (local, error, *observed) -> residuals of one observation, as printed; error (k,) of the
+    # observed values, zero in the evaluation of the residuals
     function: ca.Function
-    # (n, n_local): places of the local unknowns among all, none twice in a row; -1 is zero
+    # (n, n_local): indices of the local unknowns among all, none twice in a row; -1 is zero
     index: IntArray
     # (n,), (n, a) or (n, a, b) each: the other arguments of the function
     observed: tuple[Array, ...]
     covariance: Array | None = None  # (n, k, k) of the errors; None: the weight is one
-    n_printed: int | None = None  # the first residuals, which the paper has; others weigh nothing
+    n_printed: int | None = None  # number of first residuals in the paper; others have no weight
 
     @property
     def n_rows(self) -> int:
@@ -68,7 +68,7 @@ class Term:
 
     @property
     def unit_weights(self) -> Array:
-        """Weights of one, (n, r, r); as numbers (n, r) where there are no others."""
+        """Weights of one, (n, r, r), or as numbers (n, r) without a covariance."""
         n, r = len(self.index), self.n_rows
         if self.covariance is None:
             return np.ones((n, r))
@@ -80,11 +80,11 @@ class Term:
 class LeastSquares:
     """Half the sum of squared residuals, to be minimised from a start."""
 
-    name: str  # what is looked for, for messages: "The base joints (eq 9)"
+    name: str  # the unknowns, for messages: "The base joints (eq 9)"
     terms: tuple[Term, ...]
     start: Array  # (n,)
-    # Second derivatives instead of J'J: for criteria that do not decide some unknown, as (9) and
-    # (16) with z, where J'J vanishes; and for (18) of poses that few legs fix, of which one is
+    # Second derivatives instead of J'J: for criteria that do not determine some unknown, such as z
+    # in (9) and (16), where J'J vanishes; and for (18) of poses from few legs, one of which is
     # wrong.
     exact_hessian: bool = False
 
@@ -107,12 +107,12 @@ class LeastSquares:
         return csc_array(_matrix(self._weights(self.start, None)) @ J) if weighted else J
 
     def _weights(self, x: Array, residuals: Array | None) -> list[Array]:
-        """Return the matrices (n, r, r) by which residuals of each term have unit variance at x.
+        """Return the matrices (n, r, r) that whiten the residuals of each term at x.
 
-        They are one, (n, r), without a covariance. With the residuals there, outliers lose weight
-        by Cauchy's function.
+        They are one, (n, r), without a covariance. With residuals, outliers are downweighted by
+        Cauchy's function.
         """
-        found, first = list[Array](), 0
+        matrices, first = list[Array](), 0
         for term in self.terms:
             n, r = len(term.index), term.n_rows
             W = term.unit_weights
@@ -122,14 +122,14 @@ class LeastSquares:
                 spread = slope @ term.covariance @ np.swapaxes(slope, 1, 2)
                 W = whitener(spread)
                 if residuals is not None:
-                    own = W @ residuals[first : first + n * r].reshape(n, r, 1)
-                    W *= _cauchy(np.linalg.norm(own, axis=(1, 2)))[:, None, None]
-            found.append(W)
+                    whitened = W @ residuals[first : first + n * r].reshape(n, r, 1)
+                    W *= _cauchy(np.linalg.norm(whitened, axis=(1, 2)))[:, None, None]
+            matrices.append(W)
             first += n * r
-        return found
+        return matrices
 
     def _structure(self) -> _Structure:
-        """Return what problems share that differ only in what was observed and in the start."""
+        """Return the structure, common to problems with other observed values or another start."""
         terms = [term for term in self.terms if len(term.index)]
         keys = tuple(
             (
@@ -144,7 +144,7 @@ class LeastSquares:
         return len(self.start), keys, self.exact_hessian
 
     def _observed(self) -> ca.DM:
-        """Return what all observations saw as one vector, observations side by side."""
+        """Return all observed values as one vector, observations side by side."""
         parts = [np.zeros(0)]
         for term in self.terms:
             for values in term.observed if len(term.index) else ():
@@ -161,9 +161,9 @@ class IpoptSolution:
     jacobian: csc_array[np.float64]  # (m, n), the same
 
     def covariances(self, columns: IntArray) -> Array:
-        """Return covariances (n, k, k) of groups of unknowns (n, k) that no residual ties together.
+        """Return covariances (n, k, k) of groups of unknowns (n, k) that share no residual.
 
-        They are those for residuals of unit variance.
+        The residuals are assumed to have unit variance.
         """
         information = (self.jacobian.T @ self.jacobian).tocsr()
         return np.array([inverse_of(information[c][:, c].toarray()) for c in columns])
@@ -172,17 +172,17 @@ class IpoptSolution:
 def solve_least_squares(problem: LeastSquares, *, weighted: bool = False) -> IpoptSolution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
-    All weights are one, or those of covariances: these depend on the unknowns, and outliers lose
-    weight, so that the problem is solved again until the weights have converged. Unknowns are
-    counted from the start in units of what one residual unit shows: tolerances do not depend on
-    units of length or on the noise. Raises DidNotConverge.
+    All weights are one, or from covariances: these depend on the unknowns, and outliers are
+    downweighted, so that the problem is solved again until the weights have converged. Unknowns
+    are relative to the start, scaled by the residuals: tolerances do not depend on units of length
+    or on the noise. Raises DidNotConverge.
     """
-    with held_back_signals():  # CasADi swallows what is raised in its conversions
+    with held_back_signals():  # CasADi swallows exceptions in its conversions
         return _solved(problem, weighted=weighted)
 
 
 def undetermined(jacobian: csc_array[np.float64]) -> BoolArray:
-    """Return which unknowns can move without changing any residual."""
+    """Return a mask of the unknowns that can move without changing any residual."""
     scaled = jacobian.toarray() * _column_scale(jacobian)
     n = scaled.shape[1]
     rows = np.vstack([scaled, np.zeros((n, n))])
@@ -192,7 +192,7 @@ def undetermined(jacobian: csc_array[np.float64]) -> BoolArray:
 
 
 def inverse_of(information: Array) -> Array:
-    """Return the inverse of an information matrix, large where nothing is known."""
+    """Return the inverse of an information matrix, large in directions without information."""
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, _LEAST * float(size.max()))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
@@ -207,13 +207,13 @@ def evaluated(function: ca.Function, local: Array, *observed: Array) -> Array:
     return np.asarray(function.map(n)(*arguments).full()).T if n else _nothing(function)
 
 
-def derivatives(function: ca.Function, which: int, local: Array, *observed: Array) -> Array:
+def derivatives(function: ca.Function, input_index: int, local: Array, *observed: Array) -> Array:
     """Return the derivatives (n, r, k) by the local unknowns (0) or the errors (1)."""
     n, none = len(local), np.zeros((len(local), function.size1_in(1)))
-    r, k = function.size1_out(0), function.size1_in(which)
+    r, k = function.size1_out(0), function.size1_in(input_index)
     arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    found = _derivative(function, which).map(n)(*arguments).full()
-    return np.asarray(found.reshape(r, n, k).swapaxes(0, 1))
+    derivative = _derivative(function, input_index).map(n)(*arguments).full()
+    return np.asarray(derivative.reshape(r, n, k).swapaxes(0, 1))
 
 
 def adjusted(
@@ -223,13 +223,15 @@ def adjusted(
     covariance: Array,  # (n, k, k) of the errors
     local_covariance: Array,  # (n, n_local, n_local)
 ) -> tuple[Array, Array, Array]:
-    """Return the likeliest errors (n, k) of observations that fulfil an equation, and covariances.
+    """Return the likeliest errors (n, k) of observations given an equation, and covariances.
 
-    The covariances (n, k, k) are those of what is left of the errors, larger where the equation
-    contradicts what was observed: last by how many standard deviations it does (n,).
+    The covariances (n, k, k) of the remaining errors are inflated where the equation contradicts
+    the observation. The last result is this contradiction in standard deviations (n,).
     """
     residual = evaluated(function, local, *observed)[..., None]
-    by_local, by_error = (derivatives(function, which, local, *observed) for which in (0, 1))
+    by_local, by_error = (
+        derivatives(function, input_index, local, *observed) for input_index in (0, 1)
+    )
     mixed = covariance @ np.swapaxes(by_error, 1, 2)
     spread = by_error @ mixed + by_local @ local_covariance @ np.swapaxes(by_local, 1, 2)
     gain = mixed @ np.linalg.inv(spread)
@@ -243,7 +245,7 @@ def _nothing(function: ca.Function) -> Array:
 
 
 def _side_by_side(values: Array) -> Array:
-    """Return what observations (n,), (n, a) or (n, a, b) saw as columns, observation by one."""
+    """Return observed values (n,), (n, a) or (n, a, b) as columns, observation by observation."""
     if values.ndim < 3:
         return np.atleast_2d(values.T)
     return np.swapaxes(values, 0, 1).reshape(values.shape[1], -1)
@@ -283,17 +285,17 @@ def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
 
 
 def _minimum(compiled: _Compiled, z: Array, parameters: ca.DM) -> tuple[Array, dict[str, Any]]:
-    """Return where IPOPT ends and its statistics; raise KeyboardInterrupt if a signal stopped it.
+    """Return the solution of IPOPT and its statistics; raise KeyboardInterrupt after a signal.
 
-    No exception passes through IPOPT. One that a signal handler raises while CasADi looks for
-    signals ends it with a status that nothing else causes here: failed evaluations have others.
+    No exception passes through IPOPT. An exception of a signal handler while CasADi checks for
+    signals ends it with a status of no other cause here: failed evaluations have other ones.
     """
     compiled.watch.is_stopped = False
-    found = compiled.solver(x0=z, p=parameters)
+    solution = compiled.solver(x0=z, p=parameters)
     stats = compiled.solver.stats()
     if compiled.watch.is_stopped or stats["return_status"] in _INTERRUPTED:
         raise KeyboardInterrupt
-    return _dense(found["x"]), stats
+    return _dense(solution["x"]), stats
 
 
 def _cauchy(chi: Array) -> Array:
@@ -305,8 +307,8 @@ def _cauchy(chi: Array) -> Array:
 # Compiled problems
 
 
-# Function, whether its weights are all one, shape and bytes of the index, and shapes of what one
-# observation saw
+# Function, whether its weights are all one, shape and bytes of the index, and shapes of the values
+# of one observation
 _TermKey = tuple[ca.Function, bool, tuple[int, ...], bytes, tuple[tuple[int, ...], ...]]
 _Structure = tuple[int, tuple[_TermKey, ...], bool]  # unknowns, terms, exact Hessian
 
@@ -343,7 +345,7 @@ class _Watch(ca.Callback):
         """Return 1 to stop."""
         try:
             self.is_stopped = self.is_stopped or is_waiting()
-        except KeyboardInterrupt:  # out of the handler of Python, which runs here
+        except KeyboardInterrupt:  # from the signal handler of Python, which runs here
             self.is_stopped = True
         return [int(self.is_stopped)]
 
@@ -394,7 +396,7 @@ def _residuals_and_jacobian(
 ) -> tuple[ca.Function, ca.Function]:
     """Return (x, observed) -> residuals of all terms, and their sparse derivative by x."""
     n_observed = sum(shape[0] * a * b for *_, shape, _, sizes in terms for a, b in sizes)
-    x, seen = ca.MX.sym("x", n_unknowns), ca.MX.sym("observed", n_observed)
+    x, all_observed = ca.MX.sym("x", n_unknowns), ca.MX.sym("observed", n_observed)
     residuals, values = [ca.MX(0, 1)], [ca.MX(0, 1)]
     rows, columns = [_NONE], [_NONE]
     n_before = place = 0
@@ -402,7 +404,7 @@ def _residuals_and_jacobian(
         observed = []
         for a, b in sizes:
             size = n * a * b
-            observed.append(ca.reshape(seen[place : place + size], a, n * b))
+            observed.append(ca.reshape(all_observed[place : place + size], a, n * b))
             place += size
         index = np.frombuffer(content, dtype=np.int64).reshape(n, n_local)
         padded = np.where(index >= 0, index, n_unknowns).ravel().tolist()
@@ -423,16 +425,16 @@ def _residuals_and_jacobian(
     pattern = ca.Sparsity(n_before, n_unknowns, first.tolist(), row[order].tolist())
     jacobian = ca.MX(pattern, ca.vertcat(*values)[order.tolist()])
     return (
-        ca.Function("residuals", [x, seen], [ca.vertcat(*residuals)]),
-        ca.Function("jacobian", [x, seen], [jacobian]),
+        ca.Function("residuals", [x, all_observed], [ca.vertcat(*residuals)]),
+        ca.Function("jacobian", [x, all_observed], [jacobian]),
     )
 
 
 @lru_cache(maxsize=64)
-def _derivative(function: ca.Function, which: int) -> ca.Function:
+def _derivative(function: ca.Function, input_index: int) -> ca.Function:
     """Return the full derivative of a term's function by its local unknowns (0) or errors (1)."""
     inputs = [ca.SX.sym(f"i{k}", *function.size_in(k)) for k in range(function.n_in())]
-    jacobian = ca.densify(ca.jacobian(function(*inputs), inputs[which]))
+    jacobian = ca.densify(ca.jacobian(function(*inputs), inputs[input_index]))
     return ca.Function("derivative", inputs, [jacobian])
 
 
@@ -446,8 +448,8 @@ def _matrix(weights: Sequence[Array]) -> csc_array[np.float64]:
         rows.append((place if W.ndim == 2 else np.repeat(place, r, axis=1)).ravel())
         columns.append((place if W.ndim == 2 else np.tile(place, (1, r))).ravel())
         first += n * r
-    where = np.concatenate(rows), np.concatenate(columns)
-    return csc_array((np.concatenate(entries), where), shape=(first, first))
+    indices = np.concatenate(rows), np.concatenate(columns)
+    return csc_array((np.concatenate(entries), indices), shape=(first, first))
 
 
 def _entries(weights: Sequence[Array]) -> ca.DM:

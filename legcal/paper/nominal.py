@@ -1,6 +1,6 @@
-"""The machine as a step knows it: nominal legs at first, in R_b and R_e, identified ones at last.
+"""The machine of the steps: nominal legs at first, in R_b and R_e, identified legs at last.
 
-Every step takes such a machine and returns it with what it has estimated.
+Every step takes such a machine and returns it with its estimates.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from legcal.machine.parameters import geometries, is_spatial
 
 @dataclass(frozen=True, eq=False)
 class NominalMachine:
-    """The legs of a machine from which a step starts, and which unknowns they have."""
+    """The legs of a machine at the start of a step, and their unknowns."""
 
     leg_names: tuple[str, ...]
-    legs: tuple[Leg, ...]  # what belongs to the base in R_b, to the platform in R_e
+    legs: tuple[Leg, ...]  # geometry of the base in R_b, of the platform in R_e
     frame_legs: tuple[int, ...]  # their joints define R_b and R_e: three in space, two in a plane
 
     @property
@@ -59,22 +59,22 @@ class NominalMachine:
 
     @cached_property
     def constant(self) -> BoolArray:
-        """Which legs have a constant length and no reading, (n_legs,)."""
+        """Mask of the legs with a constant length and no reading, (n_legs,)."""
         return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
 
     @cached_property
     def actuators(self) -> dict[int, Actuator]:
-        """What moves the joints at A of legs that are rods on actuators, by leg."""
+        """The actuators that move joints at A of legs that are rods, by leg."""
         return {j: leg.actuator for j, leg in enumerate(self.legs) if leg.actuator is not None}
 
     @cached_property
     def on_platform(self) -> BoolArray:
-        """Which legs are fixed to the platform, (n_legs,)."""
+        """Mask of the legs that are fixed to the platform, (n_legs,)."""
         return np.array([leg.is_fixed_to_platform for leg in self.legs], dtype=np.bool_)
 
     @cached_property
     def revolute(self) -> BoolArray:
-        """Which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
+        """Mask of the legs with a revolute axis at the base as a parameter, (n_legs,)."""
         constrained = [EquationKind.BASE_AXIS in leg.equations for leg in self.legs]
         return np.array(constrained, dtype=np.bool_)
 
@@ -93,5 +93,5 @@ class NominalMachine:
 
 
 def nominal_machine(machine: Machine) -> NominalMachine:
-    """Return a machine as the steps take it."""
+    """Return the nominal machine of the steps."""
     return NominalMachine(machine.leg_names, geometries(machine), machine.frame_legs)

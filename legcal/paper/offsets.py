@@ -32,23 +32,23 @@ from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import Unknowns
 from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
 
-_APART = 1e-3  # mean leg lengths: nearer platform joints count as one
+_APART = 1e-3  # [mean leg lengths] minimum distance of separate platform joints
 
 
 @dataclass(frozen=True, eq=False)
 class LegDirections:
-    """Legs of (13) as steps 3 and 4 see them: by group, then by leg."""
+    """Legs of (13), the input of steps 3 and 4: by group, then by leg."""
 
-    group: IntArray  # (n,): legs of one group are those of one pose in one view
+    group: IntArray  # (n,): index of the pose and view of each leg
     view: IntArray  # (n,)
     leg: IntArray  # (n,)
     A: Array  # (n, 3): base joint centres in the frame of the group [m], at the readings
-    of_A: Array  # (n, 3, 3): covariances of these [m^2]; zero where actuators move them
+    of_A: Array  # (n, 3, 3): covariances of A [m^2]; zero where actuators move A
     u: Array  # (n, 3): unit directions from base to platform
     basis: Array  # (n, 2, 3): e1, e2 normal to u
     reading: Array  # (n,) sign * q [m], length less offset; zero if constant, NaN if passive
     covariance: Array  # (n, 3, 3) of u along e1 and e2 [rad^2], and of the reading [m^2]
-    turn: Array  # (n, 3, 3): how what is fixed in the carriage or arm has turned in R_b
+    turn: Array  # (n, 3, 3): rotation of the carriage or arm in R_b
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -60,7 +60,7 @@ class LegDirections:
 
     @property
     def columns(self) -> Array:
-        """The legs as (13) takes them, (n, 13)."""
+        """The legs in the form of (13), (n, 13)."""
         basis = self.basis.reshape(-1, 6)
         return np.hstack([self.A, self.u, self.reading[:, None], basis])
 
@@ -72,14 +72,14 @@ class LegDirections:
 def leg_directions(
     machine: NominalMachine, joints: JointsInCamera, measurements: Measurements
 ) -> LegDirections:
-    """Return the legs as step 1 found them in each camera; images of one pose are averaged."""
+    """Return the legs of step 1 in each camera; images of one pose are averaged."""
     axes = joints.axes
     key = np.stack([measurements.view[axes.row], measurements.pose[axes.row], axes.leg], axis=1)
-    distinct, first, which, count = np.unique(
+    distinct, first, inverse, count = np.unique(
         key, axis=0, return_index=True, return_inverse=True, return_counts=True
     )
     total = np.zeros((len(distinct), 3))
-    np.add.at(total, which.ravel(), axes.u)
+    np.add.at(total, inverse.ravel(), axes.u)
     u = total / np.linalg.norm(total, axis=1, keepdims=True)
     v, k, j = distinct.T
     q = measurements.q[axes.row[first], j]
@@ -110,9 +110,9 @@ def leg_directions(
 def identify_offsets(
     machine: NominalMachine, directions: LegDirections, *, weighted: bool
 ) -> tuple[NominalMachine, tuple[str, ...]]:
-    """Return the machine with offsets and constant lengths by (14), and what stayed nominal.
+    """Return the machine with offsets and constant lengths by (14), and nominal values in words.
 
-    Raises NotIdentifiable if the distances do not fix every offset, and DidNotConverge.
+    Raises NotIdentifiable if the distances do not determine every offset, and DidNotConverge.
     """
     pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     problem = build_consecutive(machine, directions)
@@ -126,23 +126,23 @@ def identify_offsets(
 
 
 def build_consecutive(machine: NominalMachine, directions: LegDirections) -> LeastSquares:
-    """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
+    """Build the criterion C_2 of (14): distances are equal in consecutive positions of a view."""
     pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     last: dict[tuple[int, ...], int] = {}
-    found = []
+    consecutive = []
     for k, (a, b) in enumerate(pairs):
         key = (int(directions.view[a]), int(directions.leg[a]), int(directions.leg[b]))
         if key in last:
-            found.append((last[key], k))
+            consecutive.append((last[key], k))
         last[key] = k
-    _check_any(found, "view shows the same two legs in two images")
-    before, after = np.array(found, dtype=np.intp).T
-    seen = tuple(np.swapaxes(directions.columns[pairs[k]], 1, 2) for k in (before, after))
+    _check_any(consecutive, "view shows the same two legs in two images")
+    before, after = np.array(consecutive, dtype=np.intp).T
+    observed = tuple(np.swapaxes(directions.columns[pairs[k]], 1, 2) for k in (before, after))
     covariance = np.zeros((len(before), 12, 12))
-    for k, each in enumerate((*pairs[before].T, *pairs[after].T)):
-        covariance[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = directions.covariance[each]
+    for k, rows in enumerate((*pairs[before].T, *pairs[after].T)):
+        covariance[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = directions.covariance[rows]
     index = unknowns.place[directions.leg[pairs[after]], LegColumns.LENGTH]
-    term = Term(change_of_distance(), index, seen, covariance)
+    term = Term(change_of_distance(), index, observed, covariance)
     return LeastSquares("The offsets (eq 14)", (term,), unknowns.vector(machine.legs))
 
 
@@ -161,8 +161,8 @@ def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
 def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
     """Return the pairs of :func:`pairs_of_legs` whose distance depends on their offsets.
 
-    Two legs that meet in one platform joint are at distance zero whatever their offsets are; a leg
-    that is fixed to the platform ends on it whatever its offset is.
+    Two legs that meet in one platform joint are at distance zero for any offsets; a leg that is
+    fixed to the platform ends on it for any offset.
     """
     q0, B = machine.offsets, machine.parameters.platform_joints
     pairs = pairs_of_legs(directions, q0)
@@ -181,9 +181,9 @@ def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
 # Refusals
 
 
-def _check_any(found: Sequence[object], missing: str) -> None:
-    """Refuse a criterion without observations; *missing* says which are missing."""
-    if not found:
+def _check_any(observations: Sequence[object], missing: str) -> None:
+    """Refuse a criterion without observations; *missing* are the missing ones in words."""
+    if not observations:
         raise NotIdentifiable(
             f"The offsets could not be identified: no {missing}; needed images at different poses "
             "that show several legs at once; add such images."
@@ -196,7 +196,7 @@ def _check_identifiable(
     pairs: IntArray,
     loose: BoolArray,
 ) -> None:
-    """Refuse when an offset can change without any distance noticing."""
+    """Refuse offsets that can change without changing any distance."""
     with_offset = np.flatnonzero(np.isfinite(machine.offsets))
     loose = loose & ~machine.on_platform[with_offset]
     if not loose.any():

@@ -6,9 +6,9 @@ of a view equal those in the platform frame R_e (16):
     C_3 = sum over views and pairs of legs (mean |B_j B_g| in R_c - |B_j B_g| in R_e)^2
 
 With weights, joints, offsets and poses of the platform are then solved for together by (18), which
-shows z of coplanar joints too. Where the platform is gives revolute axes on it by v . u = 0 (7),
-the ends of passive legs by u x A B = 0 (19), universal axes and twists by the closure of legs
-without an S joint.
+determines z of coplanar joints too. The poses of the platform give revolute axes on it by
+v . u = 0 (7), the ends of passive legs by u x A B = 0 (19), universal axes and twists by the
+closure of legs without an S joint.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from legcal.paper.platform_pose import PlatformPoses, across_rays, locate_platfo
 from legcal.paper.unknowns import Unknowns
 from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal, with_prior
 
-_APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
-_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
-_SIGMA_CLOSURE = 1e-4  # of all closures together, rms: what changes them by less is not observed
+_APART = 1e-3  # [mean leg lengths] minimum distance of separate joints
+_SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of different directions
+_SIGMA_CLOSURE = 1e-4  # standard deviation of all closures together, rms
 
 
 def locate_platform_joints(
@@ -60,11 +60,11 @@ def locate_platform_joints(
     weighted: bool,
     free_twists: bool = False,
 ) -> tuple[NominalMachine, tuple[str, ...]]:
-    """Return the machine of steps 2 and 3 with all that step 4 estimates, and diagnostics.
+    """Return the machine of steps 2 and 3 with all estimates of step 4, and diagnostics.
 
     These are B, axes on the platform, universal axes at the base, and twists if they are freed;
-    diagnostics say what was left at nominal, and why. Raises NotIdentifiable if the images do not
-    determine something that moves the platform, and DidNotConverge.
+    diagnostics name nominal values with their reasons. Raises NotIdentifiable if the images do not
+    determine a parameter that moves the platform, and DidNotConverge.
     """
     unknowns = Unknowns.of_platform(machine, free_twists=free_twists)
     problem = build_mean_distances(machine, unknowns, directions)
@@ -83,14 +83,16 @@ def locate_platform_joints(
     if not unposed and not on_rays:
         left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
         return replace(machine, legs=legs), left
-    seen = _SeenLegs.of(machine, legs, base, directions, weighted=weighted, by_rays=not on_rays)
-    if on_rays and len(seen.poses.R):
-        seen, legs, shown = _ends_on_rays(seen, unknowns, legs)
+    seen_legs = _SeenLegs.of(
+        machine, legs, base, directions, weighted=weighted, by_rays=not on_rays
+    )
+    if on_rays and len(seen_legs.poses.R):
+        seen_legs, legs, shown = _ends_on_rays(seen_legs, unknowns, legs)
         held = np.setdiff1d(held, shown)
     left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
     if not unposed:
         return replace(machine, legs=legs), left
-    if not len(seen.poses.R):
+    if not len(seen_legs.poses.R):
         number = "three" if machine.spatial else "two"
         shape = " that do not lie on one line" if machine.spatial else ""
         raise NotIdentifiable(
@@ -98,8 +100,8 @@ def locate_platform_joints(
             f"shows {number} legs of known length at once with ends{shape}, needed to know where "
             "the platform is (eq 18); add images that show several legs at once."
         )
-    legs = tuple(_with_axis_and_end(seen, unknowns, j, leg) for j, leg in enumerate(legs))
-    legs, of_closure = _close_legs(seen, unknowns, legs)
+    legs = tuple(_with_axis_and_end(seen_legs, unknowns, j, leg) for j, leg in enumerate(legs))
+    legs, of_closure = _close_legs(seen_legs, unknowns, legs)
     return replace(machine, legs=_in_own_frame(machine, legs)), (*left, *of_closure)
 
 
@@ -108,7 +110,7 @@ def build_mean_distances(
 ) -> LeastSquares:
     """Build the criterion C_3 of (16): mean distances of a view equal those in R_e.
 
-    Two legs that end in one place have none. In a plane the heights of R_e are nominal.
+    Two legs that end in one point are left out. In a plane the heights of R_e are nominal.
     """
     q0 = machine.offsets
     pairs = pairs_of_legs(directions, q0)
@@ -116,14 +118,14 @@ def build_mean_distances(
     apart = _APART * float(np.mean(q0[np.isfinite(q0)]))
     pairs = pairs[np.linalg.norm(B[:, 1] - B[:, 0], axis=1) > apart]
     key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])
-    distinct, which = np.unique(key, axis=0, return_inverse=True)
-    which, legs = which.ravel(), distinct[:, 1:]
+    distinct, group = np.unique(key, axis=0, return_inverse=True)
+    group, legs = group.ravel(), distinct[:, 1:]
     ends = q0[directions.leg[pairs]], np.swapaxes(directions.columns[pairs], 1, 2)
     distance = evaluated(distance_of_ends(), *ends)[:, 0]
     slope = derivatives(distance_of_ends(), 1, *ends)[:, 0].reshape(-1, 2, 3)
     variance = np.einsum("pki,pkij,pkj->p", slope, directions.covariance[pairs], slope)
-    n = np.bincount(which)
-    mean, of_mean = (np.bincount(which, weights=w) for w in (distance, variance))
+    n = np.bincount(group)
+    mean, of_mean = (np.bincount(group, weights=w) for w in (distance, variance))
     place = unknowns.place[:, LegColumns.B]
     observed = np.swapaxes(unknowns.known_B[legs], 1, 2), mean / n
     index, covariance = place[legs].reshape(-1, 6), (of_mean / n**2)[:, None, None]
@@ -139,9 +141,9 @@ def build_mean_distances(
 class _SeenLegs:
     """Legs in R_b where their camera is located, else in its frame, and the platform there."""
 
-    machine: NominalMachine  # as steps 2 and 3 have it
+    machine: NominalMachine  # result of steps 2 and 3
     directions: LegDirections
-    in_base: BoolArray  # (n,) which are in R_b
+    in_base: BoolArray  # (n,) whether each is in R_b
     centre: Array  # (n, 3) of the camera [m]
     poses: PlatformPoses
     weighted: bool
@@ -157,19 +159,19 @@ class _SeenLegs:
         weighted: bool,
         by_rays: bool,
     ) -> _SeenLegs:
-        """Locate cameras and platform by (18): each A, and each B, is on the ray that shows it."""
+        """Locate cameras and platform by (18): each A, and each B, is on its camera ray."""
         A, u, basis = directions.A.copy(), directions.u.copy(), directions.basis.copy()
         of_A = directions.of_A.copy()
         centre, in_base = np.zeros_like(A), np.zeros(len(A), dtype=np.bool_)
         for v, T in enumerate(base.T_Rb_camera):
-            here = np.flatnonzero(directions.view == v)
-            if T is None or not len(here):
+            of_view = np.flatnonzero(directions.view == v)
+            if T is None or not len(of_view):
                 continue
             R = T.rotation.as_matrix()
-            of_A[here] = R @ of_A[here] @ R.T
-            A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
-            basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
-            centre[here], in_base[here] = T.translation, True
+            of_A[of_view] = R @ of_A[of_view] @ R.T
+            A[of_view], u[of_view] = T.apply(A[of_view]), T.rotation.apply(u[of_view])
+            basis[of_view] = T.rotation.apply(basis[of_view].reshape(-1, 3)).reshape(-1, 2, 3)
+            centre[of_view], in_base[of_view] = T.translation, True
         directions = replace(directions, A=A, of_A=of_A, u=u, basis=basis)
         q0 = machine.offsets
         slope = derivatives(end_of_leg(), 1, q0[directions.leg, None], directions.columns)
@@ -186,31 +188,31 @@ class _SeenLegs:
         return cls(machine, directions, in_base, centre, poses, weighted)
 
     def across(self, rows: IntArray) -> AcrossAxes:
-        """Return some directions as (7) of one axis on the platform takes them."""
+        """Return some directions in the form of (7) for one axis on the platform."""
         u, basis = self.directions.u[rows], self.directions.basis[rows]
         R, axis = self.poses.R[self.poses.pose[rows]], np.zeros(len(rows), dtype=np.intp)
         return AcrossAxes(u, basis, R, self.covariance(rows), axis)
 
     def covariance(self, rows: IntArray) -> Array:
         """Return the covariances (k, 8, 8) of some directions and of steps of their poses."""
-        found = np.zeros((len(rows), 8, 8))
-        found[:, :2, :2] = self.directions.covariance[rows, :2, :2]
-        found[:, 2:, 2:] = self.poses.covariance[self.poses.pose[rows]]
-        return found
+        covariances = np.zeros((len(rows), 8, 8))
+        covariances[:, :2, :2] = self.directions.covariance[rows, :2, :2]
+        covariances[:, 2:, 2:] = self.poses.covariance[self.poses.pose[rows]]
+        return covariances
 
 
 # Ends, offsets and poses together
 
 
 def _ends_on_rays(
-    seen: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
+    seen_legs: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
 ) -> tuple[_SeenLegs, tuple[Leg, ...], IntArray]:
-    """Return legs with B and offsets, and where the platform is, by (18), and what it shows.
+    """Return platform poses and legs with B and offsets by (18), and the unknowns it determines.
 
-    These are unknowns. What it shows less of than the nominal model stays where (14) and (16) have
-    it.
+    Directions with less information in (18) than in the nominal model keep the results of (14) and
+    (16).
     """
-    machine, directions, poses = seen.machine, seen.directions, seen.poses
+    machine, directions, poses = seen_legs.machine, seen_legs.directions, seen_legs.poses
     q0 = machine.offsets
     rows = np.flatnonzero(
         (poses.pose >= 0) & np.isfinite(q0[directions.leg]) & ~machine.on_platform[directions.leg]
@@ -232,8 +234,8 @@ def _ends_on_rays(
         unknowns.known_B[leg],
         poses.R[pose],
         poses.t[pose],
-        seen.centre[rows],
-        across_rays(directions.ends(q0)[rows], seen.centre[rows]),
+        seen_legs.centre[rows],
+        across_rays(directions.ends(q0)[rows], seen_legs.centre[rows]),
         directions.columns[rows],
     )
     index = np.hstack([renumbered[place], steps[pose]])
@@ -243,27 +245,29 @@ def _ends_on_rays(
     name = "The platform joints and poses (eq 18)"
     problem = LeastSquares(name, (term,), start, exact_hessian=True)
     problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True, wanted=wanted)
-    found = solve_least_squares(problem, weighted=True)
-    x[wanted] = found.x[: len(wanted)]
+    solution = solve_least_squares(problem, weighted=True)
+    x[wanted] = solution.x[: len(wanted)]
     legs = unknowns.legs(x, legs)
-    R, t = stepped_poses(poses.R, poses.t, found.x[steps])
-    poses = PlatformPoses(poses.pose, R, t, found.covariances(steps))
-    seen = replace(seen, machine=replace(machine, legs=legs), poses=poses)
-    return seen, legs, np.setdiff1d(wanted, held)
+    R, t = stepped_poses(poses.R, poses.t, solution.x[steps])
+    poses = PlatformPoses(poses.pose, R, t, solution.covariances(steps))
+    seen_legs = replace(seen_legs, machine=replace(machine, legs=legs), poses=poses)
+    return seen_legs, legs, np.setdiff1d(wanted, held)
 
 
 # Axes on the platform and passive ends
 
 
-def _with_axis_and_end(seen: _SeenLegs, unknowns: Unknowns, j: int, leg: Leg) -> Leg:
+def _with_axis_and_end(seen_legs: _SeenLegs, unknowns: Unknowns, j: int, leg: Leg) -> Leg:
     """Return leg *j* with its axis on the platform, (7), and its end if it is passive, (19)."""
-    machine, directions, nominal = seen.machine, seen.directions, leg.platform_axis
+    machine, directions, nominal = seen_legs.machine, seen_legs.directions, leg.platform_axis
     name = machine.leg_names[j]
-    rows = np.flatnonzero((directions.leg == j) & (seen.poses.pose >= 0))
+    rows = np.flatnonzero((directions.leg == j) & (seen_legs.poses.pose >= 0))
     if nominal is not None and EquationKind.PLATFORM_AXIS in leg.equations:
-        leg = replace(leg, platform_axis=_revolute_axis(seen, name, rows, nominal))
+        leg = replace(leg, platform_axis=_revolute_axis(seen_legs, name, rows, nominal))
     elif nominal is not None and leg.is_fixed_to_platform:
-        u = np.einsum("nij,ni->nj", seen.poses.R[seen.poses.pose[rows]], directions.u[rows])
+        u = np.einsum(
+            "nij,ni->nj", seen_legs.poses.R[seen_legs.poses.pose[rows]], directions.u[rows]
+        )
         fixed = replace(leg, platform_axis=fixed_direction(name, u))
         twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
         leg = replace(fixed, twist=twist)
@@ -271,24 +275,24 @@ def _with_axis_and_end(seen: _SeenLegs, unknowns: Unknowns, j: int, leg: Leg) ->
         free = np.flatnonzero(unknowns.place[j, LegColumns.B] >= 0)
         if j in machine.frame_legs and not leg.is_fixed_to_platform:
             free = np.arange(3 if machine.spatial else 2)
-        leg = replace(leg, B=_passive_end(seen, name, rows, leg.B, free))
+        leg = replace(leg, B=_passive_end(seen_legs, name, rows, leg.B, free))
     return leg
 
 
-def _revolute_axis(seen: _SeenLegs, name: str, rows: IntArray, nominal: Array) -> Array:
-    """Return a revolute axis in R_e (3,) by (7), on the side of the nominal one.
+def _revolute_axis(seen_legs: _SeenLegs, name: str, rows: IntArray, nominal: Array) -> Array:
+    """Return a revolute axis in R_e (3,) by (7), with the sign of the nominal axis.
 
     Raises NotIdentifiable if the leg has fewer than two directions in the platform.
     """
-    across, n = seen.across(rows), len(rows)
+    across, n = seen_legs.across(rows), len(rows)
     if not n or np.linalg.eigvalsh(across.scatter[0])[1] <= _SAME_DIRECTION * n:
-        found = f"one direction in {n} pose{'s' * (n != 1)}"
+        actual = f"one direction in {n} pose{'s' * (n != 1)}"
         raise NotIdentifiable(
             f"The revolute axis of leg {name} on the platform could not be identified: found "
-            f"{found if n else 'no pose that shows its direction'} in the frame of the "
+            f"{actual if n else 'no pose that shows its direction'} in the frame of the "
             "platform, needed two different ones; add poses between which the leg turns about it."
         )
-    v, turns, _ = across.solve(weighted=seen.weighted)
+    v, turns, _ = across.solve(weighted=seen_legs.weighted)
     axis = turned_axis(v[0], angles_of(turns[0]))
     return axis if axis @ nominal > 0.0 else -axis
 
@@ -309,26 +313,26 @@ def fixed_direction(name: str, u: Array) -> Array:
 
 
 def _passive_end(
-    seen: _SeenLegs, name: str, rows: IntArray, B_nominal: Array, free: IntArray
+    seen_legs: _SeenLegs, name: str, rows: IntArray, B_nominal: Array, free: IntArray
 ) -> Array:
     """Return the platform joint centre (3,) of a passive leg: u x A B = 0 in all poses, eq (19).
 
-    Only the ``free`` coordinates of B are looked for: three; two in a plane, and on a leg that is
-    fixed to the platform, along which B may lie anywhere. Raises NotIdentifiable if the leg has too
-    few directions in the platform.
+    Only the ``free`` coordinates of B are unknown: three; two in a plane, and on a leg that is
+    fixed to the platform, where B may be anywhere along the leg. Raises NotIdentifiable if the leg
+    has too few directions in the platform.
     """
     n, place, B = len(rows), np.full(3, -1), B_nominal.copy()
     place[free] = np.arange(len(free))
-    pose, directions = seen.poses.pose[rows], seen.directions
+    pose, directions = seen_legs.poses.pose[rows], seen_legs.directions
     observed = (
         np.tile(np.where(place < 0, B, 0.0), (n, 1)),
-        seen.poses.R[pose],
-        seen.poses.t[pose],
+        seen_legs.poses.R[pose],
+        seen_legs.poses.t[pose],
         directions.A[rows],
         directions.u[rows],
         directions.basis[rows],
     )
-    term = Term(end_on_axis(), np.tile(place, (n, 1)), observed, seen.covariance(rows))
+    term = Term(end_on_axis(), np.tile(place, (n, 1)), observed, seen_legs.covariance(rows))
     problem = LeastSquares(f"The end of leg {name} (eq 19)", (term,), B[free])
     J = problem.jacobian(problem.start).toarray() if n else np.zeros((1, len(free)))
     if np.linalg.eigvalsh(J.T @ J)[0] <= _SAME_DIRECTION * n:
@@ -339,7 +343,7 @@ def _passive_end(
             "the platform, each seen together with three legs of known length (eq 19); add images "
             "at poses that differ more."
         )
-    B[free] = solve_least_squares(problem, weighted=seen.weighted).x
+    B[free] = solve_least_squares(problem, weighted=seen_legs.weighted).x
     return B
 
 
@@ -347,11 +351,11 @@ def _passive_end(
 
 
 def _close_legs(
-    seen: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
+    seen_legs: _SeenLegs, unknowns: Unknowns, legs: tuple[Leg, ...]
 ) -> tuple[tuple[Leg, ...], tuple[str, ...]]:
-    """Identify universal axes and twists by the closure, what the poses leave open at nominal.
+    """Identify universal axes and twists by the closure; undetermined ones stay nominal.
 
-    ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
+    ``legs`` have the other estimates. Returns them, and the nominal values in words.
     """
     twisting = np.array([leg.twist is not None for leg in unknowns.start])
     known_axis = np.array([leg.platform_joint is not JointType.UNIVERSAL for leg in unknowns.start])
@@ -359,36 +363,36 @@ def _close_legs(
     wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, LegColumns.PLATFORM_AXIS])
     if not len(wanted):
         return legs, ()
-    problem = _build_closure(seen, unknowns, wanted, legs)
+    problem = _build_closure(seen_legs, unknowns, wanted, legs)
     if not problem.terms:
-        names = ", ".join(np.array(seen.machine.leg_names)[twisting])
+        names = ", ".join(np.array(seen_legs.machine.leg_names)[twisting])
         return legs, (
             f"Step 4 left the axes of leg {names} at nominal: no camera in R_b shows it.",
         )
-    if not seen.weighted:  # axes that nothing determines would end anywhere
+    if not seen_legs.weighted:  # undetermined axes would end anywhere
         near = with_prior(problem, np.arange(len(wanted)))
         problem = replace(problem, start=solve_least_squares(near).x)
     problem, held = hold_at_nominal(
         problem,
-        seen.machine,
+        seen_legs.machine,
         unknowns,
-        weighted=seen.weighted,
+        weighted=seen_legs.weighted,
         wanted=wanted,
         nominal=np.zeros(len(wanted)),
     )
-    x = solve_least_squares(problem, weighted=seen.weighted).x
-    left = left_near_nominal("Step 4", seen.machine, unknowns, held)
+    x = solve_least_squares(problem, weighted=seen_legs.weighted).x
+    left = left_near_nominal("Step 4", seen_legs.machine, unknowns, held)
     return _closed(unknowns, legs, wanted, x), left
 
 
 def _build_closure(
-    seen: _SeenLegs, unknowns: Unknowns, wanted: IntArray, legs: tuple[Leg, ...]
+    seen_legs: _SeenLegs, unknowns: Unknowns, wanted: IntArray, legs: tuple[Leg, ...]
 ) -> LeastSquares:
     """Build the closure of all legs without an S joint: sin(angle - twist) = 0."""
     renumbered = np.full(len(unknowns) + 1, -1, dtype=np.intp)
     renumbered[wanted] = np.arange(len(wanted))
-    place, directions = renumbered[unknowns.place], seen.directions
-    shown = seen.in_base & (seen.poses.pose >= 0)
+    place, directions = renumbered[unknowns.place], seen_legs.directions
+    shown = seen_legs.in_base & (seen_legs.poses.pose >= 0)
     twisting = [(j, leg) for j, leg in enumerate(legs) if leg.twist is not None]
     n_rows = int(np.sum(shown & np.isin(directions.leg, [j for j, _ in twisting])))
     terms = []
@@ -405,50 +409,50 @@ def _build_closure(
         observed = (
             directions.u[rows],
             directions.basis[rows],
-            seen.poses.R[seen.poses.pose[rows]],
+            seen_legs.poses.R[seen_legs.poses.pose[rows]],
             directions.turn[rows] @ base,
             platform,
             np.array([float(legs[j].twist or 0.0) for j in leg]),
             np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),
         )
         index = place[leg, LegColumns.BASE_AXIS.start : LegColumns.OWN]
-        terms.append(Term(closure_of_leg(*joints), index, observed, seen.covariance(rows)))
+        terms.append(Term(closure_of_leg(*joints), index, observed, seen_legs.covariance(rows)))
     return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
 
 
 def _closed(
     unknowns: Unknowns, legs: tuple[Leg, ...], wanted: IntArray, x: Array
 ) -> tuple[Leg, ...]:
-    """Return legs with universal axes turned from the nominal ones, and twists changed."""
+    """Return legs with universal axes rotated from the nominal axes, and changed twists."""
     values = np.zeros(len(unknowns) + 1)
     values[wanted] = x
-    found = []
-    for leg, own in zip(legs, values[unknowns.place], strict=True):
+    closed_legs = []
+    for leg, leg_values in zip(legs, values[unknowns.place], strict=True):
         if leg.twist is not None and leg.base_axis is not None and leg.platform_axis is not None:
             base, platform = (
-                turned_axis(axis, angles_of(own[columns]))
+                turned_axis(axis, angles_of(leg_values[columns]))
                 for axis, columns in (
                     (leg.base_axis, LegColumns.BASE_AXIS),
                     (leg.platform_axis, LegColumns.PLATFORM_AXIS),
                 )
             )
-            twist = leg.twist + float(own[LegColumns.TWIST])
+            twist = leg.twist + float(leg_values[LegColumns.TWIST])
             leg = replace(leg, base_axis=base, platform_axis=platform, twist=twist)
-        found.append(leg)
-    return tuple(found)
+        closed_legs.append(leg)
+    return tuple(closed_legs)
 
 
 def _in_own_frame(machine: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
-    """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
+    """Return legs with the platform in R_e again after passive legs among the frame legs moved."""
     frame = list(machine.frame_legs)
     if all(legs[j].kind is not LegKind.PASSIVE for j in frame):
         return legs
     T = frame_on_points(np.array([legs[j].B for j in frame])).inv()
-    found = []
+    moved_legs = []
     for j, leg in enumerate(legs):
         B, axis = T.apply(leg.B), leg.platform_axis
         if j in frame:  # coordinates that are zero by the choice of the frame
             B[frame.index(j) : len(frame)] = 0.0
         axis = None if axis is None else np.asarray(T.rotation.apply(axis))
-        found.append(replace(leg, B=B, platform_axis=axis, twist=twist_after(leg, T.rotation)))
-    return tuple(found)
+        moved_legs.append(replace(leg, B=B, platform_axis=axis, twist=twist_after(leg, T.rotation)))
+    return tuple(moved_legs)

@@ -1,8 +1,8 @@
-"""The unknowns of a step: some of the kinematic parameters of the legs, counted from a start.
+"""The unknowns of a step: some of the kinematic parameters of the legs, relative to a start.
 
-Joint centres and lengths are unknown as they are [m], axes by two turns from where the step starts
-(:func:`~legcal.paper.gibbs.gibbs_of` the angles), twists by their change [rad]. Rods on the same
-actuator share its numbers; its gain is no unknown of the steps.
+The unknowns are joint centres and lengths [m], two rotations of each axis from the start
+(:func:`~legcal.paper.gibbs.gibbs_of` the angles), and changes of twists [rad]. Rods on the same
+actuator share its numbers; its gain is not an unknown of the steps.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _AXES = (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS, ActuatorColumns.AXIS)
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Which parameters a step estimates, and where the numbers of each leg stand among them."""
+    """The parameters that a step estimates, with the indices of each leg among them."""
 
     parametrization: Parametrization  # of all parameters of the machine
-    parameters: IntArray  # (n,), rising: which of them are unknown
-    start: tuple[Leg, ...]  # what turns of axes and changes of twists count from
+    parameters: IntArray  # (n,), ascending: indices of the unknown parameters
+    start: tuple[Leg, ...]  # reference of rotations of axes and changes of twists
 
     @classmethod
     def of_base(cls, machine: NominalMachine) -> Unknowns:
-        """Return those of step 2: base joints, revolute axes at the base, and actuators."""
+        """Return the unknowns of step 2: base joints, revolute axes at the base, and actuators."""
         columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.A] = True
         columns[:, LegColumns.BASE_AXIS] = machine.revolute[:, None]
@@ -42,14 +42,14 @@ class Unknowns:
 
     @classmethod
     def of_lengths(cls, machine: NominalMachine) -> Unknowns:
-        """Return those of step 3: offsets and constant lengths."""
+        """Return the unknowns of step 3: offsets and constant lengths."""
         columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.LENGTH] = True
         return cls._among(machine, columns)
 
     @classmethod
     def of_platform(cls, machine: NominalMachine, *, free_twists: bool = False) -> Unknowns:
-        """Return those of step 4: all that step 2 does not estimate; twists only if freed."""
+        """Return the unknowns of step 4: all but those of step 2; twists only if freed."""
         columns = np.ones((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.A] = False
         columns[:, LegColumns.OWN :] = False
@@ -61,15 +61,21 @@ class Unknowns:
         cls, machine: NominalMachine, columns: BoolArray, *, free_twists: bool = False
     ) -> Unknowns:
         legs = machine.legs
-        every = parametrize(machine.leg_names, legs, machine.frame_legs, twists=free_twists)
-        return cls(every, np.sort(every.place[columns & (every.place >= 0)]), legs)
+        parametrization = parametrize(
+            machine.leg_names, legs, machine.frame_legs, twists=free_twists
+        )
+        return cls(
+            parametrization,
+            np.sort(parametrization.place[columns & (parametrization.place >= 0)]),
+            legs,
+        )
 
     def __len__(self) -> int:
         return len(self.parameters)
 
     @cached_property
     def place(self) -> IntArray:
-        """Where each leg's numbers (LegColumns) are among the unknowns, (n_legs, 21), or -1."""
+        """Indices of each leg's numbers (LegColumns) among the unknowns, (n_legs, 21), or -1."""
         place = np.full(len(self.parametrization) + 1, -1, dtype=np.intp)
         place[self.parameters] = np.arange(len(self))
         return np.asarray(place[self.parametrization.place])
@@ -81,24 +87,24 @@ class Unknowns:
 
     @property
     def is_angle(self) -> BoolArray:
-        """Which unknowns are angles [rad] and no lengths [m], (n,)."""
+        """Mask (n,) of the unknowns that are angles [rad] rather than lengths [m]."""
         return np.array([self.parametrization.units[i] == "rad" for i in self.parameters])
 
     @property
     def known_A(self) -> Array:
-        """Coordinates of A that are no unknowns, zero for the others, (n_legs, 3) [m]."""
+        """Known coordinates of A, zero for unknown ones, (n_legs, 3) [m]."""
         return np.where(self.place[:, LegColumns.A] < 0, [leg.A for leg in self.start], 0.0)
 
     @property
     def known_B(self) -> Array:
-        """The same of B."""
+        """Known coordinates of B, zero for unknown ones, (n_legs, 3) [m]."""
         return np.where(self.place[:, LegColumns.B] < 0, [leg.B for leg in self.start], 0.0)
 
     @cached_property
     def base_frames(self) -> Array:
         """Start of axes at the base and their normal bases as columns, (n_legs, 3, 3).
 
-        Zero for legs without one.
+        Zero for legs without an axis.
         """
         return _frames([leg.base_axis for leg in self.start])
 
@@ -109,7 +115,7 @@ class Unknowns:
 
     @cached_property
     def actuator_points(self) -> Array:
-        """The points of these axes from which their places count, (n_legs, 3) [m]."""
+        """The reference points of these axes, (n_legs, 3) [m]."""
         return np.array(
             [np.zeros(3) if leg.actuator is None else leg.actuator.point for leg in self.start]
         )
@@ -125,7 +131,7 @@ class Unknowns:
         return x
 
     def legs(self, x: Array, legs: Sequence[Leg]) -> tuple[Leg, ...]:
-        """Return legs with the unknowns at values of which these are the first."""
+        """Return legs with the unknowns at the first values of x."""
         local = np.append(x[: len(self)], 0.0)[self.place]
         for columns in _AXES:
             local[:, columns] = angles_of(local[:, columns])

@@ -1,8 +1,8 @@
-"""Directions of the unknowns of a step that its equation hardly determines.
+"""Weak directions: combinations of the unknowns of a step that its equation hardly determines.
 
-Nominal models are known to some per cent. What an equation says less of than that stays where the
-nominal model has it, and is named: z of coplanar joints in (9) and (16), or what the axes on base
-and platform of a 3-UPU have in common, which only translates.
+Nominal models are accurate to some per cent. Directions with less information in an equation keep
+their nominal value and are named: z of coplanar joints in (9) and (16), or the common rotation of
+the axes on base and platform of a 3-UPU, which only translates.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from legcal.paper.least_squares import LeastSquares, Term
 from legcal.paper.nominal import NominalMachine
 from legcal.paper.unknowns import Unknowns
 
-_SIGMA_LENGTH = 0.01  # of joint centres and lengths: mean leg lengths
-_SIGMA_AXIS = 0.03  # of axes [rad]
-_HELD = 3e-5  # of these: how well a direction is held
+_SIGMA_LENGTH = 0.01  # nominal standard deviation of joint centres and lengths [mean leg lengths]
+_SIGMA_AXIS = 0.03  # nominal standard deviation of axes [rad]
+_HELD = 3e-5  # standard deviation of a held direction, in units of these
 
 
 def with_prior(problem: LeastSquares, place: IntArray) -> LeastSquares:
-    """Return a problem with axes that are known to be near the nominal ones, by their places."""
+    """Return a problem with a prior of axes at their nominal values, by their indices."""
     rows = np.full((len(place), 1), 1.0 / _SIGMA_AXIS)
     term = Term(nominal_value(1), place[:, None], (rows, np.zeros(len(place))))
     return replace(problem, terms=(*problem.terms, term))
@@ -37,14 +37,14 @@ def hold_at_nominal(
     unknowns: Unknowns,
     *,
     weighted: bool,
-    wanted: IntArray | None = None,  # which of the unknowns those of the problem are; the first
-    nominal: Array | None = None,  # (n,) values; without it the start
+    wanted: IntArray | None = None,  # indices of the problem's unknowns; by default the first
+    nominal: Array | None = None,  # (n,) values; by default the start
 ) -> tuple[LeastSquares, IntArray]:
-    """Return a problem that holds what it says less of than the nominal model.
+    """Return a problem with weak directions held at nominal, and the unknowns that are held.
 
-    With it the unknowns that are held, of which :func:`left_near_nominal` tells.
-
-    What follows the unknowns among those of the problem are steps of poses, six each.
+    Weak are directions with less information in the problem than in the nominal model;
+    :func:`left_near_nominal` names them. The unknowns of the problem may be followed by steps of
+    poses, six each.
     """
     wanted = np.arange(min(len(problem.start), len(unknowns))) if wanted is None else wanted
     n = len(wanted)
@@ -78,7 +78,7 @@ def left_near_nominal(
     unknowns: Unknowns,
     held: IntArray,
 ) -> tuple[str, ...]:
-    """Return which unknowns are held, in words; nothing where there are none."""
+    """Return the unknowns that are held, in words; () for none."""
     if not len(held):
         return ()
     words = describe_direction([unknowns.names[i] for i in held], machine.leg_names)
@@ -86,7 +86,7 @@ def left_near_nominal(
 
 
 def _without_poses(jacobian: csc_array[np.float64], n: int) -> Array:
-    """Return what residuals say of the first n unknowns when the poses after these are free."""
+    """Return the Jacobian by the first n unknowns, with the poses after these projected out."""
     left = jacobian[:, :n].toarray()
     for first in range(n, jacobian.shape[1], 6):
         of_pose = jacobian[:, first : first + 6]

@@ -1,6 +1,6 @@
-"""Bags of ROS 1 and 2 and MCAP files: images of one topic, and joint states.
+"""Bags of ROS 1 and 2, and MCAP files: images of one topic, and joint states.
 
-A bag of several cameras is named with the topic of one behind it: ``run.mcap:/left/image_raw``.
+For a bag of several cameras, append the topic of one: ``run.mcap:/left/image_raw``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _BAGS = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _JOINTS = ("sensor_msgs/msg/JointState",)
-_USUAL_JOINTS = "/joint_states"  # the topic that counts among several
+_USUAL_JOINTS = "/joint_states"  # the preferred topic of several
 _COLOURS = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -40,18 +40,18 @@ _CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "rgba8": 4,
 
 
 def is_bag(path: Path) -> bool:
-    """Say whether a path is that of a bag."""
+    """Return whether a path is a bag."""
     return path.suffix.lower() in _BAGS or (path / _METADATA).is_file()
 
 
 def split_topic(path: Path) -> tuple[Path, str | None]:
-    """Return the path of a recording, and the topic that is written behind it."""
+    """Return the path of a recording, and the topic appended to it."""
     file, colon, topic = str(path).rpartition(":/")
     return (Path(file), f"/{topic}") if colon and is_bag(Path(file)) else (path, None)
 
 
 class Bag:
-    """A bag with the images of one camera and, unless a table has them, joint states."""
+    """A bag with the images of one camera and, unless given in a table, joint states."""
 
     def __init__(self, path: Path, machine: Machine, image_topic: str | None = None) -> None:
         if find_spec("rosbags") is None:
@@ -65,7 +65,7 @@ class Bag:
         self._bad = 0
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
-        """Yield the images in the order of the bag; damaged ones are left out and counted."""
+        """Yield the images in the order of the bag; damaged images are skipped and counted."""
         self._bad, last, number = 0, -np.inf, -1
         for time, kind, message in self._messages(_IMAGES, self._topic_of_images):
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
@@ -77,13 +77,13 @@ class Bag:
                 yield Frame(time, image)
 
     def notes(self) -> tuple[str, ...]:
-        """Return how many images could not be used."""
+        """Return a note with the number of unusable images, if any."""
         if not self._bad:
             return ()
-        one = self._bad == 1
+        images, were = ("image", "was") if self._bad == 1 else ("images", "were")
         return (
-            f"{self._bad} image{'' if one else 's'} of {self.path} {'was' if one else 'were'} left "
-            "out: damaged, of an unknown encoding, or not later than the one before.",
+            f"{self._bad} {images} of {self.path} {were} left out: damaged, of an unknown "
+            "encoding, or not later than the one before.",
         )
 
     def readings(self) -> Series | None:
@@ -98,7 +98,7 @@ class Bag:
         return series_of_joints(f"{self.path}, joint states", times, states, self._machine)
 
     def _topic_of_images(self, topics: Sequence[str]) -> str:
-        """Return the topic of the images: as stated, or the only one."""
+        """Return the topic of the images: the stated one, or the only one."""
         if self._image_topic is not None and self._image_topic not in topics:
             raise UsageError(
                 f"{self.path}: the images could not be read: found no topic "
@@ -106,17 +106,17 @@ class Bag:
                 f"{', '.join(map(describe, topics)) or 'one'}; correct the name."
             )
         if self._image_topic is None and len(topics) != 1:
-            found = ", ".join(map(describe, topics)) or "no topic"
+            stated = ", ".join(map(describe, topics)) or "no topic"
             remedy = f"name it behind the bag, {self.path}:{topics[0]}" if topics else (
                 "give another bag")  # fmt: skip
             raise DatasetError(
-                f"{self.path}: the images could not be read: found {found} with them, needed one; "
+                f"{self.path}: the images could not be read: found {stated} with them, needed one; "
                 f"{remedy}."
             )
         return self._image_topic or topics[0]
 
     def _topic_of_joints(self, topics: Sequence[str]) -> str:
-        """Return the topic of the joint states: the only one, or that of the usual name."""
+        """Return the topic of the joint states: the only one, or the one with the usual name."""
         if len(topics) > 1 and _USUAL_JOINTS not in topics:
             raise DatasetError(
                 f"{self.path}: the joint states could not be read: found "
@@ -141,7 +141,7 @@ class Bag:
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        """Open the bag; whatever the library finds wrong with it is one sentence."""
+        """Open the bag; errors of the library are reported in one sentence."""
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
 
@@ -149,24 +149,24 @@ class Bag:
             with AnyReader([self.path], default_typestore=get_typestore(Stores.LATEST)) as reader:
                 yield reader
         except (AnyReaderError, OSError, ValueError, EOFError) as error:
-            said = str(error).strip().splitlines()
+            lines = str(error).strip().splitlines()
             raise DatasetError(
                 f"{self.path}: the bag could not be read: found "
-                f"{describe(said[0]) if said else 'an error'}, needed a complete bag of ROS 1 "
+                f"{describe(lines[0]) if lines else 'an error'}, needed a complete bag of ROS 1 "
                 "(.bag) or 2 (its folder, .mcap); close its recording in order, or repair it "
                 "(rosbag reindex, ros2 bag reindex, mcap recover)."
             ) from error
 
 
 def _time(message: Any, recorded: int) -> float:
-    """Return when a message was made [s]: its header's time, else that of the recording."""
+    """Return the time of a message [s]: from its header, else from the recording."""
     stamp = message.header.stamp
     made = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
     return made if made > 0.0 else 1e-9 * recorded
 
 
 def _image(message: Any) -> NDArray[np.uint8] | None:
-    """Return a raw image, None if it is damaged or of an encoding that is not known."""
+    """Return a raw image, None if it is damaged or of an unsupported encoding."""
     rows, columns, step = int(message.height), int(message.width), int(message.step)
     encoding = message.encoding
     data = np.asarray(message.data)
@@ -177,8 +177,13 @@ def _image(message: Any) -> NDArray[np.uint8] | None:
         deep = np.frombuffer(data.tobytes(), dtype=order)[: rows * step // 2]
         return np.asarray(deep.reshape(rows, step // 2)[:, :columns] >> 8, dtype=np.uint8)
     channels = 1 if encoding.startswith("bayer_") else _CHANNELS.get(encoding, 0)
-    known = encoding in _CHANNELS or encoding in _COLOURS
-    if not known or min(rows, columns) < 1 or step < columns * channels or data.size < rows * step:
+    is_supported = encoding in _CHANNELS or encoding in _COLOURS
+    if (
+        not is_supported
+        or min(rows, columns) < 1
+        or step < columns * channels
+        or data.size < rows * step
+    ):
         return None
     image = data[: rows * step].reshape(rows, step)[:, : columns * channels]
     shaped = image if channels == 1 else image.reshape(rows, columns, channels)

@@ -1,4 +1,4 @@
-"""Frames of a recording with their times, one at a time: of a video, or of a folder of images."""
+"""Frames of a recording with their times, one at a time, from a video or a folder of images."""
 
 from __future__ import annotations
 
@@ -20,54 +20,54 @@ from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.recordings.series import Series, unix_seconds
 from legcal.vision.image_file import quiet_opencv
 
-# OpenCV's decoder reads it once: quiet (AV_LOG_QUIET), since damage is told in a sentence.
+# The decoder of OpenCV reads it once: quiet (AV_LOG_QUIET), since damage is reported in a sentence.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
 MAX_FRAMES = 1_000_000
 _STAMP = re.compile(r"\d{10,19}", re.ASCII)  # a Unix time in s, ms, us or ns
-_LOST = 0.02  # of the frames that a video promises: fewer are the rounding of its length
+_LOST = 0.02  # share of missing frames of a video, below which its length is just rounded
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a recording."""
+    """A frame of a recording."""
 
-    time: float  # [s] of the recording's clock
-    image: NDArray[np.uint8]  # (height, width) or (height, width, 3), in OpenCV's order of colours
+    time: float  # [s] by the clock of the recording
+    image: NDArray[np.uint8]  # (height, width) or (height, width, 3) in the colour order of OpenCV
 
 
 class Recording(Protocol):
-    """What a camera recorded from one place."""
+    """A recording of a camera at one place."""
 
     @property
     def path(self) -> Path:
         """The file or folder."""
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
-        """Yield the frames in the order of their times, or *only* those with these numbers.
+        """Yield the frames in the order of their times, or *only* the frames with these indices.
 
-        Each call begins at the first.
+        Each call starts at the first frame.
         """
 
     def notes(self) -> tuple[str, ...]:
-        """Return what is odd, once all frames have been seen."""
+        """Return notes, after all frames have been read."""
 
     def readings(self) -> Series | None:
-        """Return the readings that the recording holds itself, if any."""
+        """Return the readings in the recording, if any."""
 
 
 def _reader() -> int:
-    """Return the number of FFmpeg where OpenCV has it.
+    """Return the id of FFmpeg if OpenCV has it.
 
-    Others, which OpenCV tries on what FFmpeg cannot read, write about damage to stderr.
+    Other backends, which OpenCV tries on files that FFmpeg cannot read, print damage to stderr.
     """
     has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
     return cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
 
 
 class Video:
-    """A video file that OpenCV reads."""
+    """A video file, read with OpenCV."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,7 +77,7 @@ class Video:
         """Yield the frames; a video without any is refused."""
         with quiet_opencv():
             video = cv2.VideoCapture(str(self.path), _reader())
-            video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as its camera was calibrated
+            video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as in the calibration of its camera
             promised = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
             rate = video.get(cv2.CAP_PROP_FPS) if video.isOpened() else 0
             count, last = 0, -np.inf
@@ -88,11 +88,11 @@ class Video:
                     if only is not None and count not in only:
                         count += 1
                         continue
-                    found, image = video.retrieve()
-                    if not found:
+                    is_read, image = video.retrieve()
+                    if not is_read:
                         break
-                    time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)  # of the frame just read
-                    if time <= last:  # a container without times of its own
+                    time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)  # time of the frame just read
+                    if time <= last:  # a container without times
                         time = last + 1.0 / (rate or 30.0)
                     last = time
                     count += 1
@@ -112,16 +112,16 @@ class Video:
             )
 
     def notes(self) -> tuple[str, ...]:
-        """Return whether the video was cut off."""
+        """Return a note if the video was cut off."""
         return self._notes
 
     def readings(self) -> Series | None:
-        """Return nothing: a video holds no readings."""
+        """Return None: a video holds no readings."""
         return None
 
 
 class ImageFolder:
-    """A folder of images whose names or EXIF data say when they were taken."""
+    """A folder of images with times in their names or EXIF data."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -135,7 +135,7 @@ class ImageFolder:
             raise DatasetError(
                 f"{self.path}: {lost[0]} could not be used: found no time in its name or EXIF "
                 "data, needed one for each image (a Unix time in the name, or the date of the "
-                "camera); for photographs of poses that were held use legcal init."
+                "camera); for photographs of single poses use legcal init."
             )
         ordered = sorted(photographs, key=lambda p: times[p.name] or 0.0)
         for number, photograph in enumerate(ordered):
@@ -152,21 +152,21 @@ class ImageFolder:
             yield Frame(times[photograph.name] or 0.0, np.asarray(image, dtype=np.uint8))
 
     def notes(self) -> tuple[str, ...]:
-        """Return nothing."""
+        """Return no notes."""
         return ()
 
     def readings(self) -> Series | None:
-        """Return nothing: images hold no readings."""
+        """Return None: images hold no readings."""
         return None
 
 
 def _taken(photograph: Photograph) -> float | None:
-    """Return when a photograph was taken [s], as its EXIF data say."""
+    """Return the time of a photograph [s], from its EXIF data."""
     moment = photograph_time(photograph)
     return None if moment is None else moment.replace(tzinfo=UTC).timestamp()
 
 
 def stamp_in(text: str) -> float | None:
-    """Return the Unix time [s] in a text, whatever its unit, or None."""
-    found = _STAMP.findall(text)
-    return unix_seconds(float(found[-1])) if found else None
+    """Return the Unix time [s] in a text, in any unit, or None."""
+    stamps = _STAMP.findall(text)
+    return unix_seconds(float(stamps[-1])) if stamps else None

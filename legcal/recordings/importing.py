@@ -1,4 +1,4 @@
-"""From recordings to a dataset: what is found first, then written complete or not at all."""
+"""From recordings to a dataset: planned first, then written completely or not at all."""
 
 from __future__ import annotations
 
@@ -42,68 +42,68 @@ from legcal.recordings.stillness import (
 )
 from legcal.vision.camera_file import read_camera
 
-LEAST_STILL = 0.3  # [s]
-ONE_CLOCK = 2.0  # [s] that frames and readings in one bag are apart at most
-_WIDTH = 160  # [px] of frames that are compared
+LEAST_STILL = 0.3  # least duration of a rest [s]
+ONE_CLOCK = 2.0  # largest offset of frames and readings in one bag [s]
+_WIDTH = 160  # width of compared frames [px]
 _SHOTS, _TABLE = "shots", "readings.csv"
 
 
 class StillBlock(Document):
-    """A time in which the machine stood still."""
+    """An interval in which the machine was at rest."""
 
     begin_s: Number
     end_s: Number
-    frame: int | None  # that is used
-    why_not: str  # "" where it is used
+    frame: int | None  # the used frame
+    why_not: str  # reason for not using it; "" if used
 
 
 class RecordingBlock(Document):
-    """What was found in the recording of a view."""
+    """The recording of a view."""
 
     recording: str
-    readings: str  # where they are from
+    readings: str  # source of the readings
     frames: int
     used: int
-    offset_s: Number  # between the clocks
+    offset_s: Number  # offset between the clocks
     offset_sigma_s: Number
-    agreement: Number | None  # correlation of motions; None where the offset was stated
+    agreement: Number | None  # correlation of motions; None if the offset was stated
     stills: list[StillBlock]
     notes: list[str]
 
 
 class ImportDocument(Document):
-    """What ``legcal import --json`` prints."""
+    """The document of ``legcal import --json``."""
 
     dataset: str
-    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] where one turns
+    encoder_sigma: Number | dict[str, Number]  # [m], or by motor [m, rad] if one turns
     views: dict[str, RecordingBlock]
     written: list[str]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What was found in the recording of one camera position.
+    """The evaluated recording of one camera position.
 
     Attributes
     ----------
     name : str
-        Of the view, after the file.
+        Name of the view, from the file.
     recording : Recording
         Its frames.
     n_frames : int
-        How many there are.
+        Number of frames.
     offset : Offset
-        The clock of the camera less that of the readings.
+        Clock of the camera minus clock of the readings.
     stills : tuple of Still
-        Intervals in which the frames rest.
+        Intervals without motion in the frames.
     readings : (n_used, n_motors) array
-        Means over the intervals that are used [m or rad].
+        Means over the used intervals [m or rad].
     scatter : (n_motors,) array
         Standard deviation of a reading around them [m or rad].
     series : Series
         All readings.
     notes : tuple of str
-        What is odd.
+        Notes on irregularities.
     """
 
     name: str
@@ -118,11 +118,11 @@ class View:
 
     @property
     def used(self) -> list[int]:
-        """The frames that are used."""
+        """Indices of the used frames."""
         return [still.frame for still in self.stills if still.frame is not None]
 
     def block(self) -> RecordingBlock:
-        """Return what ``legcal import --json`` says of the view."""
+        """Return the block of the view in ``legcal import --json``."""
         return RecordingBlock(
             recording=str(self.recording.path),
             readings=self.series.source,
@@ -141,7 +141,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Import:
-    """Recordings of which the frames to use are known, not written yet."""
+    """Recordings with their selected frames, not written yet."""
 
     machine: Machine
     model: str | Path
@@ -151,9 +151,9 @@ class Import:
 
     @property
     def encoder_sigma(self) -> float | dict[str, float]:
-        """Standard deviation of a reading at rest [m]; errors that last do not average out.
+        """Standard deviation of a reading at rest [m]; constant errors do not average out.
 
-        By joint [m or rad] where a motor turns.
+        By joint [m or rad] if a motor turns.
         """
         scatter = np.max([view.scatter for view in self.views], axis=0)
         motors = [self.machine.legs[j] for j in self.machine.motors]
@@ -165,7 +165,7 @@ class Import:
         }
 
     def document(self, written: Sequence[Path]) -> dict[str, Any]:
-        """Return what ``legcal import --json`` prints, with the files that were written."""
+        """Return the document of ``legcal import --json``, with the written files."""
         return ImportDocument(
             dataset=str(self.destination),
             encoder_sigma=self.encoder_sigma,
@@ -185,31 +185,31 @@ def plan_import(
     offset: float | None = None,
     progress: Report = no_progress,
 ) -> Import:
-    """Find the frames of recordings in which the machine stands still, and their readings.
+    """Select the frames of recordings in which the machine is at rest, with their readings.
 
     Parameters
     ----------
     sources : sequence of path
-        A video, a ROS bag or a folder of images with times for each camera position; of a bag with
-        several cameras the topic of one behind it, ``run.mcap:/left/image_raw``.
+        A video, a ROS bag or a folder of images with times for each camera position; for a bag with
+        several cameras append the topic of one, ``run.mcap:/left/image_raw``.
     model : path or str
         The nominal model, as for :func:`legcal.load_mechanism`.
     destination : path
         The folder of the dataset.
     readings : sequence of path
         Tables of readings with a column of times: one for all recordings, or one for each; none
-        for bags that hold joint states.
+        for bags with joint states.
     cameras : sequence of str
         Camera files: one for all views, or ``VIEW=FILE`` for each.
     lengths : bool
-        Whether tables hold whole lengths of legs in place of readings.
+        Whether tables hold total lengths of legs instead of readings.
     offset : float, optional
-        The clock of the camera less that of the readings [s]; found from motion by default.
+        Clock of the camera minus clock of the readings [s]; determined from motion by default.
 
     Raises
     ------
     DatasetError, ModelError, UsageError
-        If a file cannot be read, nothing moves or nothing rests, or the clocks cannot be compared.
+        If a file cannot be read, nothing moves or rests, or the clocks cannot be compared.
     """
     machine = load_mechanism(model)
     destination = Path(destination)
@@ -232,25 +232,25 @@ def plan_import(
             f"The recordings could not be imported: found an offset of {offset:g} s between the "
             "clocks, needed a finite number; correct --offset."
         )
-    for text in cameras:  # before minutes of looking at frames
+    for text in cameras:  # before minutes of reading frames
         read_camera(
             Path(text if "=" not in text or os.path.isfile(text) else text.split("=", 1)[1])
         )
     tables = {path: read_series(path, machine, lengths=lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
-        own = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
-        if own is None:
+        series = tables[readings[min(k, len(readings) - 1)]] if readings else recording.readings()
+        if series is None:
             raise UsageError(
                 f"{recording.path}: the readings could not be found: found none in it, needed a "
                 "table with times; give it with --readings."
             )
-        views.append(_view(name, recording, own, offset, progress, one_clock=not readings))
+        views.append(_view(name, recording, series, offset, progress, one_clock=not readings))
     return Import(machine, model, destination, tuple(views), tuple(cameras))
 
 
 def open_recording(path: Path, machine: Machine) -> Recording:
-    """Return the recording at a path: a bag (with a topic behind it), images or a video."""
+    """Return the recording at a path: a bag (with an optional topic), images or a video."""
     path, topic = split_topic(path)
     if not os.path.exists(path):
         raise DatasetError(
@@ -271,7 +271,7 @@ def open_recording(path: Path, machine: Machine) -> Recording:
 
 
 def _view_name(path: Path, destination: Path) -> str:
-    """Return the name of the view of a recording: that of the file, and of the topic behind it."""
+    """Return the name of the view of a recording, from its file and topic."""
     path, topic = split_topic(path)
     name = path.resolve().stem if not path.is_dir() else path.resolve().name
     if topic is not None:
@@ -293,19 +293,19 @@ def _view(
     *,
     one_clock: bool,
 ) -> View:
-    """Return the frames of a recording that are used, with their readings."""
+    """Return the view of a recording, with its used frames and their readings."""
     start = f"{recording.path}: the recording could not be used:"
     times, changes = _changes(recording, progress, name)
     if len(times) < 3:
         raise DatasetError(f"{start} found {len(times)} frames, needed those of a recording.")
     frames_move = moving(changes)
     moves = moving(reading_speeds(series.times, series.q))
-    for what, motion in (("frames", frames_move), ("readings", moves)):
+    for signal, motion in (("frames", frames_move), ("readings", moves)):
         if motion is None:
             raise DatasetError(
-                f"{start} found {what} that change alike all the time, needed a machine that rests "
-                "at each pose and moves between; for photographs of poses that were held use "
-                f"legcal init. ({series.source if what == 'readings' else recording.path})"
+                f"{start} found {signal} that change at one rate all the time, needed a machine "
+                "that rests at each pose and moves between; for photographs of single poses use "
+                f"legcal init. ({series.source if signal == 'readings' else recording.path})"
             )
     assert frames_move is not None
     assert moves is not None
@@ -325,10 +325,10 @@ def _view(
     _check_overlap(times - apart.seconds, series, start)
     stills, kept = still_frames(times, frames_move, series.times, moves, apart, LEAST_STILL)
     if not kept:
-        found = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
+        reasons = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
         raise DatasetError(
-            f"{start} found no frame to use ({found}), needed rests of {LEAST_STILL:g} s and more "
-            "with readings; record longer rests."
+            f"{start} found no frame to use ({reasons}), needed rests of {LEAST_STILL:g} s and "
+            "more with readings; record longer rests."
         )
     q = np.array([series.q[rows].mean(axis=0) for rows in kept])
     rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
@@ -342,7 +342,7 @@ def _view(
 
 
 def _check_overlap(times: Array, series: Series, start: str) -> None:
-    """Refuse frames at *times* of the readings' clock [s], none of which have any."""
+    """Refuse frames at *times* [s] by the clock of the readings, if none of them has readings."""
     first, last = float(series.times.min()), float(series.times.max())
     if times[0] > last or times[-1] < first:
         raise DatasetError(
@@ -353,7 +353,7 @@ def _check_overlap(times: Array, series: Series, start: str) -> None:
 
 
 def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, Array]:
-    """Return the times of frames [s] and how much each differs from the one before [levels]."""
+    """Return the times of frames [s] and their differences from the frame before [levels]."""
     times: list[float] = []
     changes: list[float] = []
     before: Array | None = None
@@ -379,24 +379,24 @@ def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, 
 
 
 def import_recordings(
-    found: Import, *, force: bool = False, progress: Report = no_progress
+    plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
     """Write the dataset of an import, complete or not at all; return its files but the images.
 
     Raises
     ------
     DatasetError
-        If the frames do not fit the camera files.
+        If the frames do not match the camera files.
     UsageError
         If files are in the way and *force* is not given.
     """
-    check_path(found.destination, DATASET_FOLDER)
-    motors = [found.machine.legs[j] for j in found.machine.motors]
+    check_path(plan.destination, DATASET_FOLDER)
+    motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     try:
-        with temporary_folder(existing_parent(found.destination), found.destination.name) as folder:
+        with temporary_folder(existing_parent(plan.destination), plan.destination.name) as folder:
             rows: list[tuple[object, ...]] = []
-            for view in found.views:
+            for view in plan.views:
                 (folder / _SHOTS / view.name).mkdir(parents=True)
                 used = view.used
                 for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
@@ -413,13 +413,13 @@ def import_recordings(
             table = folder / _TABLE
             table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
             new = plan_new_dataset(
-                folder / _SHOTS, table, found.model, found.destination,
-                SheetOptions(cameras=found.cameras, encoder_sigma=found.encoder_sigma),
+                folder / _SHOTS, table, plan.model, plan.destination,
+                SheetOptions(cameras=plan.cameras, encoder_sigma=plan.encoder_sigma),
             )  # fmt: skip
             return write_new_dataset(new, force=force)
     except OSError as error:
         raise OutOfResources(
-            f"{found.destination}: the dataset could not be written: found "
+            f"{plan.destination}: the dataset could not be written: found "
             f"'{error.strerror or error}', needed a folder that takes its files; free some space "
             "or give another folder; nothing was written."
         ) from error

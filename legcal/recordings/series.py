@@ -1,4 +1,4 @@
-"""Readings over time: of a table with a column of times, or of the joint states in a bag."""
+"""Readings over time, from a table with a column of times or from joint states in a bag."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
 def unix_seconds(number: float) -> float | None:
-    """Return a Unix time [s] of one in s, ms, us or ns: the years 2001 to 2286 tell them apart.
+    """Return a Unix time [s] from s, ms, us or ns, distinguished by years 2001 to 2286.
 
-    Numbers that are none, as 20261123101500, are None; those before 2001 are seconds.
+    Other numbers, such as 20261123101500, give None; numbers before 2001 are seconds.
     """
     for unit in (1e9, 1e6, 1e3, 1.0):
         if number >= 1e9 * unit:
@@ -38,15 +38,15 @@ class Series:
     Attributes
     ----------
     source : str
-        Where they were read, for messages.
+        Source of the readings, for messages.
     times : (n,) array
-        Increasing [s], of their own clock.
+        Increasing times [s], by their own clock.
     q : (n, n_motors) array
         Readings [m or rad], in the order of the actuated legs.
     taken : mapping
-        What each heading was taken for.
+        Interpretation of each heading.
     unit : str
-        Unit in the table, and where it was found, in words.
+        Unit in the table and its origin, in words.
     """
 
     source: str
@@ -58,32 +58,34 @@ class Series:
 
 
 def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
-    """Return the readings of a CSV with a column of times, in the order of these."""
+    """Return the readings of a CSV with a column of times, in the order of times."""
     sheet = ReadingsSheet(path, machine, "time")
     if "time" not in sheet:
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
-            f"poses that were held. {' '.join(sheet.notes)}".rstrip()
+            f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
-    found = sheet.readings(lengths=lengths)
+    readings = sheet.readings(lengths=lengths)
     times = _seconds(sheet.text("time"), path)
-    in_words = f"{found.unit}, {found.unit_from}"
-    return _in_order(Series(str(path), times, found.q, sheet.taken, in_words, tuple(sheet.notes)))
+    in_words = f"{readings.unit}, {readings.unit_from}"
+    return _in_order(
+        Series(str(path), times, readings.q, sheet.taken, in_words, tuple(sheet.notes))
+    )
 
 
 def series_of_joints(
     source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
 ) -> Series:
-    """Return the readings of joint states: positions [m or rad] by the names of joints."""
+    """Return the readings of joint states: positions [m or rad] by joint name."""
     joints = [column.name for column in reading_columns(machine.legs)]
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:
-        known = sorted({name for state in states for name in state})
-        missing = [name for name in joints if name not in known]
+        names = sorted({name for state in states for name in state})
+        missing = [name for name in joints if name not in names]
         raise DatasetError(
             f"{source}: the readings could not be used: found the joints "
-            f"{', '.join(map(describe, known[:10])) or 'none'}, needed "
+            f"{', '.join(map(describe, names[:10])) or 'none'}, needed "
             f"{', '.join(missing or joints)} in one message; rename the joints of the model or "
             "give a table with --readings."
         )
@@ -97,7 +99,7 @@ def series_of_joints(
 
 
 def _in_order(series: Series) -> Series:
-    """Return a series in the order of its times; of equal times the first counts."""
+    """Return a series in the order of its times; of equal times the first is kept."""
     times, first = np.unique(series.times, return_index=True)
     if len(times) < 3:
         raise DatasetError(
@@ -120,14 +122,14 @@ def _seconds(texts: Sequence[str], path: Path) -> Array:
         if seconds is None or len(wrong):
             raise _no_time(texts[wrong[0]], path)
         return numbers * (seconds / size if size else 1.0)
-    found = []
+    stamps = []
     for text in texts:
         try:
             moment = datetime.fromisoformat(text.strip())
         except ValueError:
             raise _no_time(text, path) from None
-        found.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
-    return np.array(found)
+        stamps.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+    return np.array(stamps)
 
 
 def _no_time(text: str, path: Path) -> DatasetError:

@@ -1,10 +1,10 @@
-"""When the machine stood still, and how far the clocks of camera and encoders are apart.
+"""Intervals of rest, and the offset between the clocks of camera and encoders.
 
-Motion shows in both: pixels change from frame to frame, and readings change. What moves is told
-from what rests by the threshold that separates the logarithms of both best (N. Otsu, *A threshold
+Motion is visible in both: pixels change from frame to frame, and readings change. Motion and rest
+are distinguished by the threshold that separates the logarithms of both best (N. Otsu, *A threshold
 selection method from gray-level histograms*, 1979), so that noise of cameras and encoders needs no
-setting. The offset of the clocks is the one with which motion in the frames and in the readings
-agree best over the whole recording.
+setting. The offset of the clocks maximises the agreement of motion in frames and readings over the
+whole recording.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from scipy.signal import correlate
 
 from legcal.geometry.types import Array, BoolArray
 
-MIN_CONTRAST = 5.0  # of motion to rest, in scatters of rest: a normal distribution has 2.7
-MIN_AGREEMENT = 0.5  # correlation of motion in frames and readings
-MIN_LEAD = 0.1  # of the best offset over the best other one
-_LEAST_OVERLAP = 0.5  # of the shorter recording
+MIN_CONTRAST = 5.0  # least contrast of motion and rest, in scatters of rest (a normal has 2.7)
+MIN_AGREEMENT = 0.5  # least correlation of motion in frames and readings
+MIN_LEAD = 0.1  # least lead of the best offset over the second best
+_LEAST_OVERLAP = 0.5  # least overlap, relative to the shorter recording
 _MOST_SAMPLES = 200_000
 
 
 @dataclass(frozen=True)
 class Still:
-    """An interval in which frames do not change, and what became of it."""
+    """An interval without motion in the frames, and its use."""
 
-    begin: float  # [s] of the camera's clock
+    begin: float  # [s] by the clock of the camera
     end: float
     frame: int | None  # the frame that is used
-    why_not: str = ""  # in words, where none is
+    why_not: str = ""  # reason why none is used, in words
 
 
 @dataclass(frozen=True)
 class Offset:
-    """How far the clock of the camera is ahead of that of the readings."""
+    """The clock of the camera minus the clock of the readings."""
 
     seconds: float
     sigma: float  # [s]
-    agreement: float | None  # correlation of motion, 1 at most; None where it was stated
+    agreement: float | None  # correlation of motion, at most 1; None for a stated offset
 
 
 class NoOffset(ValueError):
-    """The clocks cannot be compared: found, as a part of a sentence."""
+    """The clocks cannot be compared; the text completes "found ..."."""
 
 
 def moving(speeds: Array) -> BoolArray | None:
-    """Say where something moves, of speeds (n,) of any unit; None where all of them are alike."""
+    """Return where speeds (n,) of any unit show motion; None if they are all alike."""
     positive = speeds[speeds > 0.0]
     if len(positive) < 2:
         return None
@@ -69,43 +69,52 @@ def moving(speeds: Array) -> BoolArray | None:
 
 
 def reading_speeds(times: Array, q: Array) -> Array:
-    """Return how fast readings (n, n_motors) change between times (n,): (n - 1,) [m/s]."""
+    """Return the speeds (n - 1,) [m/s] of readings (n, n_motors) between times (n,)."""
     return np.asarray(np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times))
 
 
 def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves: BoolArray,
                  most: float | None = None) -> Offset:  # fmt: skip
-    """Return the offset with which motion in frames and in readings agree best.
+    """Return the offset with the best agreement of motion in frames and in readings.
 
     Parameters
     ----------
     frame_times, times : (n + 1,) arrays
-        Of frames and of readings, each of their own clock [s].
+        Times of frames and of readings, each by their own clock [s].
     frames_move, moves : (n,) arrays
-        Whether something moves between two neighbouring times.
+        Whether there is motion between neighbouring times.
     most : float, optional
-        The largest offset to look at [s], where both were recorded by one clock.
+        Largest offset [s] if both were recorded by one clock.
 
     Raises
     ------
     NoOffset
-        If motion does not agree, or agrees as well with another offset.
+        If motion does not agree, or agrees equally well with another offset.
     """
     span = max(np.ptp(frame_times), np.ptp(times))
     step = max(float(np.median(np.diff(frame_times))), span / _MOST_SAMPLES)
-    one, start_one = _on_grid(frame_times, frames_move, step)
-    two, start_two = _on_grid(times, moves, step)
-    n = correlate(np.ones_like(one), np.ones_like(two))
-    sums = [correlate(a, b) for a, b in ((one, np.ones_like(two)), (np.ones_like(one), two),
-                                         (one, two), (one**2, np.ones_like(two)),
-                                         (np.ones_like(one), two**2))]  # fmt: skip
+    frame_samples, start_of_frames = _on_grid(frame_times, frames_move, step)
+    reading_samples, start_of_readings = _on_grid(times, moves, step)
+    ones_1, ones_2 = np.ones_like(frame_samples), np.ones_like(reading_samples)
+    n = correlate(ones_1, ones_2)
+    sums = [
+        correlate(frame_samples, ones_2),
+        correlate(ones_1, reading_samples),
+        correlate(frame_samples, reading_samples),
+        correlate(frame_samples**2, ones_2),
+        correlate(ones_1, reading_samples**2),
+    ]
     n = np.maximum(np.round(n), 1.0)
     mean = [s / n for s in sums]
     spread = [np.maximum(mean[3] - mean[0] ** 2, 1e-6), np.maximum(mean[4] - mean[1] ** 2, 1e-6)]
     score = (mean[2] - mean[0] * mean[1]) / np.sqrt(spread[0] * spread[1])
-    # at index i the readings lie under the frames from sample i - len(two) + 1 on
-    lags = start_one - start_two + step * (np.arange(len(score)) - (len(two) - 1))
-    score[n < _LEAST_OVERLAP * min(len(one), len(two))] = -1.0
+    # At index i the readings start at frame sample i - len(reading_samples) + 1.
+    lags = (
+        start_of_frames
+        - start_of_readings
+        + step * (np.arange(len(score)) - (len(reading_samples) - 1))
+    )
+    score[n < _LEAST_OVERLAP * min(len(frame_samples), len(reading_samples))] = -1.0
     if most is not None:
         score[np.abs(lags) > most] = -1.0
     best = int(np.argmax(score))
@@ -131,18 +140,18 @@ def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves
 
 
 def _on_grid(times: Array, moves: BoolArray, step: float) -> tuple[Array, float]:
-    """Return motion on a grid of times as 1 and 0, and the first of them."""
-    elapsed = times - times[0]  # small numbers: at Unix times steps are rounded to 0.2 us
+    """Return motion as 1 and 0 on a grid of times, and the first time."""
+    elapsed = times - times[0]  # small numbers: Unix times are rounded to 0.2 us
     grid = np.arange(0.0, elapsed[-1], step)
     at = np.searchsorted(elapsed, grid, side="right") - 1
-    at = np.minimum(at, len(moves) - 1)  # the grid may reach the last time by rounding
+    at = np.minimum(at, len(moves) - 1)  # rounding may put the last grid point at the last time
     return moves[at].astype(float), float(times[0])
 
 
 def _changes(times: Array, moves: BoolArray) -> tuple[Array, Array]:
-    """Return the times at which motion begins or ends, and which of both: 1 or -1.
+    """Return the times at which motion begins (1) or ends (-1).
 
-    Motion begins and ends within an interval that shows some of it: in its middle at best guess.
+    The estimate is the middle of the first or last interval with motion.
     """
     change = np.diff(moves.astype(int))
     at = np.flatnonzero(change)
@@ -152,7 +161,7 @@ def _changes(times: Array, moves: BoolArray) -> tuple[Array, Array]:
 
 def _refined(rough: float, step: float, frames: tuple[Array, BoolArray],
              readings: tuple[Array, BoolArray], agreement: float) -> Offset:  # fmt: skip
-    """Return the offset by beginnings and ends of motion, better than the grid."""
+    """Return the offset from beginnings and ends of motion, more precise than the grid."""
     ones, kinds = _changes(*frames)
     twos, others = _changes(*readings)
     reach = 3.0 * max(step, float(np.median(np.diff(readings[0]))))
@@ -173,7 +182,7 @@ def _refined(rough: float, step: float, frames: tuple[Array, BoolArray],
 
 
 def runs(moves: BoolArray) -> list[tuple[int, int]]:
-    """Return the runs without motion as (first, last) of what lies between the differences."""
+    """Return the runs without motion as (first, last) of the samples between the differences."""
     rests = np.concatenate([[False], ~moves, [False]]).astype(int)
     change = np.diff(rests)
     return list(zip(np.flatnonzero(change == 1).tolist(), np.flatnonzero(change == -1).tolist(),
@@ -188,14 +197,14 @@ def still_frames(
     offset: Offset,
     least: float,
 ) -> tuple[list[Still], list[Sequence[int]]]:
-    """Return the intervals in which frames rest, and the readings of those that are used.
+    """Return the intervals without motion in frames, and the readings of the used intervals.
 
-    A frame is used if frames and readings rest around it for *least* seconds, less what the
-    clocks are uncertain by; it is the one in the middle.
+    An interval is used if frames and readings rest for *least* seconds, within the uncertainty of
+    the clocks; its middle frame is taken.
     """
     shifted = times + offset.seconds
     margin = 3.0 * offset.sigma
-    found: list[Still] = []
+    stills: list[Still] = []
     used: list[Sequence[int]] = []
     for first, last in runs(frames_move):
         begin, end = float(frame_times[first]), float(frame_times[last])
@@ -203,7 +212,7 @@ def still_frames(
             continue
         inside = np.flatnonzero((shifted >= begin + margin) & (shifted <= end - margin))
         if not len(inside):
-            found.append(Still(begin, end, None, "no reading"))
+            stills.append(Still(begin, end, None, "no reading"))
             continue
         rests = max(
             ((a, b) for a, b in runs(moves[inside[0] : inside[-1]])),
@@ -211,15 +220,15 @@ def still_frames(
             default=(0, 0) if len(inside) == 1 else None,
         )
         if rests is None:
-            found.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin, end, None, "readings moved"))
             continue
         kept = inside[rests[0] : rests[1] + 1]
         low, high = max(begin, shifted[kept[0]] - margin), min(end, shifted[kept[-1]] + margin)
         middle = 0.5 * (low + high) if len(kept) > 1 else float(shifted[kept[0]])
         if len(inside) > 1 and high - low < least:
-            found.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin, end, None, "readings moved"))
             continue
         frame = first + int(np.argmin(np.abs(frame_times[first : last + 1] - middle)))
-        found.append(Still(begin, end, frame))
+        stills.append(Still(begin, end, frame))
         used.append(kept.tolist())
-    return found, used
+    return stills, used

@@ -1,4 +1,4 @@
-"""Where joints are at readings, and what moves them: a calibration, or a weak direction."""
+"""Positions of joints at readings, and their motion by a calibration or a weak direction."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
     from legcal.calibration.documents import Result
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
-_SHOWN = 0.12  # of the size of the machine: how far the largest change is drawn at first
-_HELD = 0.0025  # of the leg length
+_SHOWN = 0.12  # default displayed size of the largest change, relative to the machine
+_HELD = 0.0025  # length of a step along a held direction, in leg lengths
 
 
 class PlacedModel(NamedTuple):
-    """What is seen of a model at k poses, in the base link [m]."""
+    """The visible geometry of a model at k poses, in the base link [m]."""
 
     A: Array  # (k, n_legs, 3)
     B: Array  # (k, n_legs, 3)
-    anchors: Array  # (n_motors, 3) where motors that move joints at A stand
+    anchors: Array  # (n_motors, 3) positions of motors that move joints at A
     standing: Array  # (n_motors, 2, 3) their rails and axes
     moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
 
     def moved_towards(self, other: PlacedModel, share: float) -> PlacedModel:
-        """Return what is seen a share of the way to another model, or beyond it."""
+        """Return the geometry at a share of the difference to another model, or beyond it."""
         return PlacedModel(*(a + share * (b - a) for a, b in zip(self, other, strict=True)))
 
     def first_step(self, other: PlacedModel, size: float) -> int:
-        """Return which of ``FACTORS`` shows the way to another on a machine of some size [m]."""
+        """Return the default index of ``FACTORS`` for the difference to another model."""
         moved = max(float(np.abs(other.A - self.A).max()), float(np.abs(other.B - self.B).max()))
         wanted = _SHOWN * size / max(moved, 1e-12)
         return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
@@ -52,10 +52,10 @@ def placed_model(
     *,
     by_readings: bool = True,
 ) -> PlacedModel:
-    """Return what is seen of legs in R_b and R_e, motors and platform at readings q (k, n).
+    """Return the geometry of legs in R_b and R_e, motors and platform at readings q (k, n).
 
-    Poses T_Rb_Re are looked for *near* others; the platform stays at these where it is not placed
-    *by_readings*. Motors stand in the base link, also where A defines R_b.
+    Poses T_Rb_Re are solved *near* others, which are kept unless *by_readings*. Motors are fixed in
+    the base link, even if A defines R_b.
     """
     poses = near
     if by_readings:
@@ -74,11 +74,11 @@ def directions(
 ) -> list[tuple[str, Array]]:
     """Return steps of the parameters (p,) along weak and held directions, with words.
 
-    Weak ones are as long as their standard deviation, held ones a small part of a leg;
-    *length* is that of a leg [m], by which turns count.
+    Weak steps are one standard deviation long, held ones a small fraction of the leg *length* [m],
+    which also weights rotations.
     """
     names = list(parameters.names)
-    found = []
+    steps = []
     for weak in result.weakest:
         step = np.zeros(len(names))
         for name, component in zip(weak.parameters, weak.components, strict=True):
@@ -87,9 +87,9 @@ def directions(
                 per = length if parameters.units[i] == "rad" else 1.0
                 step[i] = weak.sigma_m * component / per
         if np.any(step):
-            found.append((f"1 sigma along: {weak.in_words}", step))
+            steps.append((f"1 sigma along: {weak.in_words}", step))
     order = [result.kinematic.names.index(name) for name in names]
     for words, row in zip(result.held, result.kinematic.held, strict=False):
         step = _HELD * length * np.array(row)[order]
-        found.append((f"{1e3 * _HELD * length:.2g} mm along what is held: {words}", step))
-    return found
+        steps.append((f"{1e3 * _HELD * length:.2g} mm along a held direction: {words}", step))
+    return steps

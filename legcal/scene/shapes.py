@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from legcal.calibration.documents import Result
     from legcal.vision.camera import Camera
 
-_STRAIGHT = 1e-9  # of the squared size: a bend that is none
+_STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
 
 
 def around(points: Array) -> list[int]:
-    """Return the rim of joints (n, 3) in order about their middle, the first twice.
+    """Return the rim of joints (n, 3), ordered about their centroid, the first twice.
 
-    Joints within it, as of a leg in the middle, are left out.
+    Inner joints, such as of a leg in the middle, are left out.
     """
     away = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(away)
@@ -42,17 +42,18 @@ def around(points: Array) -> list[int]:
 def ellipsoids(result: Result) -> dict[str, Array]:
     """Return half axes of one sigma at the joints of base and platform, (n, 3, 3) [m].
 
-    Columns are axes, in the link; they are zero along what is fixed or defines a frame.
+    Columns are axes, in the link; they are zero along fixed coordinates and those that define a
+    frame.
     """
-    found = {}
+    half_axes = {}
     for side, block in (result.links or {}).items():
         value, vector = np.linalg.eigh(np.array([joint.covariance for joint in block.joints]))
-        found[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
-    return found
+        half_axes[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+    return half_axes
 
 
 def enlargement(axes: Mapping[str, Array], radius: float) -> float:
-    """Return by which of 1, 2, 5, 10, ... the usual ellipsoid is nearly as large as *radius*."""
+    """Return the factor 1, 2, 5, 10, ... that enlarges the median ellipsoid to nearly *radius*."""
     longest = [np.linalg.norm(of_side, axis=1).max(axis=1) for of_side in axes.values()]
     seen = np.concatenate([*longest, np.zeros(0)])
     usual = float(np.median(seen[seen > 0.0])) if np.any(seen > 0.0) else 1.0
@@ -62,7 +63,7 @@ def enlargement(axes: Mapping[str, Array], radius: float) -> float:
 
 
 def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Array:
-    """Return the centre of a camera and the corners of what it sees at a depth [m], (5, 3)."""
+    """Return the centre of a camera and the corners of its view at a depth [m], (5, 3)."""
     w, h = camera.width - 0.5, camera.height - 0.5
     corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
     rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)

@@ -1,4 +1,4 @@
-"""A calibration board beside a simulated machine: its print, its plate, the corners that show."""
+"""A calibration board beside a simulated machine: its print, its plate, its visible corners."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from legcal.vision.board import (
 from legcal.vision.board_file import board_document, read_board_file
 from legcal.vision.camera import Camera
 
-INK = 0.06  # how much of the light that white returns black does
+INK = 0.06  # reflectance of black, in units of white
 TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
 
-_THICKNESS = 0.02  # of the longer side of the plate
-_RIM = 0.06  # of the longer side that stays white around the print
-_MIN_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
-_BESIDE = 0.3  # of a square around a corner that must be seen with it
-_IN_FRONT = 0.2  # of the thickness before a corner from which on a hit hides it
-_MIN_SHARE = 0.5  # of the corners that an image must show to count
+_THICKNESS = 0.02  # of the plate, in units of its longer side
+_RIM = 0.06  # white margin around the print, in units of the longer side
+_MIN_COSINE = 0.42  # minimum cosine between normal and line of sight for visible corners
+_BESIDE = 0.3  # fraction of a square around a corner that must be visible with it
+_IN_FRONT = 0.2  # minimum distance in front of a corner, in thicknesses, of a hit that hides it
+_MIN_SHARE = 0.5  # minimum share of the corners in an image that counts
 _MIN_CORNERS = 8
 
 KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
-_WIDTH, _PLATFORM_WIDTH = 0.42, 0.3  # of the size of the machine
+_WIDTH, _PLATFORM_WIDTH = 0.42, 0.3  # of boards on base and platform, in sizes of the machine
 _MARKERS: dict[Link, str] = {"base": "DICT_4X4_50", "platform": "DICT_5X5_50"}
-_DIGITS = 3  # of a side in metres: whole millimetres
+_DIGITS = 3  # decimals of a side in metres: whole millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +54,13 @@ class BoardPrint:
     middle: Array  # (2,) the middle of the plate in the board frame [m]
     origin: Array  # (2,) where the first tile starts, in the board frame [m]
     pitch: float  # from tile to tile [m]
-    # first, size: where the modules start in a tile, and how long they are together [m]
+    # first, size: start of the modules in a tile, and their total length [m]
     first: float
     size: float
     # (rows, columns, n, n) black modules of each tile, by rows along y and columns along x
     modules: NDArray[np.bool_]
-    # 0 or 1: tiles of that parity are black outside their modules; -1 for tags, where the crossings
-    # of the gaps are black
+    # 0 or 1: tiles of this parity are black outside their modules; -1 for tags, with black squares
+    # at the crossings of the gaps
     checked: int
 
     @classmethod
@@ -77,7 +77,7 @@ class BoardPrint:
         return cls(face, middle, origin, board.side, gap, marker, modules, black)
 
     def reflectance(self, x: Array, y: Array) -> Array:
-        """Return how much of the light that white returns comes back from points of the plate."""
+        """Return the reflectance at points of the plate, in units of white."""
         u = (x + (self.middle[0] - self.origin[0])) / self.pitch
         v = (y + (self.middle[1] - self.origin[1])) / self.pitch
         i, j = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
@@ -91,8 +91,8 @@ class BoardPrint:
             black = inside & ((i + j) % 2 == self.checked)
         k = np.floor((a - self.first) * (n / self.size)).astype(np.intp)
         m = np.floor((b - self.first) * (n / self.size)).astype(np.intp)
-        at = np.flatnonzero(inside & (k >= 0) & (k < n) & (m >= 0) & (m < n))
-        black[at] |= self.modules[j[at], i[at], m[at], k[at]]
+        points = np.flatnonzero(inside & (k >= 0) & (k < n) & (m >= 0) & (m < n))
+        black[points] |= self.modules[j[points], i[points], m[points], k[points]]
         return np.where(black, np.float32(INK), np.float32(1.0))
 
 
@@ -103,17 +103,17 @@ def _modules(board: Board) -> NDArray[np.bool_]:
         return np.zeros((*shape, 1, 1), dtype=np.bool_)
     if board.kind == "aprilgrid":
         tags = [
-            # Kalibr's tags are upright where OpenCV's stand on their heads; rows go up.
+            # Kalibr's tags are upright where OpenCV's are upside down; rows go up.
             np.rot90(_marker(board.dictionary, k, TAG_BORDER), 2)[::-1]
             for k in range(board.columns * board.rows)
         ]
         return np.array(tags).reshape(*shape, *tags[0].shape)
     printed = charuco_board(board)
-    found = np.zeros((*shape, *_marker(board.dictionary, 0, 1).shape), dtype=np.bool_)
+    modules = np.zeros((*shape, *_marker(board.dictionary, 0, 1).shape), dtype=np.bool_)
     for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True):
         i, j = np.floor(np.mean(corners, axis=0)[:2] / board.side).astype(int)
-        found[j, i] = _marker(board.dictionary, int(number), 1)
-    return found
+        modules[j, i] = _marker(board.dictionary, int(number), 1)
+    return modules
 
 
 @lru_cache(maxsize=1024)
@@ -167,7 +167,7 @@ class PlacedBoard:
         )
 
     def runs_through(self, posed: PosedMachine) -> bool:
-        """Say whether the plate runs through a machine, or something lies right on its print."""
+        """Return whether the plate intersects the machine, or something touches its print."""
         half = 0.5 * np.array(self.plate_size)
         for corner in ([-1.0, -1.0], [1.0, -1.0]):  # rays from two corners to the sides across
             for height in (-0.5, 0.5, 2.0):  # in the plate, and above its print
@@ -188,7 +188,7 @@ class PlacedBoard:
         return False
 
     def is_covered(self, posed: PosedMachine) -> bool:
-        """Say whether something of a machine lies over the print, as seen from straight above."""
+        """Return whether a part of the machine is above the print, seen along its normal."""
         x, y, _ = self.board.extent.mean(axis=0).tolist()
         above = self.board.towards_viewer * 3.0 * max(self.plate_size)
         eye = self.T_base_board.apply([x, y, above])
@@ -196,7 +196,7 @@ class PlacedBoard:
         return bool(posed.hidden(eye, points, np.zeros(len(points))).any())
 
     def seen(self, posed: PosedMachine, camera: Camera, T_base_camera: RigidTransform) -> BoolArray:
-        """Return which corners an image shows, (n_corners,)."""
+        """Return a mask (n_corners,) of the corners that are visible in an image."""
         points = self._watched
         base = self.T_base_board.apply(points.reshape(-1, 3))
         centre = T_base_camera.translation
@@ -208,14 +208,14 @@ class PlacedBoard:
         margin = np.full(int(free.sum()), _IN_FRONT * self.plate_size[2])
         if free.any():
             free[free] = ~posed.hidden(centre, base[free], margin)
-        seen = np.all(free.reshape(points.shape[:2]), axis=1)
-        if self.board.kind == "chessboard" and not seen.all():
-            seen[:] = False  # the numbers of a part are not certain
-        return np.asarray(seen)
+        is_seen = np.all(free.reshape(points.shape[:2]), axis=1)
+        if self.board.kind == "chessboard" and not is_seen.all():
+            is_seen[:] = False  # the numbers of a part are not certain
+        return np.asarray(is_seen)
 
-    def is_enough(self, seen: BoolArray) -> bool:
-        """Say whether so many corners, as :meth:`seen` returns them, place a camera well."""
-        return int(seen.sum()) >= max(_MIN_SHARE * len(seen), min(_MIN_CORNERS, len(seen)))
+    def is_enough(self, is_seen: BoolArray) -> bool:
+        """Return whether the corners of a mask of :meth:`seen` suffice to place a camera."""
+        return int(is_seen.sum()) >= max(_MIN_SHARE * len(is_seen), min(_MIN_CORNERS, len(is_seen)))
 
     @cached_property
     def _watched(self) -> Array:
@@ -233,8 +233,8 @@ def placed_at(fixed: FixedBoard, T_base_platform: RigidTransform) -> PlacedBoard
 
 
 def documents(boards: Sequence[FixedBoard], *, poses: bool) -> Any:
-    """Return boards as the block of ``dataset.yaml`` has them; None of none."""
-    found = [
+    """Return the block of ``dataset.yaml`` with boards; None without boards."""
+    blocks = [
         board_document(fixed.board)
         | ({} if fixed.link == "base" else {"on": fixed.link})
         | (
@@ -244,13 +244,13 @@ def documents(boards: Sequence[FixedBoard], *, poses: bool) -> Any:
         )
         for fixed in boards
     ]
-    return found[0] if len(found) == 1 else found or None
+    return blocks[0] if len(blocks) == 1 else blocks or None
 
 
 def chosen_board(
     choice: Board | str | Path | None, posed_machines: Sequence[PosedMachine], link: Link = "base"
 ) -> Board | None:
-    """Return the board on a link that settings ask for; those of two links look different."""
+    """Return the board on a link according to settings; boards of two links look different."""
     if choice is None or isinstance(choice, Board):
         return choice
     if choice not in KINDS:

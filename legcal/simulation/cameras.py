@@ -1,6 +1,6 @@
-"""Simulated cameras and the board: where they stand so that images show the legs.
+"""Simulated cameras and the board: poses chosen so that images show the legs.
 
-Places around a machine are scored by how long its legs are in the images. A board lies flat near
+Places around a machine are scored by the lengths of its legs in the images. A board lies flat near
 the base joints, among the legs or beside them; for cameras with given poses it may also be raised
 and turned.
 """
@@ -36,32 +36,32 @@ from legcal.vision.board import Board, Link, facing_board
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 
-_MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
+_MAX_SHIFT = 0.015  # [m] of rough poses; the method accepts 2 cm and 2 degrees
 _MAX_TURN = float(np.deg2rad(1.5))
 
-_MAX_SIDE, _MAX_PIXELS = 65_535, 100_000_000  # what PNG files and memory hold
+_MAX_SIDE, _MAX_PIXELS = 65_535, 100_000_000  # limits of PNG files and memory
 
-_TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # within its sector, in sectors of a right angle at most
+_TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # azimuths in a sector, in units of it or a right angle
 _LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the machine
 _LIFTS_PLANAR = (0.8, 0.95, 1.1, 1.25, 1.4)  # [rad] above the plane of motion
-_N_POSES = 5  # poses at which places are judged
-_SAMPLES = 32  # points of a leg in that
-_ROUNDING = 1e-9  # relative, of the most that a place may show
-_ROLL = 0.08  # [rad] by which cameras are not upright
-_EXTRA_DISTANCE = 0.08  # of the least distance, by which cameras stand further away
-_HAND_ROLL, _HAND_EXTRA_DISTANCE = 0.3, 0.25  # the same for cameras that are held in the hand
-_N_HAND_CANDIDATES = 3  # places that see board and legs, of which the best is taken
+_N_POSES = 5  # poses for scoring places
+_SAMPLES = 32  # points of a leg for scoring
+_ROUNDING = 1e-9  # relative rounding of the upper bound of a score
+_ROLL = 0.08  # [rad] maximum roll of cameras
+_EXTRA_DISTANCE = 0.08  # maximum extra distance of cameras, in minimum distances
+_HAND_ROLL, _HAND_EXTRA_DISTANCE = 0.3, 0.25  # the same for hand-held cameras
+_N_HAND_CANDIDATES = 3  # places with board and legs in view, of which the best is taken
 MAX_HAND_DRAWS = 60
-_MARGIN = 0.03  # of the image that stays free at each side
+_MARGIN = 0.03  # free margin at each side, in units of the image size
 _CENTRING_STEPS = 3  # steps that bring the machine into the middle of the image
-_MIN_BOARD_SHARE = 0.75  # of the poses in which a camera must see the board
-_MIN_DISTANCE = 0.3  # machine sizes that lie between the camera and the machine, at least
+_MIN_BOARD_SHARE = 0.75  # minimum share of poses in which a camera must see the board
+_MIN_DISTANCE = 0.3  # minimum distance between camera and machine, in machine sizes
 
 _N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better is taken
-_LEVELS = (0.0, -0.08, 0.25)  # of the size of the machine, above the base joints
-_PLATFORM_LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3)  # the same above the joints of the platform
-_TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given places
-_MIN_LEGS_SHARE = 0.9  # of what is seen of the legs that must stay seen
+_LEVELS = (0.0, -0.08, 0.25)  # heights above the base joints, in machine sizes
+_PLATFORM_LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3)  # heights above the joints of the platform
+_TILTS = (0.0, 0.6, 1.1)  # [rad] from horizontal, towards cameras with given places
+_MIN_LEGS_SHARE = 0.9  # minimum share of the visible lengths of legs that a board leaves visible
 
 
 def mild_lens() -> Camera:
@@ -104,16 +104,16 @@ def cameras_around(
     rng: np.random.Generator,  # of the first sector, roll and distance
     progress: Report = no_progress,
 ) -> tuple[tuple[Viewpoint, ...], float]:
-    """Return cameras around a machine, each in a sector of its own, and how much they see.
+    """Return cameras around a machine, each in a separate sector, and their score.
 
-    That is the least mean length of the legs in the images of a view [px], zero if a camera does
-    not see a board.
+    The score is the minimum over views of the mean length of the legs in the images [px], zero if a
+    camera does not see a board.
     """
     reached, tried, up = _reached(posed_machines), _some(posed_machines), machine.upward
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
     lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
-    found, least = [], np.inf
+    viewpoints, least = [], np.inf
     for v, (name, camera) in enumerate(cameras.items()):
         progress("Cameras", v, len(cameras))
         roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _EXTRA_DISTANCE * rng.random()
@@ -130,10 +130,10 @@ def cameras_around(
             for lift in lifts
         ]
         place, score = _best(machine, tried, camera, candidates)
-        found.append(Viewpoint(name, camera, candidates[place]))
+        viewpoints.append(Viewpoint(name, camera, candidates[place]))
         least = min(least, score)
     progress("Cameras", len(cameras), len(cameras))
-    return tuple(found), least
+    return tuple(viewpoints), least
 
 
 def camera_in_hand(
@@ -142,7 +142,7 @@ def camera_in_hand(
     camera: Camera,
     rng: np.random.Generator,
 ) -> RigidTransform | None:
-    """Return T_base_camera that shows boards and legs, the best of a few; None if there is none."""
+    """Return the best of a few T_base_camera with boards and legs in view; None without any."""
     up, reached = machine.upward, _reached([posed])
     lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
     good = []
@@ -160,7 +160,7 @@ def camera_in_hand(
             good.append((score, T))
         if len(good) == _N_HAND_CANDIDATES:
             break
-    return max(good, key=lambda found: found[0])[1] if good else None
+    return max(good, key=lambda scored: scored[0])[1] if good else None
 
 
 def board_and_cameras(
@@ -182,7 +182,7 @@ def board_and_cameras(
             break
     if not good:
         raise _nowhere(board, "every camera around the machine", "use a smaller board")
-    _, placed, views = max(good, key=lambda found: found[0])
+    _, placed, views = max(good, key=lambda scored: scored[0])
     return placed, views
 
 
@@ -192,15 +192,17 @@ def board_before(
     posed_machines: Sequence[PosedMachine],
     views: Sequence[Viewpoint],
 ) -> PlacedBoard:
-    """Return a board where cameras whose places are given see it."""
+    """Return a board in view of given cameras."""
     tried = _some(posed_machines)
     towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
     most, best = 0.0, None
     for placed in _lying(board, machine, tried, towards):
         together = [placed.beside(posed) for posed in tried]
-        seen = min(_share(placed, together, view) for view in views)
-        if seen > most and not any(_hides(machine, tried, together, view) for view in views):
-            most, best = seen, placed
+        visible_share = min(_share(placed, together, view) for view in views)
+        if visible_share > most and not any(
+            _hides(machine, tried, together, view) for view in views
+        ):
+            most, best = visible_share, placed
     if best is None:
         raise _nowhere(
             board, "all of the given cameras", "turn or move the cameras, or use another"
@@ -213,7 +215,7 @@ def board_on_platform(
     machine: Machine,
     posed_machines: Sequence[PosedMachine],
     T_base_platform: Sequence[RigidTransform],
-    views: Sequence[Viewpoint],  # that have to see it; without any it faces up
+    views: Sequence[Viewpoint],  # cameras that must see it; without any it faces up
 ) -> RigidTransform:
     """Return T_platform_board of a board on top of the platform, free of the machine."""
     home = machine.home
@@ -241,15 +243,15 @@ def board_on_platform(
             if not views:
                 return T
             together = [p.beside(body) for p, body in zip(placed, bodies, strict=True)]
-            seen = np.mean(
+            visible_share = np.mean(
                 [
                     p.is_enough(p.seen(body, view.camera, view.T_base_camera))
                     for view in views
                     for p, body in zip(placed, together, strict=True)
                 ]
             )
-            if seen > most:
-                most, best = float(seen), T
+            if visible_share > most:
+                most, best = float(visible_share), T
             break  # one level at each tilt
     if best is None or most < _MIN_BOARD_SHARE:
         raise _nowhere(board, "the cameras", "use a smaller board, or other cameras", "platform")
@@ -285,7 +287,7 @@ def _reached(posed_machines: Sequence[PosedMachine]) -> Array:
 def _before(
     toward: Array, up: Array, roll: float, further: float, points: Array, camera: Camera
 ) -> RigidTransform:
-    """Return the pose of a camera in a direction from which all points are in the image."""
+    """Return the pose of a camera in a direction, with all points in the image."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     rotation = look_at(target + toward, target, roll, up=up).rotation
     low, high = field_of_view(camera)
@@ -295,8 +297,8 @@ def _before(
     for _ in range(_CENTRING_STEPS):
         needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
         distance = float(max(*needed, _MIN_DISTANCE * size - p[:, 2].min()))
-        seen = p[:, :2] / (p[:, 2:] + distance)
-        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) - 0.5 * (low + high)
+        directions = p[:, :2] / (p[:, 2:] + distance)
+        middle = 0.5 * (directions.min(axis=0) + directions.max(axis=0)) - 0.5 * (low + high)
         aside = np.append(distance * middle, 0.0)
         p = p - aside
         target = target + rotation.apply(aside)
@@ -347,9 +349,9 @@ def _score(
     camera: Camera,
     T: RigidTransform,
 ) -> float:
-    """Return the mean length in the image [px] of all legs, those hidden counted as nothing.
+    """Return the mean length in the image [px] of all legs; hidden legs count as zero.
 
-    It counts by the share of the poses in which each board is seen, which must be most of them.
+    It is multiplied by the share of the poses in which each board is visible, which must be most.
     """
     share = 1.0
     for boards in zip(*(posed.boards for posed in posed_machines), strict=True):
@@ -382,7 +384,7 @@ def _lying(
         for placed in places:
             if not any(placed.runs_through(posed) for posed in posed_machines):
                 yield placed
-                break  # one place at each foot
+                break  # a single place at each foot
 
 
 def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Array:
@@ -397,7 +399,7 @@ def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Arra
 
 
 def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:
-    """Return the share of the corners that a view shows, zero if too few in one of the poses."""
+    """Return the share of corners in a view, zero if there are too few in one of the poses."""
     shown = [placed.seen(posed, view.camera, view.T_base_camera) for posed in together]
     return float(np.mean(shown)) if all(map(placed.is_enough, shown)) else 0.0
 
@@ -408,7 +410,7 @@ def _hides(
     together: Sequence[PosedMachine],
     view: Viewpoint,
 ) -> bool:
-    """Say whether a board beside a machine hides much of its legs from a view."""
+    """Return whether a board beside a machine hides much of its legs from a view."""
     free, left = (
         sum(_lengths(machine, posed_machines, view.camera, view.T_base_camera))
         for posed_machines in (alone, together)
@@ -417,7 +419,7 @@ def _hides(
 
 
 def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:
-    """Return that a board has no place."""
+    """Return the error of a board without a suitable place."""
     width, height = np.ptp(board.extent, axis=0)[:2].tolist()
     return NotVisible(
         f"The board could not be placed: found no place near the {link} at which {who} would see a "

@@ -55,14 +55,14 @@ from legcal.workers import Workers, is_number
 @brief
 @dataclass(frozen=True, eq=False)
 class SimulatedDataset:
-    """What was written.
+    """A dataset that was written.
 
     Attributes
     ----------
     folder : Path
         The dataset.
     level : Level
-        What it gives a calibration to work on.
+        Its kind of observations.
     nominal, truth : Machine
         The model of the dataset, and the machine that was measured.
     truth_path : Path
@@ -70,9 +70,9 @@ class SimulatedDataset:
     measurements : Measurements
         The rows.
     seen : (n_rows, n_legs) array of bool
-        Which legs each image shows.
+        Mask of the legs that each image shows.
     left_out : int
-        Images that show no leg, which a dataset of axes or outlines has no row for.
+        Images without a leg, for which a dataset of axes or outlines has no row.
     n_extreme : int
         Poses with every motor near an end of its travel.
     """
@@ -99,20 +99,19 @@ def simulate(
 ) -> SimulatedDataset:
     """Write a dataset of a machine that differs from its nominal model by drawn errors.
 
-    The same settings give the same files, to the last bit, on one machine. What is drawn for one
-    purpose does not depend on the others: two levels with one seed show the same machine in the
-    same poses.
+    The same settings give the same files, to the last bit, on one computer. Draws for one purpose
+    do not depend on the others: two levels with one seed show the same machine in the same poses.
 
     Parameters
     ----------
     model : str, Path or Machine
-        The nominal model, as :func:`legcal.load_mechanism` takes it.
+        The nominal model, as for :func:`legcal.load_mechanism`.
     output : path
         The folder of the dataset.
     settings : SimulationSettings, optional
-        What to simulate.
+        The machine's errors, poses, cameras and noise.
     workers : int, str or executor
-        Render photographs there, as :func:`legcal.calibrate` searches them.
+        Workers that render photographs, as for :func:`legcal.calibrate`.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
 
@@ -191,8 +190,8 @@ def simulate(
 def _measured(
     truth: Machine, lengths: Mapping[str, float], rng: np.random.Generator
 ) -> dict[str, str]:
-    """Return distances of joints as somebody measures them, as ``dataset.yaml`` has them."""
-    found = {}
+    """Return measured distances of joints with errors, in the form of ``dataset.yaml``."""
+    lengths_in_words = {}
     for name, sigma in lengths.items():
         true = joint_distance(truth, name)
         if true is None:
@@ -200,8 +199,8 @@ def _measured(
                 f"The length {describe(name)} could not be measured: found no two joints of the "
                 "base, of the platform or of one rod, needed them; name others."
             )
-        found[name] = f"{1e3 * (true + sigma * rng.normal()):.6f}+-{1e3 * sigma:g}mm"
-    return found
+        lengths_in_words[name] = f"{1e3 * (true + sigma * rng.normal()):.6f}+-{1e3 * sigma:g}mm"
+    return lengths_in_words
 
 
 def _write_photographs(
@@ -237,11 +236,11 @@ class ViewSummary(Document):
     """A view of the dataset."""
 
     images: int
-    legs: dict[str, int]  # in how many of its images each is seen
+    legs: dict[str, int]  # number of images that show each leg
 
 
 class SimulationDocument(Document):
-    """What ``legcal simulate --json`` prints."""
+    """The document of ``legcal simulate --json``."""
 
     dataset: str
     level: str
@@ -249,7 +248,7 @@ class SimulationDocument(Document):
     truth: str  # the true model
     images: int
     poses: int
-    extreme_poses: int  # in which every motor is near an end of its travel
+    extreme_poses: int  # poses with every motor near an end of its travel
     left_out: int
     views: dict[str, ViewSummary]
 

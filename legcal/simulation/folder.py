@@ -1,7 +1,7 @@
-"""The folder of a simulated dataset, with the truth beside what a calibration may see.
+"""The folder of a simulated dataset, with the truth beside the input of a calibration.
 
-``truth/`` holds the true model, the exact outlines and ``truth.json``: settings and seed, where the
-cameras and the platform really were. Nothing of the method reads it.
+``truth/`` holds the true model, the exact outlines and ``truth.json``: settings and seed, and the
+true poses of cameras and platform. The method never reads it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def write_session(
     m: Measurements,
     *,
     groups: Sequence[str] = (),  # view of the file of each view, where cameras are in the hand
-    board: Any = None,  # the block of one, or of several
+    board: Any = None,  # the block of a board, or of several
     lengths: Mapping[str, str] | None = None,  # measured distances of joints
 ) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""
@@ -124,7 +124,7 @@ def write_truth(
 
 
 def _plain(value: Any) -> Any:
-    """Return settings as JSON can hold them."""
+    """Convert settings to values of JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
@@ -138,17 +138,17 @@ def _plain(value: Any) -> Any:
 
 
 def check_dataset_destination(destination: Path) -> None:
-    """Refuse an output folder that holds anything."""
+    """Refuse an output folder that is not empty."""
     check_path(destination, SIMULATED)
     if destination.is_dir() and holds_files(destination):
-        there = "a simulated dataset" if SIMULATED.is_in(destination) else "a folder with files"
+        content = "a simulated dataset" if SIMULATED.is_in(destination) else "a folder with files"
         raise UsageError(
-            f"{destination}: the dataset could not be written: found {there}, needed a new or "
+            f"{destination}: the dataset could not be written: found {content}, needed a new or "
             "empty folder; give another folder, or remove this one first."
         )
 
 
 def files_in(folder: Path) -> list[str]:
-    """Return the files of a folder, relative to it, in order; none of hidden folders."""
-    found = [path.relative_to(folder) for path in folder.rglob("[!.]*") if path.is_file()]
-    return [path.as_posix() for path in sorted(found) if not path.parent.name.startswith(".")]
+    """Return the files of a folder, relative to it, in order; without hidden folders."""
+    paths = [path.relative_to(folder) for path in folder.rglob("[!.]*") if path.is_file()]
+    return [path.as_posix() for path in sorted(paths) if not path.parent.name.startswith(".")]

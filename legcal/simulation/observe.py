@@ -1,6 +1,6 @@
-"""What cameras see of a machine in its poses: outlines, axes, corners, exact or with known noise.
+"""Simulated observations of a machine in its poses: outlines, axes, corners, exact or noisy.
 
-A :class:`Scene` is the truth of a session: where joints are and what each image shows of the legs
+A :class:`Scene` is the truth of a session: the joints, and the visible legs in each image
 (:func:`legcal.simulation.visibility.take_images`).
 """
 
@@ -23,14 +23,14 @@ from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Images, Viewpoint, silhouette
 from legcal.vision.camera import Camera
 
-EXACT_PX = 1e-3  # standard deviation that outlines and corners without noise claim
+EXACT_PX = 1e-3  # stated standard deviation of outlines and corners without noise
 _MIN_UPRIGHT_AXIS = 1e-3  # component along the image y axis below which a leg has no point M_LS
-_MIN_UPRIGHT = 1e-9  # the same, below which there are no numbers for it
+_MIN_UPRIGHT = 1e-9  # component below which its numbers cannot be computed
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A machine in its poses and what cameras see of it, in a frame L: the base link or R_b."""
+    """A machine in its poses, its cameras and images, in a frame L: the base link or R_b."""
 
     A: Array  # (n_poses, n_legs, 3) base joint centres in L [m]
     B: Array  # (n_poses, n_legs, 3) platform joint centres in L [m]
@@ -54,8 +54,8 @@ class Scene:
 class OutlineNoise:
     """White noise of the edge points of an outline, to which a line is fitted."""
 
-    sigma_px: float = 0.1  # of each point [px]
-    n_points: int | None = 300  # equally spaced; None for one in every pixel
+    sigma_px: float = 0.1  # standard deviation of each point [px]
+    n_points: int | None = 300  # equally spaced; None for a point in every pixel
 
     def covariance(self, length_px: float) -> Array:
         """Return the covariance of the line's offsets at its ends, (2, 2) [px^2]."""
@@ -73,9 +73,8 @@ def outlines_of(
 ) -> Outlines:
     """Return the outlines of all visible stretches by row, leg and edge; exact without *rng*.
 
-    Those of arms follow those of the legs that have them as parts.
-
-    They carry the covariance of the noise in either case.
+    Outlines of an arm follow the outlines of its leg. They carry the covariance of the noise in
+    either case.
     """
     claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
     images = scene.images
@@ -126,7 +125,7 @@ def outlines_of(
 
 
 def noisy_outlines(exact: Outlines, camera: Camera, rng: np.random.Generator) -> Outlines:
-    """Return exact outlines of one camera with errors of the covariance that they carry."""
+    """Return exact outlines of one camera with errors drawn from their covariance."""
     root = np.linalg.cholesky(exact.covariance)
     return moved_outlines(
         exact, camera, np.einsum("nij,nj->ni", root, rng.normal(size=(len(exact), 2)))
@@ -134,7 +133,7 @@ def noisy_outlines(exact: Outlines, camera: Camera, rng: np.random.Generator) ->
 
 
 def moved_outlines(outlines: Outlines, camera: Camera, offsets: Array) -> Outlines:
-    """Return outlines of one camera whose ends are moved across them by (n, 2) pixels."""
+    """Return outlines of one camera with ends moved across them by (n, 2) pixels."""
     h, ends = shifted_outlines(camera, outlines.h, outlines.ends, offsets)
     return replace(outlines, h=h, ends=ends)
 
@@ -203,7 +202,7 @@ class AxisTable(NamedTuple):
 def axes_in_images(
     scene: Scene, noise: TableNoise, rng: np.random.Generator | None = None
 ) -> AxisTable:
-    """Return the axes of all legs that images show, by row and leg; exact without *rng*.
+    """Return the axes of all visible legs, by row and leg; exact without *rng*.
 
     A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
     """
@@ -251,7 +250,7 @@ def table_of_lines(u: Array, A: Array) -> Array:
 
     The direction u is at 90 deg - psi to the optical axis, and its picture u_y - i u_x as a complex
     number is at theta to the image's y axis. M_LS is in the plane y = 0 and has the moment of
-    the line, M x u = A x u. The method finds the same by other ways, so that a mistake shows.
+    the line, M x u = A x u. The method computes the same in another way, so that a mistake shows.
     """
     u_x, u_y, u_z = u.T
     if np.any(np.abs(u_y) < _MIN_UPRIGHT):
@@ -276,11 +275,8 @@ def corners_in_images(
     sigma_px: float,
     rng: np.random.Generator | None = None,
 ) -> Corners:
-    """Return the corners of boards that images show, by board, row and number.
-
-    They are exact without *rng*.
-    """
-    found = []
+    """Return the visible corners of boards, by board, row and number; exact without *rng*."""
+    tables = []
     for board, row in product(range(len(posed_machines[0].boards)), range(len(scene.images))):
         v, k = scene.images.view[row], scene.images.pose[row]
         camera, T = scene.views[v].camera, scene.views[v].T_base_camera
@@ -297,5 +293,5 @@ def corners_in_images(
             corner, px = corner[inside], px[inside]
         sigma = np.full(len(corner), max(sigma_px, EXACT_PX))
         of_row = np.full(len(corner), row, dtype=np.intp)
-        found.append(found_corners(of_row, placed.first + corner, px, sigma))
-    return join_corners(found)
+        tables.append(found_corners(of_row, placed.first + corner, px, sigma))
+    return join_corners(tables)

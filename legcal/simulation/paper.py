@@ -1,7 +1,7 @@
-"""Section 4.3: the paper's own evaluation, a hundred simulated calibrations of a 6-SPU.
+"""Section 4.3: the evaluation in the paper, a hundred simulated calibrations of a 6-SPU.
 
 The session simulator makes the measurements; here are the machine, the cameras and the numbers of
-the paper, and what its estimators find.
+the paper, and its estimators.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera, sample_camera
 
 MACHINES = ("coplanar", "noncoplanar")
-PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
-RAISED = 0.030  # [m] out of the plane of the others
+PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs in each view
+RAISED = 0.030  # [m] height of raised joints above the plane of the others
 TRAVEL = (0.0, 0.140)  # [m] of every motor; the limits of the shipped model leave 4 mm more
-_DISTANCE = 0.9  # [m] of cameras from the middle of the machine, about
-_WAY = (0.25, 0.5, 0.75)  # parts of the way from home to the readings
-_MAX_ERROR = 1e-12  # of leg lengths
-_MAX_ROUNDS = 100  # of draws of poses
+_DISTANCE = 0.9  # [m] approximate distance of cameras from the middle of the machine
+_WAY = (0.25, 0.5, 0.75)  # intermediate steps from home to the readings, as fractions
+_MAX_ERROR = 1e-12  # relative tolerance of leg lengths
+_MAX_ROUNDS = 100  # maximum rounds of drawing poses
 
 
 # The machine and its cameras
@@ -100,13 +100,13 @@ def paper_cameras(
     legs: Sequence[Sequence[int]] = PAPER_VIEWS,
     camera: Camera | None = None,
 ) -> tuple[Viewpoint, ...]:
-    """Return cameras around a machine, each on the side of the legs that it sees."""
+    """Return cameras around a machine, each on the side of its legs."""
     camera = camera or sample_camera()
     middle = 0.5 * (machine.A_base + machine.home.apply(machine.B_platform))
     centre = middle.mean(axis=0)
     views = []
-    for v, seen in enumerate(legs):
-        outward = (middle[list(seen)] - centre).mean(axis=0)
+    for v, view_legs in enumerate(legs):
+        outward = (middle[list(view_legs)] - centre).mean(axis=0)
         outward[2] = 0.0
         if np.linalg.norm(outward) < 1e-3 * _DISTANCE:  # every leg is seen: any side will do
             outward = np.array([*rng.normal(size=2), 0.0])
@@ -115,7 +115,7 @@ def paper_cameras(
         toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
         place = centre + _DISTANCE * rng.uniform(0.95, 1.05) * toward
         T = look_at(place, centre, roll=rng.uniform(-0.1, 0.1))
-        names = tuple(machine.leg_names[j] for j in seen)
+        names = tuple(machine.leg_names[j] for j in view_legs)
         views.append(Viewpoint(f"c{v + 1}", camera, T, names))
     return tuple(views)
 
@@ -133,7 +133,7 @@ class PaperStudy:
     n_poses: int = 15  # extreme poses of each camera position
     n_images: int = 3  # of each pose
     n_checked: int = 10  # random poses of eq (20)
-    estimators: tuple[str, ...] = ("literal", "default", "fit")  # what is compared
+    estimators: tuple[str, ...] = ("literal", "default", "fit")  # the estimators compared
 
     @property
     def name(self) -> str:
@@ -153,7 +153,7 @@ class PaperStudy:
         }
 
     def one_run(self, seed: np.random.SeedSequence) -> Record:
-        """Return what every estimator finds on one session of either machine."""
+        """Return the errors of every estimator for one session of either machine."""
         seeds = seed.spawn(len(MACHINES))
         return {
             name: self._calibrations(paper_machine(name), child)
@@ -169,7 +169,7 @@ class PaperStudy:
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], seed: np.random.SeedSequence
     ) -> SimulatedSession:
-        """Return the measurements of one calibration: nothing hides the legs of a view."""
+        """Return the measurements of one calibration, without occlusion of legs."""
         settings = SimulationSettings(
             level=Level.AXES,
             poses=self.n_poses,
@@ -190,18 +190,18 @@ class PaperStudy:
         session = self.session(truth, paper_cameras(truth, rng), of_session)
         checked = checked_poses(truth, initial, self.n_checked, rng)
         covariance = bound_covariance(session, self.noise)
-        found = {INITIAL: _errors(truth, initial, covariance, checked)}
+        errors_by_estimator = {INITIAL: _errors(truth, initial, covariance, checked)}
         for name in self.estimators:
             try:
                 legs = ESTIMATORS[name](session, initial)
             except LegcalError as failure:
-                found[name] = {"failure": failure_of(failure)}
+                errors_by_estimator[name] = {"failure": failure_of(failure)}
             else:
-                found[name] = _errors(truth, legs, covariance, checked)
+                errors_by_estimator[name] = _errors(truth, legs, covariance, checked)
         sigma = np.sqrt(np.diagonal(covariance))
         expected = expected_errors(truth, covariance, checked)
-        found[BOUND] = errors_record(expected, 1.0, np.sqrt(2.0 / np.pi) * sigma)
-        return found
+        errors_by_estimator[BOUND] = errors_record(expected, 1.0, np.sqrt(2.0 / np.pi) * sigma)
+        return errors_by_estimator
 
 
 def checked_poses(
@@ -224,11 +224,12 @@ def checked_poses(
 def _errors(
     truth: Machine, legs: Sequence[Leg], covariance: Array, checked: RigidTransform
 ) -> Record:
-    """Return the errors of eq (20) and those of every parameter, or the failure to compute them."""
-    found, true = (
-        to_vector(parameters_of_legs(each), truth.frame_legs) for each in (legs, geometries(truth))
+    """Return the errors of eq (20) and of every parameter, or the failure to compute them."""
+    estimated, true = (
+        to_vector(parameters_of_legs(some_legs), truth.frame_legs)
+        for some_legs in (legs, geometries(truth))
     )
-    difference = found - true
+    difference = estimated - true
     squared = float(difference @ np.linalg.solve(covariance, difference)) / len(difference)
     try:
         errors = platform_errors(truth, legs, checked)
@@ -253,7 +254,7 @@ def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: A
 class PlatformErrors:
     """Means over poses of eq (20)."""
 
-    dX: float  # displacement of B_1 from A_1, which are the origins of R_e and R_b [m]
+    dX: float  # error of the displacement from A_1 to B_1, the origins of R_b and R_e [m]
     dE: float  # norm of the Euler angles between both orientations, as printed [rad]
     angle: float  # of that rotation [rad]: near the norm of Euler angles while both are small
 
@@ -277,7 +278,7 @@ def platform_errors(truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
 def poses_by_readings(
     truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
 ) -> tuple[RigidTransform, BoolArray]:
-    """Return the poses that legs compute from the readings of true poses, and which exist."""
+    """Return the poses of legs at the readings of true poses, and a mask of those that exist."""
     R, t, true = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation, truth.parameters
     arms = true.platform_joints @ np.swapaxes(R, -1, -2)
     lengths = np.linalg.norm(arms + t[:, None] - true.base_joints, axis=-1)
@@ -301,31 +302,31 @@ def expected_errors(truth: Machine, covariance: Array, T_Rb_Re: RigidTransform) 
 def expected_norm(covariance: Array) -> Array:
     """Return the expected norm of Gaussian vectors with covariances (..., 3, 3).
 
-    The length of a Gaussian vector is that of its direction times a chi-distributed number of
-    mean sqrt(8 / pi); the mean over directions is Carlson's elliptic integral R_G.
+    The length of a Gaussian vector is a function of its direction times a chi-distributed number
+    of mean sqrt(8 / pi); the mean over directions is Carlson's elliptic integral R_G.
     """
     value = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     mean = elliprg(value[..., 0], value[..., 1], value[..., 2])
     return np.asarray(np.sqrt(8.0 / np.pi) * mean)
 
 
-# Estimators: they look at measurements and axes of a session, and at the initial legs
+# Estimators: their inputs are measurements and axes of a session, and the initial legs
 
 
 def four_steps(
     session: SimulatedSession, initial: Sequence[Leg], criteria: Criteria
 ) -> tuple[Leg, ...]:
-    """Return the legs that the four steps find."""
+    """Return the legs of the four steps."""
     truth = session.truth
     machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
     return run_steps(machine, _axes(session), session.measurements, criteria=criteria).legs
 
 
 def one_fit(session: SimulatedSession, initial: Sequence[Leg]) -> tuple[Leg, ...]:
-    """Return the legs that the joint fit finds, started from initial legs and rough cameras.
+    """Return the legs of the joint fit, started from initial legs and rough cameras.
 
-    ``legcal calibrate`` also starts from what the steps find and keeps the better of both; here the
-    fit is compared with the steps, and does without them.
+    ``legcal calibrate`` also starts from the result of the steps and keeps the better fit; here the
+    fit is compared with the steps, and does not use them.
     """
     m, legs = session.measurements, _fitted(session.truth, initial)
     start = nominal_start(legs, m, session.truth.T_base_Rb)
@@ -353,8 +354,8 @@ def nominal_start(legs: FittedLegs, m: Measurements, T_base_Rb: RigidTransform) 
     wanted = legs.sign * m.q_of_poses
     poses: Sequence[RigidTransform] = (legs.home,) * m.n_poses
     for part in _WAY:
-        there = first + part * (wanted - first)
-        poses = platform_poses(legs.nominal, there, poses, legs.frame_legs)
+        readings = first + part * (wanted - first)
+        poses = platform_poses(legs.nominal, readings, poses, legs.frame_legs)
     cameras = cameras_from_hints(m, T_base_Rb)
     return start_from(legs.nominal, m, legs, cameras, poses, "nominal")
 
@@ -373,11 +374,11 @@ def bound_covariance(session: SimulatedSession, noise: TableNoise) -> Array:
 
 
 def _axes(session: SimulatedSession) -> LegAxes:
-    """Return the axes that were measured."""
+    """Return the measured axes of a session."""
     assert session.axes is not None
     return axes_of_table(*session.axes)
 
 
 def _fitted(truth: Machine, legs: Sequence[Leg]) -> FittedLegs:
-    """Return legs as the fit sees them."""
+    """Return legs in the form of the joint fit."""
     return FittedLegs(truth.leg_names, tuple(legs), truth.frame_legs, {}, truth.home_of_frames)

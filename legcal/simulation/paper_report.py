@@ -1,4 +1,4 @@
-"""What the evaluation of section 4.3 found: means over runs, and figure 4."""
+"""The result of the evaluation of section 4.3: means over runs, and figure 4."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ _BARS, _MARKS, _TRUE = "mean error", "expected at the Cramer-Rao bound", "true v
 
 
 class Means:
-    """Means of one estimator's errors over the runs in which it did not fail, taken one by one."""
+    """Means of one estimator's errors over the runs without failure, accumulated run by run."""
 
     def __init__(self, machine: str, estimator: str, n_parameters: int) -> None:
         self.machine, self.estimator = machine, estimator
@@ -85,7 +85,7 @@ class Means:
         self._parameters = np.zeros(n_parameters)
 
     def add(self, record: Record) -> None:
-        """Add what one run found."""
+        """Add the errors of one run."""
         if "failure" in record:
             self.failures[record["failure"]["kind"]] += 1
             return
@@ -97,7 +97,7 @@ class Means:
 
     @property
     def n_failed(self) -> int:
-        """How many runs failed."""
+        """The number of failed runs."""
         return self.failures.total()
 
     @property
@@ -107,7 +107,7 @@ class Means:
 
     @property
     def uncertainties(self) -> Array:
-        """Standard deviations of these means, (4,)."""
+        """Standard deviations of the means, (4,)."""
         count = max(self.n, 1)
         variances = np.maximum(self._squares / count - self.scalars**2, 0.0)
         return np.asarray(np.sqrt(variances / max(self.n - 1, 1)))
@@ -117,7 +117,7 @@ class Means:
         """Root mean square of d' inv(C) d / n for errors d of the n parameters, and its sigma.
 
         C is the covariance of the Cramer-Rao bound of the same run: 1 for an estimator that reaches
-        it. Its spread is far smaller than that of dX.
+        it. Its spread is far smaller than the spread of dX.
         """
         ratio = float(np.sqrt(self.scalars[3]))
         return ratio, float(self.uncertainties[3]) / (2.0 * ratio) if ratio else 0.0
@@ -166,13 +166,13 @@ class PaperSummary:
     def of(
         cls, records: Iterable[Record], machines: Mapping[str, Machine], *, in_radians: bool
     ) -> PaperSummary:
-        """Return the means over records, which are read once."""
+        """Return the means over records, in one pass over these."""
         first = next(iter(machines.values()))
         names = parametrize(first.leg_names, geometries(first), first.frame_legs).names
         means: dict[tuple[str, str], Means] = {}
         for record in records:
-            for machine, found in record.items():
-                for estimator, errors in found.items():
+            for machine, errors_by_estimator in record.items():
+                for estimator, errors in errors_by_estimator.items():
                     key = machine, estimator
                     means.setdefault(key, Means(*key, len(names))).add(errors)
         truths = {
@@ -183,7 +183,7 @@ class PaperSummary:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """How the paper's text was read where it leaves a choice."""
+        """The interpretation of the paper where its text leaves a choice."""
         return (IN_RADIANS if self.in_radians else IN_DEGREES, *READINGS)
 
     def document(self) -> dict[str, Any]:
@@ -221,14 +221,14 @@ class EstimatorRow(Document):
 
 
 class PaperDocument(Document):
-    """What the runs of ``legcal study paper`` found together."""
+    """The combined result of the runs of ``legcal study paper``."""
 
     rows: list[EstimatorRow]
     initial: list[EstimatorRow]  # before calibration
     names: list[str]  # of the parameters
     true_values_mm: dict[str, list[Number]]  # by machine
     as_printed: dict[str, dict[str, Any] | str]  # in the paper
-    readings: list[str]  # how the paper's text was read where it leaves a choice
+    readings: list[str]  # interpretations of the paper where its text leaves a choice
 
 
 # Figure 4
@@ -243,9 +243,9 @@ class _Panel(NamedTuple):
     truth: Array
 
 
-def _panels(found: PaperSummary) -> list[list[_Panel]]:
+def _panels(summary: PaperSummary) -> list[list[_Panel]]:
     """Return the panels: a row for each estimator, a column for each machine."""
-    by_name = {(means.machine, means.estimator): means for means in found.means}
+    by_name = {(means.machine, means.estimator): means for means in summary.means}
     compared = {estimator for _, estimator in by_name}
 
     def panel(machine: str, estimator: str) -> _Panel:
@@ -255,11 +255,11 @@ def _panels(found: PaperSummary) -> list[list[_Panel]]:
             f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}",
             1e3 * means.parameters,
             1e3 * limit.parameters,
-            1e3 * found.truths[machine],
+            1e3 * summary.truths[machine],
         )
 
     return [
-        [panel(machine, estimator) for machine in found.truths]
+        [panel(machine, estimator) for machine in summary.truths]
         for estimator in _DRAWN
         if estimator in compared
     ]
@@ -274,10 +274,10 @@ def _limits(grid: Sequence[Sequence[_Panel]]) -> tuple[float, float]:
     return 0.7 * float(shown.min()), 1.4 * float(shown.max())
 
 
-def _title(found: PaperSummary) -> str:
+def _title(summary: PaperSummary) -> str:
     """Return the title of the figure."""
-    n_runs = found.means[0].n + found.means[0].n_failed
-    return f"Fig. 4 of the paper: {len(found.names)} parameters, means over {n_runs} calibrations"
+    n_runs = summary.means[0].n + summary.means[0].n_failed
+    return f"Fig. 4 of the paper: {len(summary.names)} parameters, means over {n_runs} calibrations"
 
 
 def _label(name: str) -> str:
@@ -286,12 +286,12 @@ def _label(name: str) -> str:
     return f"{_LETTERS[kind]}{leg.removeprefix('leg')}{''.join(axis)}"
 
 
-def _as_html(found: PaperSummary) -> bytes:
+def _as_html(summary: PaperSummary) -> bytes:
     """Return the figure as one HTML page that works without a network."""
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
-    grid, names = _panels(found), list(map(_label, found.names))
+    grid, names = _panels(summary), list(map(_label, summary.names))
     n_rows, n_columns = len(grid), len(grid[0])
     decades = np.log10(_limits(grid)).tolist()
     tick = {"symbol": "line-ew", "size": 9, "line": {"width": 2, "color": _LIMIT}}
@@ -308,7 +308,7 @@ def _as_html(found: PaperSummary) -> bytes:
         for j, panel in enumerate(row):
             place = {"row": i + 1, "col": j + 1}
             left, right = {**place, "secondary_y": False}, {**place, "secondary_y": True}
-            for trace, where in (
+            for trace, axis in (
                 (go.Bar(x=names, y=panel.errors, name=_BARS, marker_color=_BAR), left),
                 (
                     go.Scatter(x=names, y=panel.limit, name=_MARKS, mode="markers", marker=tick),
@@ -317,28 +317,28 @@ def _as_html(found: PaperSummary) -> bytes:
                 (go.Scatter(x=names, y=panel.truth, name=_TRUE, line=line), right),
             ):
                 trace.update(showlegend=i == j == 0, legendgroup=trace.name)
-                figure.add_trace(trace, **where)
+                figure.add_trace(trace, **axis)
             figure.update_yaxes(title_text=_ERROR_AXIS, type="log", range=decades, **left)
             figure.update_yaxes(title_text=_TRUTH_AXIS, showgrid=False, **right)
     figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
     figure.update_layout(
-        title=_title(found), height=360 * n_rows, template="plotly_white", legend_orientation="h"
+        title=_title(summary), height=360 * n_rows, template="plotly_white", legend_orientation="h"
     )
     page: str = figure.to_html(include_plotlyjs=True, include_mathjax=False, div_id="fig4")
     return page.encode()
 
 
-def _as_png(found: PaperSummary) -> bytes:
+def _as_png(summary: PaperSummary) -> bytes:
     """Return the figure as a PNG picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    grid, names = _panels(found), list(map(_label, found.names))
+    grid, names = _panels(summary), list(map(_label, summary.names))
     n_rows, n_columns = len(grid), len(grid[0])
     width, height = 7.0 * n_columns, 2.9 * n_rows + 0.6
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    place = {  # in inches; a layout that matplotlib finds takes as long as all the rest
+    place = {  # in inches; automatic layout in matplotlib takes as long as everything else
         "left": 0.8 / width,
         "right": 1.0 - 0.75 / width,
         "bottom": 0.95 / height,
@@ -350,7 +350,7 @@ def _as_png(found: PaperSummary) -> bytes:
     for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
         handles = _draw(axis, panel, names)
         axis.set_ylim(_limits(grid))
-    figure.suptitle(_title(found), fontsize=11, y=1.0 - 0.15 / height)
+    figure.suptitle(_title(summary), fontsize=11, y=1.0 - 0.15 / height)
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
@@ -358,7 +358,7 @@ def _as_png(found: PaperSummary) -> bytes:
 
 
 def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
-    """Draw a panel with Matplotlib and return what its legend explains."""
+    """Draw a panel with Matplotlib and return the handles of its legend."""
     place = range(len(names))
     bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
     marks = axis.scatter(place, panel.limit, marker="_", s=70, lw=2.0, color=_LIMIT, label=_MARKS)

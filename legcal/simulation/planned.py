@@ -1,4 +1,4 @@
-"""A session that ``legcal plan`` wrote, as it will be shot: tripods a little elsewhere."""
+"""A session planned by ``legcal plan``, with the actual tripods a little off the planned poses."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from legcal.simulation.visibility import Viewpoint
 
 @dataclass(frozen=True, eq=False)
 class PlannedSession:
-    """What a plan asks for."""
+    """A plan: its rows, tolerances, and board."""
 
-    measurements: Measurements  # one row an image, with views where they should stand
-    setting: Setting  # how far tripods may be off
+    measurements: Measurements  # one row an image, with planned poses of views
+    setting: Setting  # tolerances of tripods
     board: PlacedBoard | None  # on the base
-    hand: str  # the view of a camera in the hand; empty if cameras stand
+    hand: str  # name of the view of a hand-held camera; "" for fixed cameras
 
     @property
     def poses_of(self) -> list[list[int]]:
@@ -48,11 +48,11 @@ class PlannedSession:
         rng: np.random.Generator,
         posed_machines: Sequence[PosedMachine],  # in all poses, with the board
     ) -> tuple[Viewpoint, ...]:
-        """Return the views as cameras are set: elsewhere by the tolerance of the plan at most.
+        """Return the views with actual camera poses, within the tolerance of the plan.
 
-        A camera in the hand is moved until it shows the board. Raises NotVisible if it never does.
+        A hand-held camera is moved until it shows the board. Raises NotVisible if it never does.
         """
-        found = []
+        viewpoints = []
         for view, poses in zip(self.measurements.views, self.poses_of, strict=True):
             T = view.T_base_camera
             if T is None:
@@ -72,8 +72,8 @@ class PlannedSession:
                     f"from none of {MAX_HAND_DRAWS} places near that of the plan, needed all of "
                     "it; plan with a smaller board."
                 )
-            found.append(Viewpoint(view.name, view.camera, moved))
-        return tuple(found)
+            viewpoints.append(Viewpoint(view.name, view.camera, moved))
+        return tuple(viewpoints)
 
     def poses(self, truth: Machine) -> Configurations:
         """Return the poses of the true machine at the planned readings."""
@@ -91,7 +91,7 @@ class PlannedSession:
 
 
 def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
-    """Return a planned session of a machine. Raises UsageError if it is none, or of another one."""
+    """Return a planned session. Raises UsageError if it is invalid, or of another machine."""
     try:
         document = read_json(folder / PLAN_NAME)
         if not isinstance(document, dict) or "legcal_plan" not in document:
@@ -104,12 +104,14 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
             f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
             "needed the folder that legcal plan wrote; correct --plan."
         ) from error
-    of = plan.tolerance
-    setting = Setting(of.camera_m, of.machine_m, of.camera_rad, of.machine_rad)
+    tolerance = plan.tolerance
+    setting = Setting(
+        tolerance.camera_m, tolerance.machine_m, tolerance.camera_rad, tolerance.machine_rad
+    )
     dataset = load_dataset(folder, check_images=False)
-    if other := difference(nominal, dataset.machine):
+    if difference_in_words := difference(nominal, dataset.machine):
         raise UsageError(
-            f"{folder}: the plan could not be shot: found {other}, needed a plan of "
+            f"{folder}: the plan could not be shot: found {difference_in_words}, needed a plan of "
             f"{nominal.name}; correct MODEL or --plan."
         )
     if not nominal.is_determined:
@@ -128,6 +130,6 @@ def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
                 f"{PLAN_NAME}; plan again."
             )
         hand = m.views[0].name.rpartition("-")[0]
-        both = zip(m.views, places, strict=True)
-        m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in both))
+        views_and_places = zip(m.views, places, strict=True)
+        m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in views_and_places))
     return PlannedSession(m, setting, board, hand)

@@ -22,12 +22,12 @@ from legcal.machine.redundancy import contradictions
 from legcal.progress import Report, no_progress
 from legcal.simulation.settings import Sampling
 
-_REGULAR_NOMINAL = 0.05  # of the nominal model's singularity measure at home
-_MAX_ROUNDS = 20  # of draws for poses that the nominal model does not reach
+_REGULAR_NOMINAL = 0.05  # minimum singularity measure of the nominal model, in units of home
+_MAX_ROUNDS = 20  # maximum rounds of draws that replace poses unreachable for the nominal model
 
 
 def are_extreme(machine: Machine, readings: Array) -> BoolArray:
-    """Say in which poses every motor is near an end of its travel, (n_poses,)."""
+    """Return a mask (n_poses,) of the poses with every motor near an end of its travel."""
     lower, upper = motor_travel(machine)
     part = (readings[:, list(machine.motors)] - lower) / (upper - lower)
     return np.asarray(np.all(np.minimum(part, 1.0 - part) <= JITTER, axis=1))
@@ -53,7 +53,7 @@ def draw_poses(
 def given_poses(machine: Machine, path: Path) -> Configurations:
     """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
 
-    Each is followed from the nearest one that is reached already, or from home.
+    Each is reached from the nearest pose that has been reached already, or from home.
     """
     if not machine.is_determined:
         raise UsageError(
@@ -71,10 +71,10 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
     readings, _ = readings_in(table, machine.legs)  # (n_poses, n_motors) [m]
     table.check()
     feasibility, problems = Feasibility(machine), []
-    known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    reached_readings = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
     reached = [machine.home_configuration]
-    for where, row in zip(table.where, readings, strict=True):
-        nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
+    for place, row in zip(table.where, readings, strict=True):
+        nearest = int(np.argmin(np.abs(np.array(reached_readings) - row).max(axis=1)))
         problem = _outside_travel(machine, row)
         if problem is None:
             try:
@@ -89,11 +89,11 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
                     if off
                     else feasibility.problem(configuration, of_motors=False)
                 )
-                known.append(row)
+                reached_readings.append(row)
                 reached.append(configuration)
         if problem is not None:
             problems.append(
-                f"{where}: the pose could not be used: found {problem} there, needed a pose that "
+                f"{place}: the pose could not be used: found {problem} there, needed a pose that "
                 "the machine reaches from home; correct or remove the row."
             )
     if problems:
@@ -133,7 +133,7 @@ def commanded_poses(
 
 
 def _outside_travel(machine: Machine, row: Array) -> str | None:
-    """Return which reading of the motors, (n_motors,) [m], is outside its travel."""
+    """Return in words the reading of a motor outside its travel, among (n_motors,) [m]."""
     for j, q in zip(machine.motors, row, strict=True):
         leg = machine.legs[j]
         lower, upper = leg.travel
@@ -145,7 +145,7 @@ def _outside_travel(machine: Machine, row: Array) -> str | None:
 
 
 def _reached(nominal: Machine, readings: Array) -> BoolArray:
-    """Say which readings (k, n_legs) the nominal model reaches, away from its singularities."""
+    """Return a mask of readings (k, n_legs) in reach of the nominal model, off singularities."""
     if not nominal.is_determined:
         return np.ones(len(readings), dtype=np.bool_)
     poses, failures = zip(*followed_poses(nominal, readings, on_the_chain=False), strict=True)

@@ -1,4 +1,4 @@
-"""A small photograph of a machine as a camera will see it, before anybody takes one."""
+"""A small simulated photograph of a machine from a planned camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import dressed, pose_machine
 from legcal.vision.camera import Camera
 
-_WIDTH = 400  # [px]
+_WIDTH = 400  # [px] of a preview
 
 
 def preview(

@@ -1,4 +1,4 @@
-"""The options of ``legcal simulate``, as people write them, made into settings."""
+"""The options of ``legcal simulate``, parsed into settings."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def requested(
     plan: Path | None = None,
     seed: int = 0,
 ) -> SimulationSettings:
-    """Return the settings that options ask for; Python has more (:class:`SimulationSettings`)."""
+    """Return the settings of options; Python has more (:class:`SimulationSettings`)."""
     for option, is_given in (("--poses", poses is not None), ("--hand-held", hand_held)):
         if plan is not None and is_given:
             raise UsageError(
@@ -76,7 +76,7 @@ def requested(
 
 
 def _camera(choices: Sequence[str], level: str) -> tuple[Path | None, Appearance]:
-    """Return the camera file, and what the kind of camera does to photographs."""
+    """Return the camera file, and the appearance of photographs for the kind of camera."""
     files, looks = list[Path](), list[Appearance]()
     for choice in choices:
         kind, colon, quality = choice.partition(":")
@@ -130,7 +130,7 @@ def _board(choice: str | None) -> str | Path | None:
 
 
 def parameter_errors(texts: Sequence[str], nominal: Machine) -> ParameterErrors:
-    """Return the errors of parameters that words such as ``joints=2mm`` ask for."""
+    """Return the errors of parameters from words such as ``joints=2mm``."""
     errors, possible = DEFAULT_ERRORS, kinds_of(nominal)
     for text in texts:
         if text == "none":

@@ -1,4 +1,4 @@
-"""The session simulator: from a machine and settings to what is measured of it, in memory.
+"""The session simulator: from a machine and settings to its measurements, in memory.
 
 :func:`simulate_session` puts a true machine into poses and cameras around it, and returns readings,
 outlines or axes, corners of a board, and the truth. :func:`photographs` renders its images.
@@ -57,8 +57,8 @@ Streams = Mapping[str, np.random.Generator]
 
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
              "corners", "lengths")  # fmt: skip
-_MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
-_MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
+_MIN_SIGMA_Q = 1e-9  # [m] stated standard deviation of readings without noise
+_MIN_SEEN = 0.5  # minimum share of photographs of a view that show a leg named in its hint
 
 
 def streams(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
@@ -72,20 +72,20 @@ def streams(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSession:
-    """What is measured of a simulated machine, and the truth behind it."""
+    """The measurements of a simulated machine, and the truth behind them."""
 
     measurements: Measurements
     outlines: Outlines | None  # with noise, where the settings ask for them
     axes: AxisTable | None
     corners: Corners | None
     truth: Machine
-    poses: Configurations  # all that were drawn; images may show only some
+    poses: Configurations  # all drawn poses; images may show only some
     labels: tuple[str, ...]  # their names
     posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     scene: Scene
-    left_out: int  # images that show no leg, which a table of outlines or axes has no row for
+    left_out: int  # images without a leg, for which a table of outlines or axes has no row
     boards: tuple[FixedBoard, ...]
-    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
 
 def simulate_session(
@@ -95,7 +95,7 @@ def simulate_session(
     rngs: Streams,
     progress: Report = no_progress,
 ) -> SimulatedSession:
-    """Return a session of a true machine of which the nominal model is known."""
+    """Return a session of a true machine with its nominal model."""
     simulator = _Simulator(truth, nominal, settings, rngs, progress)
     setup = simulator.set_up(simulator.poses())
     return simulator.observe(*simulator.shoot(setup))
@@ -109,12 +109,12 @@ class _Setup:
     posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     boards: tuple[FixedBoard, ...]
     views: tuple[Viewpoint, ...]
-    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
 
 @dataclass(frozen=True, eq=False)
 class _Simulator:
-    """What sessions are simulated from, and the steps: poses, set-up, images, measurements."""
+    """The inputs of a simulated session, and the steps: poses, set-up, images, measurements."""
 
     truth: Machine
     nominal: Machine
@@ -124,22 +124,22 @@ class _Simulator:
 
     @cached_property
     def plan(self) -> PlannedSession | None:
-        """The plan that is shot, if one is."""
+        """The plan of the session, if there is one."""
         plan = self.settings.plan
         return None if plan is None else read_plan(Path(plan), self.nominal)
 
     @property
     def given_views(self) -> tuple[Viewpoint, ...]:
-        """Where cameras stand, if settings give that."""
+        """The cameras in the settings, if any."""
         views = self.settings.views
         if not isinstance(views, Sequence):
             return ()
         for view in views:
-            if others := set(view.legs or ()) - set(self.truth.leg_names):
+            if unknown_legs := set(view.legs or ()) - set(self.truth.leg_names):
                 raise UsageError(
                     f"view {view.name}: its legs could not be simulated: found "
-                    f"{', '.join(sorted(others))}, which '{self.truth.name}' lacks, needed some of "
-                    f"{', '.join(self.truth.leg_names)}; correct the name."
+                    f"{', '.join(sorted(unknown_legs))}, which '{self.truth.name}' lacks, needed "
+                    f"some of {', '.join(self.truth.leg_names)}; correct the name."
                 )
         return tuple(views)
 
@@ -156,14 +156,18 @@ class _Simulator:
 
     @property
     def n_sets(self) -> int:
-        """How many sets of poses there are: one for each view unless they share them."""
+        """The number of sets of poses: one for each view unless they share them."""
         shared = self.settings.shared_poses or isinstance(self.settings.poses, str | Path)
         return 1 if shared else len(self.cameras)
 
     def poses_of(self, view: int, n_poses: int) -> range:
-        """Return the poses that a view sees: all of them, or those of its own set."""
-        own = n_poses // self.n_sets
-        return range(own) if self.n_sets == 1 else range(view * own, (view + 1) * own)
+        """Return the poses of a view: all poses, or the set of the view."""
+        poses_each = n_poses // self.n_sets
+        return (
+            range(poses_each)
+            if self.n_sets == 1
+            else range(view * poses_each, (view + 1) * poses_each)
+        )
 
     def poses(self) -> Configurations:
         """Return the poses of the true machine: of the plan, given, or drawn."""
@@ -181,8 +185,8 @@ class _Simulator:
         return poses
 
     def set_up(self, poses: Configurations) -> _Setup:
-        """Return boards and cameras around the machine: where plan and settings have them."""
-        # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
+        """Return boards and cameras around the machine, according to plan and settings."""
+        # Meshes are beside the nominal URDF; the URDF of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
         is_solid = self.settings.occlusion or self.settings.level == Level.PHOTOGRAPHS
         solids = dressed(replace(self.truth, urdf=urdf)) if is_solid else ()
@@ -201,8 +205,8 @@ class _Simulator:
             first = 0 if board is None else board.n_corners
             boards = (FixedBoard(board_of_platform, "platform", T, first),)
             posed = tuple(
-                placed_at(boards[0], T).beside(one)
-                for T, one in zip(poses.poses, posed, strict=True)
+                placed_at(boards[0], T).beside(posed_machine)
+                for T, posed_machine in zip(poses.poses, posed, strict=True)
             )
         if board is not None:
             on_base, views = self._with_board(board, posed, views)
@@ -227,11 +231,14 @@ class _Simulator:
         return plan.board
 
     def _with_board(
-        self, board: Board, posed: tuple[PosedMachine, ...], given: tuple[Viewpoint, ...]
+        self,
+        board: Board,
+        posed: tuple[PosedMachine, ...],
+        views_in_settings: tuple[Viewpoint, ...],
     ) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
-        """Return a board on the base before the given cameras, or with cameras before it."""
-        if given:
-            return board_before(board, self.truth, posed, given), given
+        """Return a board on the base in view of the given cameras, or with cameras to see it."""
+        if views_in_settings:
+            return board_before(board, self.truth, posed, views_in_settings), views_in_settings
         bodies: Sequence[PosedMachine] = posed
         if self.settings.hand_held:
             views = range(len(self.cameras))
@@ -243,7 +250,7 @@ class _Simulator:
     def _cameras_around(
         self, posed: tuple[PosedMachine, ...], *, with_board: bool
     ) -> tuple[Viewpoint, ...]:
-        """Return cameras around the machine; *with_board* they must see the one on the platform."""
+        """Return cameras around the machine; *with_board*, they must see the platform's board."""
         views, least = cameras_around(
             self.truth, posed, self.cameras, self.rngs["cameras"], self.progress
         )
@@ -258,7 +265,7 @@ class _Simulator:
     def _in_hand(
         self, posed: tuple[PosedMachine, ...]
     ) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
-        """Return a place for each image from which it shows board and legs, and its view."""
+        """Return for each image a camera with board and legs in view, and the name of its view."""
         views: list[Viewpoint] = []
         groups: list[str] = []
         n_images = len(self.cameras) * len(posed) // self.n_sets
@@ -278,9 +285,9 @@ class _Simulator:
         return tuple(views), tuple(groups)
 
     def shoot(self, setup: _Setup) -> tuple[_Setup, Images, int]:
-        """Return what images show, and how many are left out: tables have no row without a leg.
+        """Return the set-up, the images, and the number left out: tables need a leg in every row.
 
-        The set-up comes with it: of cameras in the hand those are left out that show nothing.
+        The set-up is without those poses of hand-held cameras that show nothing.
         """
         plan, n_poses = self.plan, len(setup.posed_machines)
         poses_of: Sequence[Sequence[int]] = [
@@ -291,7 +298,7 @@ class _Simulator:
             poses_of = plan.poses_of
         images = take_images(
             self.truth.legs, setup.posed_machines, setup.views, poses_of, self.settings.images,
-            self.progress, each=plan is None or not plan.hand,
+            self.progress, all_views=plan is None or not plan.hand,
         )  # fmt: skip
         rows = list(range(len(images)))
         if self.settings.level != Level.PHOTOGRAPHS:
@@ -323,9 +330,9 @@ class _Simulator:
         measurements = _recorded(
             self.truth, setup.poses, labels, scene, settings, rngs, hints=hints
         )
-        if self.plan is not None and hints:  # they are where the tripods should stand
-            both = zip(measurements.views, self.plan.measurements.views, strict=True)
-            hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in both)
+        if self.plan is not None and hints:  # hints are the planned poses of the tripods
+            view_pairs = zip(measurements.views, self.plan.measurements.views, strict=True)
+            hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in view_pairs)
             measurements = replace(measurements, views=hinted)
         return SimulatedSession(
             measurements, outlines, axes, corners, self.truth, setup.poses, labels, posed, scene,
@@ -341,14 +348,14 @@ def _beside(
 
 
 def exact_outlines(scene: Scene) -> Outlines:
-    """Return the outlines of a scene as they are, with next to no noise claimed."""
+    """Return the exact outlines of a scene, with a negligible stated noise."""
     return outlines_of(scene, replace(EVERY_PIXEL, sigma_px=0.0))
 
 
 def _numbered(
     images: Images, views: Sequence[Viewpoint], groups: Sequence[str]
 ) -> tuple[Images, tuple[Viewpoint, ...], tuple[str, ...]]:
-    """Return hand-held views counted anew by the images that are left, one for each of them."""
+    """Renumber hand-held views by the remaining images, one view for each."""
     counts = dict.fromkeys(groups, 0)
     left, names = [], []
     for v in images.view.tolist():
@@ -356,14 +363,17 @@ def _numbered(
         counts[name] += 1
         left.append(replace(views[v], name=f"{name}-{counts[name]}"))
         names.append(name)
-    own = replace(images, view=np.arange(len(images), dtype=np.intp))
-    return own, tuple(left), tuple(names)
+    numbered_images = replace(images, view=np.arange(len(images), dtype=np.intp))
+    return numbered_images, tuple(left), tuple(names)
 
 
-def _encoding(views: Sequence[Viewpoint], gamma: float, given: bool) -> tuple[Viewpoint, ...]:
-    """Return views whose cameras have a gamma, which the dataset gives or not."""
+def _encoding(
+    views: Sequence[Viewpoint], gamma: float, gamma_is_given: bool
+) -> tuple[Viewpoint, ...]:
+    """Return views with a gamma of their cameras, which the dataset states or not."""
     cameras = {
-        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=given) for view in views
+        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=gamma_is_given)
+        for view in views
     }
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
 
@@ -376,12 +386,12 @@ def _recorded(
     settings: SimulationSettings,
     rngs: Streams,
     *,
-    hints: bool,  # whether the dataset says roughly where cameras stand
+    hints: bool,  # whether the dataset states rough camera poses
 ) -> Measurements:
     """Return the rows of the dataset: readings with their errors, and rough poses of cameras."""
     legs, images = truth.leg_names, scene.images
     photographs = settings.level == Level.PHOTOGRAPHS
-    # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
+    # Tables list the visible legs; in photographs, legs that are often hidden are not searched.
     least = _MIN_SEEN if photographs else 0.0
     views = []
     for v, view in enumerate(scene.views):
@@ -406,7 +416,7 @@ def _recorded(
             f"images/{views[v].name}_{labels[p]}{f'_{k + 1}' * repeated}{suffix}"
             for v, p, k in zip(images.view, images.pose, images.repeat, strict=True)
         ]
-    seen, pose = np.unique(images.pose, return_inverse=True)
+    visible_poses, pose = np.unique(images.pose, return_inverse=True)
     return Measurements(
         views=tuple(views),
         image=tuple(names),
@@ -419,7 +429,7 @@ def _recorded(
         }
         if any(a.turns for a in truth.actuators)
         else {},
-        pose_labels=tuple(labels[p] for p in seen),
+        pose_labels=tuple(labels[p] for p in visible_poses),
     )
 
 
@@ -452,9 +462,9 @@ def photographs(
 
 @dataclass(frozen=True)
 class _Studio:
-    """A camera before its surroundings, and the machine in the poses that it photographs.
+    """A camera with its surroundings, and the machine in the poses to photograph.
 
-    Two of one key are the same, in whatever process they are.
+    Two studios with the same key are equal, in whatever process they are.
     """
 
     key: str

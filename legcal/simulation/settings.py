@@ -1,4 +1,4 @@
-"""What a simulated dataset is made of: the choices of Python and their limits."""
+"""The settings of a simulated dataset and their limits."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board
 
-MAX_SIZE = 1.0  # [m] or [rad]
+MAX_SIZE = 1.0  # maximum size of errors [m] or [rad]
 MAX_IMAGES = 100_000
 MAX_SIGMA_PX = 100.0
 ANGLES = ("axes", "twists")
 
 
 class Level(StrEnum):
-    """What a simulated dataset gives a calibration to work on."""
+    """The kind of observations in a simulated dataset."""
 
     AXES = "axes"
     OUTLINES = "outlines"
@@ -39,14 +39,14 @@ class Level(StrEnum):
 
 
 class Sampling(StrEnum):
-    """How poses are drawn: every motor near an end of its travel, or anywhere in it."""
+    """The drawing of poses: every motor near an end of its travel, or anywhere in it."""
 
     EXTREME = "extreme"
     WORKSPACE = "workspace"
 
 
 class Distribution(StrEnum):
-    """How errors of one kind are distributed, about zero."""
+    """The distribution of errors of one kind about zero."""
 
     UNIFORM = "uniform"
     NORMAL = "normal"
@@ -54,15 +54,15 @@ class Distribution(StrEnum):
 
 @dataclass(frozen=True)
 class Spread:
-    """How large the errors of one kind of parameter are.
+    """The size of the errors of one kind of parameter.
 
     Attributes
     ----------
     size : float
-        Half of the width where they are uniform, one standard deviation where they are normal
+        Half of the width of a uniform distribution, one standard deviation of a normal one
         [m] or [rad].
     distribution : Distribution
-        How they are distributed.
+        Their distribution.
 
     Raises
     ------
@@ -89,13 +89,13 @@ class Spread:
 
 @dataclass(frozen=True)
 class ParameterErrors:
-    """How large the errors of each kind of parameter are.
+    """The size of the errors of each kind of parameter.
 
     Attributes
     ----------
     base_joints, platform_joints : Spread
-        Errors of each coordinate of the joint centres [m]; those of the base also of where the axes
-        of motors lie that carry joints.
+        Errors of each coordinate of the joint centres [m]; for the base also errors of points on
+        the axes of motors that carry joints.
     offsets : Spread
         Errors of the offsets of actuated legs [m].
     lengths : Spread
@@ -107,7 +107,7 @@ class ParameterErrors:
     radii : Spread
         Errors of the radii of visible cylinders [m]; no parameters of the kinematics.
     coplanar : bool
-        Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
+        Whether joint centres keep their heights z in R_b and R_e: coplanar joints stay coplanar.
     """
 
     base_joints: Spread = Spread()
@@ -136,7 +136,7 @@ ERRORS_OF = {  # kind of parameter, as in its name
 }
 
 
-KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are sizes
+KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields of type Spread
 
 
 def kinds_of(machine: Machine) -> set[str]:
@@ -146,7 +146,7 @@ def kinds_of(machine: Machine) -> set[str]:
     return kinds | ({"radii"} if any(leg.cylinders for leg in machine.legs) else set())
 
 
-_MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
+_MILLIMETRES = Spread(2e-3)  # size of the disturbances in the paper
 _TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))
 DEFAULT_ERRORS = ParameterErrors(
     base_joints=_MILLIMETRES,
@@ -168,57 +168,57 @@ class SimulationSettings:
     level : Level
         ``axes`` with the noise of Table 1, ``outlines`` with noise in pixels, or ``photographs``.
     errors : ParameterErrors
-        How the true machine differs from the nominal model.
+        Errors of the true machine relative to the nominal model.
     poses : int or path
-        Number of poses for each view, or a CSV of readings that all views see.
+        Number of poses for each view, or a CSV of readings for all views.
     sampling : Sampling
-        How poses are drawn: ``extreme`` or ``workspace``.
+        Drawing of poses: ``extreme`` or ``workspace``.
     shared_poses : bool
-        Every view sees the same poses (several cameras at once) instead of its own.
+        All views see the same poses (several cameras at once) instead of separate ones.
     images : int
         Images of each pose in each view.
     views : int or sequence of Viewpoint
-        Number of cameras around the machine, or where they stand.
+        Number of cameras around the machine, or their poses.
     camera : path or None
-        Camera file of all views whose number is given; None for a camera of 1024 x 768 pixels with
+        Camera file of all views if these are a number; None for a camera of 1024 x 768 pixels with
         slight distortion.
     hints : bool
-        Say roughly where the cameras stand, and which legs each view shows well.
+        State rough camera poses in the dataset, and the legs that each view shows well.
     tell_gamma : bool
-        Say how the cameras encode light.
+        State the gamma of the cameras in the dataset.
     sigma_px : float
         Standard deviation of each edge point of outlines, and of each corner of a board [px].
     table : TableNoise
         Noise of axes.
     readings : Spread
-        Errors of encoder readings [m]; of motors that turn as far as they move A.
+        Errors of encoder readings [m]; for motors that turn, displacements of A.
     appearance : Appearance
-        How photographs look.
+        Appearance of photographs.
     board : Board, str, path or None
         A calibration board on the base: ``chessboard``, ``charuco`` or ``aprilgrid`` of a size that
         fits the machine, a YAML file with the block ``board`` of a dataset, or a Board.
     board_pose : bool
-        Say in the dataset where the boards are in their links.
+        State the poses of boards in their links in the dataset.
     hand_held : bool
-        Every image is taken from a place of its own, with the board in it.
+        Hand-held camera: a new pose for every image, with the board in view.
     seed : int
         Seed of all random numbers.
     platform_board : Board, str, path or None
         As ``board``, on the platform.
     plan : path or None
-        A session that ``legcal plan`` wrote, which says poses, cameras and views.
+        A session from ``legcal plan`` with poses, cameras and views.
     lengths : dict
-        Distances of two joints that are measured by hand, by ``LEG.SIDE:LEG.SIDE``, with their
-        standard deviations [m].
+        Standard deviations [m] of distances of two joints measured by hand, by
+        ``LEG.SIDE:LEG.SIDE``.
     angles : Spread or None
         Errors of readings of motors that turn [rad], in place of ``readings``.
     occlusion : bool
-        Parts of the machine hide its legs from a camera; in photographs they always do.
+        Whether parts of the machine hide its legs from a camera; in photographs they always do.
 
     Raises
     ------
     UsageError
-        If a value is of another kind, out of its limits, or contradicts another.
+        If a value has a wrong type, is out of its limits, or contradicts another.
     """
 
     level: Level | str = Level.PHOTOGRAPHS
@@ -246,8 +246,8 @@ class SimulationSettings:
     occlusion: bool = True
 
     def __post_init__(self) -> None:
-        for found in (self._of_other_kinds, self._out_of_limits, self._contradictions):
-            problems = [f"The dataset could not be simulated: {each}" for each in found()]
+        for check in (self._of_other_kinds, self._out_of_limits, self._contradictions):
+            problems = [f"The dataset could not be simulated: {problem}" for problem in check()]
             if problems:
                 raise UsageError(problems)
         n_poses = 1 if isinstance(self.poses, str | Path) else self.poses
@@ -260,10 +260,10 @@ class SimulationSettings:
 
     def check_images(self, n_views: int, n_poses: int) -> None:
         """Refuse more images than a dataset may have."""
-        found = n_views * n_poses * self.images
-        if found > MAX_IMAGES:
+        n_images = n_views * n_poses * self.images
+        if n_images > MAX_IMAGES:
             raise UsageError(
-                f"The dataset could not be simulated: found {found} images ({n_views} views of "
+                f"The dataset could not be simulated: found {n_images} images ({n_views} views of "
                 f"{n_poses} poses, {self.images} of each), needed at most {MAX_IMAGES}; give "
                 "fewer views, poses or images."
             )
@@ -280,7 +280,7 @@ class SimulationSettings:
         return replace(self.readings, size=leg.reading_of(self.readings.size))
 
     def _of_other_kinds(self) -> Iterator[str]:
-        """Yield what is found of another kind than needed."""
+        """Yield values of a wrong type, in words."""
         path, of_board = str | Path | None, Board | str | Path | None
         needed = {
             "errors": (self.errors, ParameterErrors, "ParameterErrors"),
@@ -304,9 +304,9 @@ class SimulationSettings:
             needed |= {f"table.{k}": (x, Real, "number") for k, x in vars(self.table).items()}
         if isinstance(self.views, list | tuple):
             needed |= {f"view {k}": (x, Viewpoint, "Viewpoint") for k, x in enumerate(self.views)}
-        for name, (value, kind, what) in needed.items():
+        for name, (value, kind, kind_name) in needed.items():
             if isinstance(value, bool) or not isinstance(value, kind):
-                yield f"found {value!r} as {name}, needed a {what}; correct it."
+                yield f"found {value!r} as {name}, needed a {kind_name}; correct it."
         for name, choices in (("level", Level), ("sampling", Sampling)):
             if getattr(self, name) not in list(choices):
                 yield (
@@ -315,7 +315,7 @@ class SimulationSettings:
                 )
 
     def _out_of_limits(self) -> Iterator[str]:
-        """Yield which numbers are out of their limits."""
+        """Yield numbers that are out of their limits, in words."""
         limits: dict[str, tuple[float, float, float, str]] = {
             "poses": (1 if isinstance(self.poses, str | Path) else self.poses, 1, MAX_IMAGES, ""),
             "views": (self.n_views, 1, MAX_IMAGES, ""),
@@ -341,7 +341,7 @@ class SimulationSettings:
                 yield f"found {value:g} as {name}, needed {needed}; correct it."
 
     def _contradictions(self) -> Iterator[str]:
-        """Yield which choices contradict others."""
+        """Yield contradictions between choices, in words."""
         if self.hand_held and self.board is None:
             yield "found a camera in the hand without a board on the base; choose a board."
         if self.board_pose and self.board is None and self.platform_board is None:
@@ -366,15 +366,17 @@ class SimulationSettings:
 
 
 def joint_distance(machine: Machine, name: str) -> float | None:
-    """Return the distance [m] of LEG.SIDE:LEG.SIDE, at reading 0 on the base; None of others."""
+    """Return the distance [m] of LEG.SIDE:LEG.SIDE, at reading 0 on the base; None for others."""
     joints = joints_of_length(name)
     if joints is None or any(leg not in machine.leg_names for leg, _ in joints):
         return None
-    (one, side), (other, there) = ((machine.leg_names.index(leg), side) for leg, side in joints)
-    if {side, there} == {"base", "platform"} and one == other:
-        leg = machine.legs[one]
+    (first_leg, side), (second_leg, second_side) = (
+        (machine.leg_names.index(leg), side) for leg, side in joints
+    )
+    if {side, second_side} == {"base", "platform"} and first_leg == second_leg:
+        leg = machine.legs[first_leg]
         return leg.q0 if leg.kind is LegKind.CONSTANT else None
-    if side != there or one == other or side not in ("base", "platform"):
+    if side != second_side or first_leg == second_leg or side not in ("base", "platform"):
         return None
     points = machine.A_base if side == "base" else machine.B_platform
-    return float(np.linalg.norm(points[one] - points[other]))
+    return float(np.linalg.norm(points[first_leg] - points[second_leg]))

@@ -1,4 +1,4 @@
-"""A machine as solids: visuals of its URDF and what they lack, in any pose, as rays meet it."""
+"""A machine as solids for ray casting: visuals of its URDF and parts added to them, in any pose."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size
 
 _BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
 _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
-_DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
+_DEFAULT_RADIUS = 0.02  # radius of a leg without a cylinder, in distances between its joints
 _GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
-_GRAZING = 1e-5  # sine of the angle of a ray to a face by which that hides nothing
-_FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
+_GRAZING = 1e-5  # sine of the angle of a ray to a face up to which the face hides nothing
+_FLAT = 0.2  # maximum cosine between legs and the normal of plates that are parallel to the legs
 
 _SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
-_SUBDIVISIONS = 2  # of an icosahedron that stands for a sphere
-_FLAT_JOINTS = 1e-3  # thickness of joint centres that lie in a plane, of their size
+_SUBDIVISIONS = 2  # of an icosahedron in place of a sphere
+_FLAT_JOINTS = 1e-3  # maximum thickness of coplanar joint centres, in units of their extent
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ Shape = SolidCylinder | Sphere | Box | Mesh
 
 
 def _check(urdf_path: Path, element: etree._Element) -> None:
-    """Check a shape; ValueError says what was found and needed."""
+    """Check a shape; ValueError has the actual and the needed content."""
     tag = str(element.tag)
     if tag == "mesh":
         _check_mesh(urdf_path, element)
@@ -106,7 +106,7 @@ def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
 def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
     """Return the shape of a visual and T_link_shape; the vertices of a mesh are in the link.
 
-    ValueError says what was found and needed where its file holds none.
+    ValueError has the actual and the needed content where the file of a mesh holds none.
     """
     shape = visual.find("geometry")[0]  # type: ignore[index]
     if shape.tag == "mesh":
@@ -132,7 +132,7 @@ def _rgb(material: etree._Element) -> tuple[float, float, float] | None:
 
 
 class Sheet(Protocol):
-    """What is printed on a face of a box."""
+    """A print on a face of a box."""
 
     @property
     def face(self) -> int:
@@ -144,20 +144,20 @@ class Sheet(Protocol):
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface returns light; everything in linear light, not in grey levels."""
+    """The reflectance of a surface; everything in linear light, not in grey levels."""
 
     albedo: float = 0.5  # share of light that is scattered evenly, 0 to 1
     # strength of the highlight; 0 for a dull surface, about 1 for polished steel
     specular: float = 0.1
     shininess: float = 20.0  # exponent of the highlight: the larger, the narrower
-    # how much darker the surface is where it is seen edge-on, 0 to 1: the scattered light is times
+    # darkening of the surface seen edge-on, 0 to 1: the factor of scattered light is
     # 1 - limb (1 - cos), with the angle between the normal and the line of sight. On a cylinder the
     # cosine grows like the square root of the depth inside the outline
     limb: float = 0.3
     texture: float = 0.0  # standard deviation of a mottled pattern on it, as a part of the albedo
     # factors of red, green, blue; used in pictures in colour only
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    sheet: Sheet | None = None  # what is printed on one of its faces, if it is a box
+    sheet: Sheet | None = None  # print on one of its faces, if it is a box
 
 
 TUBE = Material(albedo=0.70, specular=0.25, shininess=40.0, limb=0.35)
@@ -170,11 +170,11 @@ class Solid:
     """A solid that moves with a link."""
 
     name: str
-    link: str | None  # of the URDF; None for what stands in the base frame and is no part of it
+    link: str | None  # of the URDF; None for objects in the base frame that are not in the URDF
     shape: Shape
     T_link_solid: RigidTransform  # its pose in the link, or in the base frame
     material: Material = PART
-    leg: int | None = None  # whose axis it is coaxial with
+    leg: int | None = None  # index of the leg it is coaxial with
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class PlacedSolid:
 
 
 def solids_of(machine: Machine) -> tuple[Solid, ...]:
-    """Return the visuals of a mechanism, those that are coaxial with legs marked as such."""
+    """Return the visuals of a mechanism, with the legs that they are coaxial with."""
     urdf = machine.urdf
     robot = parse_robot(urdf.path, urdf.content)
     colours = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
@@ -233,12 +233,14 @@ def link_poses(machine: Machine, configuration: Array) -> dict[str, RigidTransfo
 
 
 def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tuple[PlacedSolid, ...]:
-    """Return solids where the poses of their links, T_base_link, put them."""
+    """Return solids placed by the poses of their links, T_base_link."""
     if not solids:
         return ()
-    at = [np.eye(4) if s.link is None else poses[s.link].as_matrix() for s in solids]
-    found = matrix_product(np.array(at), np.array([s.T_link_solid.as_matrix() for s in solids]))
-    return tuple(map(PlacedSolid, solids, motions_of(found[:, :3, :3], found[:, :3, 3])))
+    link_poses = [np.eye(4) if s.link is None else poses[s.link].as_matrix() for s in solids]
+    matrices = matrix_product(
+        np.array(link_poses), np.array([s.T_link_solid.as_matrix() for s in solids])
+    )
+    return tuple(map(PlacedSolid, solids, motions_of(matrices[:, :3, :3], matrices[:, :3, 3])))
 
 
 def _leg_along(
@@ -261,7 +263,7 @@ def _leg_along(
 
 
 def _material(shape: Shape, colour: tuple[float, float, float] | None, leg: Leg | None) -> Material:
-    """Return the surface of a visual: its colour if it has one, else what it most likely is."""
+    """Return the surface of a visual: its colour if it has one, else the most likely material."""
     material = PART
     if leg is not None and isinstance(shape, SolidCylinder):
         thickest = max(c.radius for c in leg.cylinders)
@@ -279,13 +281,12 @@ _PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=
 
 
 def dressed(machine: Machine) -> tuple[Solid, ...]:
-    """Return all that pictures show of a mechanism: its visuals, and what they lack.
+    """Return all solids of a mechanism in pictures: its visuals, and parts added to these.
 
-    A link that has no visual of its own gets balls at the joint centres and, for three joints or
-    more, a round plate that carries them on posts, on the side away from the legs; what a motor
-    moves has balls only, and a base with nothing but such motors nothing. Both plates of a
-    planar machine are below its legs, that of the base lowest, so that the legs are seen from
-    above.
+    A link without a visual gets balls at the joint centres and, for three joints or more, a round
+    plate that carries them on posts, on the side away from the legs. A link moved by a motor gets
+    balls only, and a base with nothing but such motors nothing. Both plates of a planar machine are
+    below its legs, the plate of the base lowest, so that the legs are visible from above.
     """
     shown = solids_of(machine)
     bare = {machine.base, machine.platform} - {s.link for s in shown if s.leg is None}
@@ -311,7 +312,7 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
 
 
 def _on_actuator(machine: Machine, actuator: Actuator, radii: Array) -> list[Solid]:
-    """Return the balls at the joints of what a motor moves, in its link."""
+    """Return the balls at the joints of the link that a motor moves, in that link."""
     on_it = [j for j, leg in enumerate(machine.legs) if leg.actuator is actuator]
     T_base_link = link_poses(machine, machine.home_configuration)[actuator.link]
     A = machine.home.apply(machine.B_platform) - vectors_A_to_B(machine, machine.home)
@@ -334,8 +335,10 @@ def _end(
     solids = []
     for j, (joint, R, ball) in enumerate(zip(joints, radii, balls, strict=True)):
         if ball:
-            at = RigidTransform.from_translation(joint)
-            solids.append(Solid(f"{link}_ball{j + 1}", link, Sphere(_BALL_SIZE * R), at, _BALL))
+            position = RigidTransform.from_translation(joint)
+            solids.append(
+                Solid(f"{link}_ball{j + 1}", link, Sphere(_BALL_SIZE * R), position, _BALL)
+            )
     if away is None:
         return solids
     turn = Rotation.align_vectors([away], [[0.0, 0.0, 1.0]])[0]
@@ -351,8 +354,8 @@ def _end(
     across = across - (across @ away)[:, None] * away
     thickness = _PLATE_THICKNESS * thickest
     size = float(np.linalg.norm(across, axis=1).max()) + _PLATE_RIM * thickest
-    at = middle + (outside + 0.5 * thickness - float(middle @ away)) * away
-    pose = RigidTransform.from_components(at, turn)
+    position = middle + (outside + 0.5 * thickness - float(middle @ away)) * away
+    pose = RigidTransform.from_components(position, turn)
     solids.append(Solid(f"{link}_plate", link, SolidCylinder(size, thickness), pose, _PLATE))
     return solids
 
@@ -368,13 +371,13 @@ def _away(joints_base: Array, machine: Machine, side: float) -> Array | None:
     normal = axes[2]
     legs = vectors_A_to_B(machine, machine.home).mean(axis=0)
     cosine = float(normal @ legs) / max(float(np.linalg.norm(legs)), 1e-12)
-    if abs(cosine) < _FLAT:  # the legs lie along the plates: one on each side
+    if abs(cosine) < _FLAT:  # the legs are parallel to the plates: one plate on each side
         cosine = float(normal[np.argmax(np.abs(normal))])
     return np.asarray(side * np.sign(cosine) * normal)
 
 
 def _radius(leg: Leg, machine: Machine) -> float:
-    """Return the radius of the thickest cylinder of a leg, or one that suits it [m]."""
+    """Return the radius of the thickest cylinder of a leg, or a default [m]."""
     if leg.cylinders:
         return max(c.radius for c in leg.cylinders)
     length = leg.q0
@@ -389,15 +392,15 @@ class PosedMachine:
 
     A: Array  # A, B: (n_legs, 3) joint centres in the base link [m]
     B: Array
-    solids: tuple[PlacedSolid, ...]  # what is seen of it, in the base link
+    solids: tuple[PlacedSolid, ...]  # visible solids, in the base link
     vertices: Array  # vertices, faces: (n, 3) the same as triangles, in the base link [m]
     faces: IntArray
     boards: tuple[Any, ...] = ()  # the ``PlacedBoard`` of each calibration board among the solids
-    # Ends (2, 3) of the arms that are cylinders, by the legs that have them as parts [m]
+    # Ends (2, 3) of the cylindrical arms, by the legs that have them as parts [m]
     arms: Mapping[int, Array] = field(default_factory=dict)
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
-        """Return which points something stands before, seen from a centre."""
+        """Return a mask of the points that are hidden from a centre by a solid."""
         if not len(self.faces):
             return np.zeros(len(points), dtype=np.bool_)
         ray = points - centre
@@ -416,7 +419,7 @@ class PosedMachine:
         return hidden
 
     def encloses(self, centre: Array) -> bool:
-        """Say whether a point (3,) is in a solid, or between the joints of the machine."""
+        """Return whether a point (3,) is in a solid, or between the joints of the machine."""
         if any(
             _is_in(shape.solid.shape, shape.T_base_solid.inv().apply(centre))
             for shape in self.solids
@@ -443,29 +446,31 @@ def pose_machine(
     stacked = np.concatenate([np.zeros((0, 3), dtype=np.intp), *faces])
     posed_machines = []
     for configuration, T in zip(poses.configurations, poses.poses, strict=True):
-        here = placed(solids, link_poses(machine, configuration))
-        vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
+        placed_solids = placed(solids, link_poses(machine, configuration))
+        vertices = [
+            p.T_base_solid.apply(m.vertices) for p, m in zip(placed_solids, meshes, strict=True)
+        ]
         B = np.asarray(T.apply(machine.B_platform))
         q = joint_values(machine, configuration)
         arms = arms_at(machine.legs, q[None, first_rods(machine.legs)])
         of_legs = {j: ends[0] for j, ends in arms.items()}
         A, triangle = machine.A_at(q), np.concatenate([np.zeros((0, 3)), *vertices])
-        posed_machines.append(PosedMachine(A, B, here, triangle, stacked, arms=of_legs))
+        posed_machines.append(PosedMachine(A, B, placed_solids, triangle, stacked, arms=of_legs))
     return tuple(posed_machines)
 
 
-@lru_cache(maxsize=8)  # many cameras may look at one machine, and thousands wait for theirs
+@lru_cache(maxsize=8)  # several cameras see one machine, and there may be thousands of machines
 def _caster(posed: PosedMachine) -> Any:
-    """Return what casts rays at a machine."""
+    """Return the ray caster of a machine."""
     import trimesh  # 30 MB and half a second: only where there are solids
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
 
 
-@lru_cache(maxsize=256)  # links share shapes, and each camera looks at all
+@lru_cache(maxsize=256)  # links share shapes, and each camera sees all of them
 def triangles(shape: Shape) -> Any:
-    """Return a shape as triangles, which nobody may change."""
+    """Return a shape as triangles, shared: not to be modified."""
     import trimesh
 
     if isinstance(shape, SolidCylinder):
@@ -478,7 +483,7 @@ def triangles(shape: Shape) -> Any:
 
 
 def _is_in(shape: Shape, point: Array) -> bool:
-    """Say whether a point (3,) in the frame of a shape is inside it."""
+    """Return whether a point (3,) in the frame of a shape is inside it."""
     if isinstance(shape, SolidCylinder):
         beside = np.hypot(point[0], point[1]) < shape.radius
         return bool(beside and abs(point[2]) < 0.5 * shape.length)

@@ -1,8 +1,8 @@
-"""The Monte Carlo runner: the same results however it is run, continued where it was stopped.
+"""The Monte Carlo runner: reproducible for any number of workers, resumable after a stop.
 
 Run i has child i of the study's seed, whatever the number of runs and of processes. ``runs.jsonl``
-has the study with its settings and its seed in the first line and one run in every other, written
-as runs end; a line that was being written when the process was killed is done again.
+has the study with its settings and its seed in the first line and one run in every further line,
+written as runs end; a run with an incomplete line, after a kill, is done again.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from legcal.workers import Workers, is_number, worker_pool
 
 CHECKPOINT_NAME = "runs.jsonl"
 DOCUMENT_NAME = "study.json"
-_STUDY = OutputKind("result of the study", "", "")  # beside the checkpoint and other files
+_STUDY = OutputKind("result of the study", "", "")  # in a folder with checkpoint and other files
 _KEY, _VERSION = "legcal_study", 1
 _MOST_RUNS = 1_000_000
-_LARGEST_CHUNK = 10  # runs between two writes to the checkpoint
-_PROCESSES = 4  # for each core; more only wait for each other
-_MANY = 64  # workers that a cluster may have
-_CHUNKS = 16  # for each process: the work is shared evenly to the end
+_LARGEST_CHUNK = 10  # maximum number of runs between two writes to the checkpoint
+_PROCESSES = 4  # maximum number of processes for each core; more only wait for each other
+_MANY = 64  # assumed number of workers of a cluster
+_CHUNKS = 16  # chunks for each process, so that the work is shared evenly to the end
 
 Record = dict[str, Any]
-"""What one run found, as a JSON document: numbers, texts, lists, null; never NaN."""
+"""The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
 
 
 class Summary(Protocol):
-    """What all runs of a study found together."""
+    """The combined result of all runs of a study."""
 
     def document(self) -> dict[str, Any]:
         """Return it as a JSON document."""
@@ -75,7 +75,7 @@ class Study(Protocol):
 
 
 class StudyHeading(SparseDocument):
-    """What the document of every study has beside what was found."""
+    """The part of a study's document that is common to all studies."""
 
     study: str
     settings: dict[str, Any]
@@ -93,8 +93,8 @@ class StudyResult:
     settings: dict[str, Any]  # its settings
     seed: int  # seed, n_runs: seed and number of runs
     n_runs: int
-    failures: dict[str, int]  # how many runs failed as a whole, by kind of error
-    summary: Summary  # what the others found
+    failures: dict[str, int]  # number of failed runs by kind of error
+    summary: Summary  # result of the other runs
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
@@ -118,7 +118,7 @@ def run_study(
     progress: Progress = False,
     beside: Callable[[StudyResult, Path], None] | None = None,
 ) -> StudyResult:
-    """Run a study, or what is missing of it.
+    """Run a study, or the missing runs of a checkpoint.
 
     Parameters
     ----------
@@ -129,16 +129,16 @@ def run_study(
     seed : int
         Seed of the study.
     workers : int, str or executor
-        Number of processes, of which no more than a few for each core are started, or a cluster, as
-        :func:`legcal.calibrate` takes them.
+        Number of processes, limited to a few for each core, or a cluster, as for
+        :func:`legcal.calibrate`.
     output : Path, optional
-        Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
-        the same study is continued; more runs than before are added to those that are there.
+        Folder for the checkpoint, the document and the figures. A checkpoint of the same study
+        there is continued; further runs are added to the existing ones.
     progress : bool or callable
         True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
     beside : callable, optional
-        Called as ``beside(result, folder)`` with the figures in the folder: what it writes there
-        appears in the output with them.
+        Called as ``beside(result, folder)`` with the figures in the folder; files that it writes
+        there appear in the output with them.
 
     Returns
     -------
@@ -147,7 +147,7 @@ def run_study(
     Raises
     ------
     UsageError
-        If a number makes no sense, or the folder holds something else than this study.
+        If a number is out of range, or the folder has other content than this study.
     DidNotConverge
         If every run failed.
     OutOfResources
@@ -176,7 +176,7 @@ def run_study(
 
 
 def _result(study: Study, seed: int, lines: Sequence[Record]) -> StudyResult:
-    """Return what runs found."""
+    """Combine the lines of runs."""
     failures = [line["failure"] for line in lines if "failure" in line]
     if len(failures) == len(lines):
         raise DidNotConverge(
@@ -201,7 +201,7 @@ def _write(
 
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
-    """Refuse numbers that make no sense."""
+    """Refuse numbers out of range."""
     if n_runs > _MOST_RUNS:
         raise UsageError(
             f"The study could not be run: found runs = {n_runs}, needed {_MOST_RUNS} at most; give "
@@ -220,7 +220,7 @@ def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
 
 
 class _Checkpoint:
-    """The lines of the runs that are done, kept in the file of an output folder if there is one."""
+    """The lines of completed runs, kept in the file of an output folder if there is one."""
 
     def __init__(self, output: Path | None, first: Record) -> None:
         self.lines: dict[int, Record] = {}
@@ -240,31 +240,31 @@ class _Checkpoint:
         self.lines |= {line["run"]: line for line in lines}
 
     def _read(self, path: Path, first: Record) -> None:
-        """Read the lines that are there, and drop half of a line at the end; or begin the file."""
+        """Read existing lines, and drop an incomplete line at the end; or begin the file."""
         content = path.read_bytes() if path.exists() else b""
         heading, end, body = content.partition(b"\n")
         if not end and _encoded(first).startswith(heading):  # new, or killed while it was begun
             path.write_bytes(_encoded(first))
             return
         _check_header(path, heading, first)
-        *runs, rest = body.split(b"\n")
-        if runs and not rest and not _parsed(runs[-1]):  # zeros, after a power cut
-            rest = runs.pop()
+        *runs, unfinished = body.split(b"\n")
+        if runs and not unfinished and not _parsed(runs[-1]):  # zeros, after a power cut
+            unfinished = runs.pop()
         for number, line in enumerate(runs, 2):
-            found = _parsed(line)
-            if not _is_run(found):
+            run = _parsed(line)
+            if not _is_run(run):
                 raise UsageError(
                     f"{path}: the study could not be continued: found line {number} damaged, "
                     "needed a complete JSON object of a run on every line; remove that line, or "
                     "give another output folder."
                 )
-            self.lines.setdefault(found["run"], found)
-        if rest:
+            self.lines.setdefault(run["run"], run)
+        if unfinished:
             path.write_bytes(b"".join(line + b"\n" for line in (heading, *runs)))
 
 
 def _prepare_folder(output: Path) -> None:
-    """Make the output folder; refuse one that holds something else than a study."""
+    """Make the output folder; refuse a folder with other content than a study."""
     check_path(output, _STUDY)
     checkpoint = output / CHECKPOINT_NAME
     is_begun = checkpoint.is_file() and (
@@ -282,7 +282,7 @@ def _prepare_folder(output: Path) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Say in one sentence what keeps a checkpoint from being read or written."""
+    """Refuse in one sentence a checkpoint that cannot be read or written."""
     try:
         yield
     except OSError as error:
@@ -300,34 +300,36 @@ def _header(study: Study, seed: int) -> Record:
 
 
 def _check_header(path: Path, line: bytes, expected: Record) -> None:
-    """Refuse a first line that is not the expected one."""
-    found = _parsed(line)
-    if found == expected:
+    """Refuse an unexpected first line."""
+    header = _parsed(line)
+    if header == expected:
         return
-    if _KEY not in found:
+    if _KEY not in header:
         raise UsageError(
             f"{path}: the study could not be continued: found a file that is no checkpoint of "
             "legcal, needed one or none; give another output folder."
         )
-    flat, needed = ({**first, **dict(first.get("settings") or {})} for first in (found, expected))
-    other = [name for name in needed if name != "settings" and flat.get(name) != needed[name]]
-    told = "; ".join(f"{name} {flat.get(name)!r} instead of {needed[name]!r}" for name in other)
+    flat, needed = ({**first, **dict(first.get("settings") or {})} for first in (header, expected))
+    different = [name for name in needed if name != "settings" and flat.get(name) != needed[name]]
+    differences = "; ".join(
+        f"{name} {flat.get(name)!r} instead of {needed[name]!r}" for name in different
+    )
     raise UsageError(
-        f"{path}: the study could not be continued: found the runs of another command ({told}), "
-        "needed those of the same; give another output folder, or this one the command that began "
-        "it."
+        f"{path}: the study could not be continued: found the runs of another command "
+        f"({differences}), needed those of the same; give another output folder, or this one the "
+        "command that began it."
     )
 
 
-def _is_run(found: Record) -> bool:
-    """Return whether a line has what a run found, or how it failed."""
-    run, failure = found.get("run"), found.get("failure")
+def _is_run(entry: Record) -> bool:
+    """Return whether a line has the record of a run, or its failure."""
+    run, failure = entry.get("run"), entry.get("failure")
     if type(run) is not int or not 0 <= run < _MOST_RUNS:
         return False
-    if found.keys() == {"run", "record"}:
-        return isinstance(found["record"], dict)
+    if entry.keys() == {"run", "record"}:
+        return isinstance(entry["record"], dict)
     return (
-        found.keys() == {"run", "failure"}
+        entry.keys() == {"run", "failure"}
         and isinstance(failure, dict)
         and failure.keys() == {"kind", "message"}
         and all(isinstance(text, str) for text in failure.values())
@@ -340,12 +342,12 @@ def _encoded(document: Record) -> bytes:
 
 
 def _parsed(line: bytes) -> Record:
-    """Return the object on a line, an empty one if there is none."""
+    """Return the object on a line, {} if there is none."""
     try:
-        found = json.loads(line)
+        value = json.loads(line)
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return value if isinstance(value, dict) else {}
 
 
 # Runs in processes
@@ -357,7 +359,7 @@ def child_seed(seed: int, run: int) -> np.random.SeedSequence:
 
 
 def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[Record]:
-    """Return the line of each run; one that legcal refuses is a failure, and no other error is."""
+    """Return the line of each run; a LegcalError is a failure, any other error is raised."""
     lines: list[Record] = []
     for run in runs:
         try:

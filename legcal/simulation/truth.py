@@ -1,7 +1,7 @@
-"""The true machine: the nominal model with drawn errors, written as a model of its own.
+"""The true machine: the nominal model with drawn errors, written as a separate model.
 
-With other rods, axes or twists the machine closes elsewhere than the nominal one: its home is the
-closed pose nearest to the nominal home.
+With other rods, axes or twists the machine closes elsewhere than the nominal machine: its home is
+the closed pose nearest to the nominal home.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from legcal.simulation.settings import (
 )
 from legcal.simulation.solids import SolidCylinder, solids_of
 
-# of the thinnest cylinder
+# Maximum size of errors of radii, in units of the thinnest cylinder
 _MAX_RADIUS_ERROR = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}
-_ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay so
+_ALIKE = 1e-9  # [m] maximum difference of radii of cylinders that form one tube
 MAX_DRAWS = 20
-MAX_HOME_SHIFT = 0.2  # of a leg length, from the nominal home to that of the true legs
+MAX_HOME_SHIFT = 0.2  # maximum distance between nominal and true home, in leg lengths
 
 
 def draw_errors(
@@ -55,39 +55,42 @@ def draw_errors(
 ) -> tuple[Leg, ...]:
     """Return the legs of a machine with drawn errors, in R_b and R_e.
 
-    Errors of all parameters are drawn in the same order, however large they are:
-    errors of one kind do not depend on those of another. B of a leg that is fixed to the platform
-    then slides along the leg to where models put it, the foot of the platform link's origin.
+    Errors of all parameters are drawn in the same order, whatever their size: errors of one kind
+    do not depend on errors of another kind. B of a leg that is fixed to the platform then slides
+    along the leg to its place in models, the foot of the platform link's origin.
     """
     _check(errors)
-    found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
-    uniform, normal = rng.uniform(-1.0, 1.0, len(found)), rng.normal(size=len(found))
-    step = np.zeros(len(found))
-    for i, name in enumerate(found.names):
+    parametrization, legs = parametrization_of(nominal, twists=True), geometries(nominal)
+    uniform, normal = (
+        rng.uniform(-1.0, 1.0, len(parametrization)),
+        rng.normal(size=len(parametrization)),
+    )
+    step = np.zeros(len(parametrization))
+    for i, name in enumerate(parametrization.names):
         spread = _spread(errors, name)
         unit = normal if spread.distribution == Distribution.NORMAL else uniform
         step[i] = spread.size * unit[i]
-    moved = moved_legs(legs, found.place, step)
-    scale = np.array([_spread(errors, name).size for name in found.names])
-    moved = on_ties(moved, legs, machine_ties(nominal), found.place, scale)
+    moved = moved_legs(legs, parametrization.place, step)
+    scale = np.array([_spread(errors, name).size for name in parametrization.names])
+    moved = on_ties(moved, legs, machine_ties(nominal), parametrization.place, scale)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
     return reframed(moved, nominal.frame_legs, origin)
 
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:
-    """Return how large the error of a parameter is, by its name."""
+    """Return the size of the error of a parameter, by its name."""
     parameter = ParameterId.parse(name)
     kind = parameter.kind
     if kind == "gain":  # of motors: readings are true
         return Spread()
     if errors.coplanar and parameter.is_joint_coordinate and parameter.component == "z":
         return Spread()
-    found: Spread = getattr(errors, ERRORS_OF[kind])
-    return found
+    spread: Spread = getattr(errors, ERRORS_OF[kind])
+    return spread
 
 
 def _check(errors: ParameterErrors) -> None:
-    """Refuse sizes that are no sizes."""
+    """Refuse sizes out of range."""
     problems = []
     for kind in KINDS:
         size = getattr(errors, kind).size
@@ -128,7 +131,7 @@ def draw_radii(
 
 
 def _check_radii(spread: Spread, thinnest: float) -> None:
-    """Refuse errors that may leave nothing of a leg."""
+    """Refuse errors as large as the thinnest radius."""
     most = _MAX_RADIUS_ERROR[Distribution(spread.distribution)] * thinnest
     if not spread.size <= most:
         raise UsageError(
@@ -167,11 +170,11 @@ def write_true_model(
         problems["a platform with other freedoms"] += 1
     for path in _places(nominal, folder):
         path.unlink(missing_ok=True)
-    found = ", ".join(f"{count} times {what}" for what, count in problems.most_common())
+    failures = ", ".join(f"{count} times {reason}" for reason, count in problems.most_common())
     raise ModelError(
-        f"{nominal.yaml_path}: no true machine could be made: found {found} in {MAX_DRAWS} draws "
-        "of errors, needed one draw that closes as the nominal model does; give smaller errors, or "
-        "none of the axes and lengths that close the loops."
+        f"{nominal.yaml_path}: no true machine could be made: found {failures} in {MAX_DRAWS} "
+        "draws of errors, needed one draw that closes as the nominal model does; give smaller "
+        "errors, or none of the axes and lengths that close the loops."
     )
 
 
@@ -197,11 +200,11 @@ def write_model_with(
 
 
 def _places(nominal: Machine, folder: Path) -> tuple[Path, Path]:
-    """Return where the files of the true model stand."""
+    """Return the paths of the files of the true model."""
     name = model_name(nominal)
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
 
 
 def _class_of(machine: Machine) -> tuple[object, ...]:
-    """Return what a machine is, whatever its numbers are."""
+    """Return the structure of a machine, independent of its dimensions."""
     return machine.spatial, machine.mobility, tuple(leg.type for leg in machine.legs)

@@ -1,4 +1,4 @@
-"""What cameras see of legs: silhouettes of cylinders, and stretches that nothing hides."""
+"""The visible parts of legs: silhouettes of cylinders, and unhidden stretches."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from legcal.simulation.solids import PosedMachine
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import least_length
 
-MIN_SHARE = 0.4  # of a leg's length that one stretch must show
+MIN_SHARE = 0.4  # minimum share of a leg's length in one stretch
 SAMPLES = 96  # points along a leg
-_BORDER_PX = 2.0  # of the image, where nothing counts as seen
-_RADIUS_TOLERANCE = 0.01  # relative difference of radii that shows no step
-_BESIDE = 0.01  # of the radius: how far beside its outline a leg is looked past
-_END_ON = 1.01  # radii from the axis within which a leg shows its end and no outline
-_IN_FRONT = 0.1  # radii before an outline from which on a hit hides it
+_BORDER_PX = 2.0  # width of the image border where nothing counts as seen
+_RADIUS_TOLERANCE = 0.01  # maximum relative difference of radii without a visible step
+_BESIDE = 0.01  # distance of tested points outside the outline, in radii
+_END_ON = 1.01  # distance of a camera from the axis, in radii, up to which a leg has no outline
+_IN_FRONT = 0.1  # minimum distance in front of an outline, in radii, of a hit that hides it
 
 
 def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
-    """Return the steps from an axis to the generating lines that its outlines show.
+    """Return the steps from an axis to the generating lines of its outlines.
 
-    A circle of radius R whose centre is at a distance d is touched at R^2 / d before its centre
-    and R sqrt(1 - R^2 / d^2) beside it, whatever point of the axis they are counted from.
+    The tangents to a circle of radius R with its centre at a distance d touch it R^2 / d in front
+    of the centre and R sqrt(1 - R^2 / d^2) beside it, whatever the point of the axis.
     """
     centre = A - u * np.sum(u * A, axis=-1, keepdims=True)
     d = np.linalg.norm(centre, axis=-1, keepdims=True)
@@ -75,12 +75,12 @@ class Stretch:
 
 @dataclass(frozen=True)
 class LegView:
-    """What an image shows of one leg."""
+    """The visible part of one leg in an image."""
 
     share: float  # the longest unbroken stretch, as part of the leg's length
     length_px: float  # its length in the image [px]
     stretches: tuple[Stretch, ...]  # the longest stretch of each cylinder, from base to platform
-    arm: Stretch | None = None  # that of the arm which the leg has as a part, along the arm
+    arm: Stretch | None = None  # stretch along the arm that the leg has as a part
 
     @property
     def is_seen(self) -> bool:
@@ -96,7 +96,7 @@ def legs_in_image(
     *,
     samples: int = SAMPLES,
 ) -> tuple[LegView, ...]:
-    """Return what an image shows of every leg."""
+    """Return the visible part of every leg in an image."""
     arms = {j: leg.arm for j, leg in enumerate(legs) if leg.arm is not None and j in posed.arms}
     A, B = (
         np.concatenate([ends, *(posed.arms[j][None, k] for j in arms)])
@@ -110,9 +110,9 @@ def legs_in_image(
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
     free[tested] = ~posed.hidden(T[:3, 3], matrix_applied(T, beside[tested]), margin[tested])
-    both = np.all(free, axis=-1)
+    are_both_free = np.all(free, axis=-1)
     views = [
-        _leg_view(j, *skin, both[i], pixels[i], float(length[i]))
+        _leg_view(j, *skin, are_both_free[i], pixels[i], float(length[i]))
         for i, (j, skin) in enumerate(zip([*range(len(legs)), *arms], skins, strict=True))
     ]
     of_arms = {j: view for j, view in zip(arms, views[len(legs) :], strict=True) if view.is_seen}
@@ -130,9 +130,9 @@ def longest_in_images(
     *,
     samples: int = SAMPLES,
 ) -> Array:
-    """Return what no length of :func:`legs_in_image` exceeds at many places, (n, n_legs) [px].
+    """Return upper bounds of the lengths of :func:`legs_in_image` at n places, (n, n_legs) [px].
 
-    They are those from the first to the last sample in the image, as if nothing hid any.
+    They are the lengths from the first to the last sample in the image, as if nothing hid any.
     """
     _, skins = _skins(posed.A, posed.B, [leg.cylinders for leg in legs], samples)
     *_, pixels, tested = _sampled(posed.A, posed.B, skins, camera, T_base_camera)
@@ -152,7 +152,8 @@ def _skins(
     """Return the lengths of legs and arms (n,) [m], and the skin of each."""
     length = np.linalg.norm(B - A, axis=-1)
     return length, [
-        _skin(own, L, samples) for own, L in zip(cylinders, length.tolist(), strict=True)
+        _skin(leg_cylinders, L, samples)
+        for leg_cylinders, L in zip(cylinders, length.tolist(), strict=True)
     ]
 
 
@@ -189,7 +190,7 @@ def _leg_view(
     pixels: Array,  # (n, 2, 2) of both outlines
     length: float,
 ) -> LegView:
-    """Return what is seen of a leg whose samples are free or not."""
+    """Return the visible part of a leg from the mask of its free samples."""
     middle, width = pixels.mean(axis=1), np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)
     first, last = _longest(free)
     if last <= first:
@@ -197,7 +198,7 @@ def _leg_view(
     share = round(float(s[last] - s[first]) / length, 9)  # 38 of 95 steps are MIN_SHARE, no less
     stretches = []
     for name in dict.fromkeys(names):
-        chosen = free & np.array([other == name for other in names])
+        chosen = free & np.array([sample_name == name for sample_name in names])
         start, end = _longest(chosen)
         least = least_length(width[[start, end]].mean())
         if name and end > start and np.linalg.norm(middle[end] - middle[start]) >= least:
@@ -223,8 +224,8 @@ def _skin(
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Return samples along a leg, the outer radius there (0 for a gap), and cylinders' names.
 
-    Touching cylinders of one radius look like one; the longest of them names it, and of equally
-    long ones the last in the alphabet.
+    Touching cylinders of one radius look like one cylinder, with the name of the longest of them,
+    or of the last in the alphabet if they are equally long.
     """
     spans = [cylinder.span(length) for cylinder in cylinders]
     low = min((start for start, _ in spans), default=0.0)
@@ -243,7 +244,7 @@ def _skin(
 def _name_of(
     cylinders: Sequence[Cylinder], covered: Array, radius: Array, chosen: BoolArray
 ) -> str:
-    """Return the link that names a stretch of one radius; none for a gap or a minor cylinder."""
+    """Return the link that names a stretch of one radius; "" for a gap or a minor cylinder."""
     R = float(radius[chosen].max())
     alike = [
         (c.end - c.start, c.link)
@@ -257,7 +258,7 @@ def _name_of(
 
 
 def pixels_in_image(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
-    """Return the pixels of points (..., 3) in the camera frame, and which are in the image."""
+    """Return the pixels of points (..., 3) in the camera frame, and whether the image has them."""
     depth = points[..., 2]
     before = depth > 1e-6
     xy = points[..., :2] / np.where(before, depth, 1.0)[..., None]
@@ -283,12 +284,12 @@ def field_of_view(camera: Camera) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A simulated camera and where it stands."""
+    """A simulated camera and its pose."""
 
     name: str
     camera: Camera  # its intrinsics
     T_base_camera: RigidTransform  # its true pose in the base link
-    legs: tuple[str, ...] | None = None  # measured in its images; None for all that they show
+    legs: tuple[str, ...] | None = None  # measured in its images; None for all visible legs
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,21 +300,21 @@ class Images:
     view: IntArray
     pose: IntArray
     repeat: IntArray
-    # what the images show. Images of one pose in one view show the same
+    # visible legs by row; equal for all images of one pose in one view
     shown: tuple[tuple[LegView, ...], ...]
 
     def __len__(self) -> int:
         return len(self.view)
 
     def seen(self, row: int) -> list[int]:
-        """Return the legs that an image shows well enough to be measured."""
+        """Return the legs that are measurable in an image."""
         return [j for j, leg in enumerate(self.shown[row]) if leg.is_seen]
 
     def seen_in_view(self, view: int, least: float = 0.0) -> list[int]:
-        """Return the legs that more than a part of the images of a view show."""
+        """Return the legs that more than a fraction *least* of the images of a view show."""
         rows = np.flatnonzero(self.view == view)
-        seen = np.array([[leg.is_seen for leg in self.shown[row]] for row in rows])
-        return [int(j) for j in np.flatnonzero(seen.mean(axis=0) > least)]
+        is_seen = np.array([[leg.is_seen for leg in self.shown[row]] for row in rows])
+        return [int(j) for j in np.flatnonzero(is_seen.mean(axis=0) > least)]
 
     def chosen(self, rows: Sequence[int]) -> Images:
         """Return some of the images."""
@@ -330,7 +331,7 @@ def take_images(
     n_images: int,  # of each pose in each view
     progress: Report = no_progress,
     *,
-    each: bool = True,  # whether each view must show a leg, or one of them
+    all_views: bool = True,  # whether each view must show a leg, or only one of them
 ) -> Images:
     """Return the images that cameras take of a machine in its poses."""
     rows: list[tuple[int, int, int]] = []
@@ -349,7 +350,7 @@ def take_images(
             rows += [(v, p, k) for k in range(n_images)]
             shown += [view] * n_images
     progress("Views", len(viewpoints), len(viewpoints))
-    if problems and (each or len(problems) == len(viewpoints)):
+    if problems and (all_views or len(problems) == len(viewpoints)):
         raise NotVisible(problems)
     view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
     return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
@@ -358,7 +359,7 @@ def take_images(
 def _only(
     names: Sequence[str], legs: Sequence[Leg], shown: Sequence[LegView]
 ) -> tuple[LegView, ...]:
-    """Return what an image shows of the named legs."""
+    """Return the visible parts of the named legs; the others are not visible."""
     nothing = LegView(0.0, 0.0, ())
     return tuple(
         view if leg.name in names else nothing for leg, view in zip(legs, shown, strict=True)
@@ -378,7 +379,7 @@ def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine])
 
 
 def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegView]]) -> str:
-    """Return that a view shows no leg, and what it shows."""
+    """Return the problem of a view without a leg, with the visible parts in words."""
     start = f"view {name}: its images could not be simulated: found"
     if not any(leg.cylinders for leg in legs):
         return (

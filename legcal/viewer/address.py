@@ -1,4 +1,4 @@
-"""Where the browser finds the viewer: a host and a port that are free."""
+"""The address of the viewer: a free host and port."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from legcal.errors import UsageError
 
 @dataclass(frozen=True)
 class Address:
-    """A host and a port; port 0 stands for any that is free."""
+    """A host and a port; port 0 means any free port."""
 
     host: str
     port: int
@@ -22,7 +22,7 @@ class Address:
 
 
 def check_address(address: Address) -> None:
-    """Refuse a host or a port at which nothing can be served.
+    """Refuse a host or a port that cannot be served.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def check_address(address: Address) -> None:
 
 
 def _why_not(address: Address, error: OSError) -> str:
-    """Return why nothing can be served there."""
+    """Return the error of an address that cannot be served."""
     start = f"The viewer could not be served at {address}: found"
     if error.errno == errno.EADDRINUSE:
         return (

@@ -1,7 +1,7 @@
-"""The page of a detection served to the browser of this machine, for clicks on joints.
+"""The page of a detection, served to a local browser for clicks on joints.
 
-Clicks that are posted place the cameras of their views, and the legs are drawn there. They become
-``landmarks.csv`` of the dataset only where the page is told to save them.
+Posted clicks determine the cameras of their views, and the legs are drawn accordingly. They are
+written to ``landmarks.csv`` of the dataset only on request.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from legcal.errors import DatasetError
 from legcal.files.folder import write_atomically
 from legcal.viewer.address import Address
 
-HOST = "127.0.0.1"  # of this machine alone: whoever reaches the page may write the table
+HOST = "127.0.0.1"  # local only: anybody who reaches the page may write the table
 TOKEN_HEADER = "X-Legcal-Token"
-MAX_TABLE = 2**20  # bytes of a table that is posted
+MAX_TABLE = 2**20  # largest posted table [bytes]
 
 
 class ClickServer:
-    """Serves the folder of a detection until it is closed."""
+    """A server of the folder of a detection, until it is closed."""
 
     def __init__(
-        self, found: Examination, detection: Detection, folder: Path, port: int = 0
+        self, examination: Examination, detection: Detection, folder: Path, port: int = 0
     ) -> None:
         self.detection = detection
         self.folder = folder
         self.token = secrets.token_urlsafe(16)
-        self._page = examination_page(found, detection, self.token).encode()
+        self._page = examination_page(examination, detection, self.token).encode()
         handler = partial(_Handler, self)
         self._server = _Server((HOST, port), handler)
         files = (*detection.photograph_files.values(), *detection.overlay_files.values())
@@ -56,20 +56,20 @@ class ClickServer:
 
     @property
     def address(self) -> Address:
-        """Where the page is."""
+        """The address of the page."""
         return Address(HOST, self._server.server_port)
 
     def run(self) -> None:
-        """Answer until :meth:`close`, or an interrupt."""
+        """Serve until :meth:`close` or an interrupt."""
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End it."""
+        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
 
     def content(self, path: str) -> tuple[str, bytes] | None:
-        """Return type and content of what a path names; None if it names nothing here."""
+        """Return type and content of a path of the page; None for other paths."""
         if path in ("/", f"/{DETECTION_PAGE}"):
             return "text/html; charset=utf-8", self._page
         if path == "/favicon.ico":  # browsers ask for it
@@ -78,7 +78,7 @@ class ClickServer:
         return None if file is None or not file.is_file() else ("image/jpeg", file.read_bytes())
 
     def read(self, table: bytes) -> Landmarks:
-        """Return the clicks of a table that the page made; raise DatasetError as for a file."""
+        """Return the clicks of a posted table; raise DatasetError as for a file."""
         dataset = self.detection.dataset
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / LANDMARKS_NAME
@@ -86,7 +86,7 @@ class ClickServer:
             return read_landmarks(path, dataset.machine.leg_names, dataset.measurements)
 
     def placed(self, table: bytes, image: int) -> dict[str, Any]:
-        """Return what clicks make of the camera of an image: its legs and joints [px]."""
+        """Return the camera of an image determined by clicks: its legs and joints [px]."""
         dataset = self.detection.dataset
         m, machine = dataset.measurements, dataset.machine
         landmarks = self.read(table)
@@ -95,10 +95,10 @@ class ClickServer:
         answer: dict[str, Any] = {
             "image": image, "problems": [], "notes": [], "legs": [], "joints": {},
         }  # fmt: skip
-        own = landmarks.choose(m.view[landmarks.row] == v)
-        if not len(own):
+        landmarks_here = landmarks.choose(m.view[landmarks.row] == v)
+        if not len(landmarks_here):
             return answer
-        camera = cameras_by_landmarks(Path(LANDMARKS_NAME), machine, m, own)[v]
+        camera = cameras_by_landmarks(Path(LANDMARKS_NAME), machine, m, landmarks_here)[v]
         answer |= {"problems": camera.problems, "notes": camera.notes}
         if camera.T_base_camera is not None:
             rows = np.array([row], dtype=np.intp)
@@ -113,7 +113,7 @@ class ClickServer:
         return answer
 
     def save(self, table: bytes) -> dict[str, Any]:
-        """Write clicks into the dataset, and return the file."""
+        """Write clicks into the dataset, and return the path of the file."""
         dataset = self.detection.dataset
         text = format_landmarks(self.read(table), dataset.measurements, dataset.machine.leg_names)
         path = dataset.folder / LANDMARKS_NAME
@@ -130,18 +130,18 @@ class ClickServer:
 
 
 class _Server(http.server.ThreadingHTTPServer):
-    """Says nothing of browsers that leave before they have their answer."""
+    """A server that ignores browsers that disconnect early."""
 
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report what went wrong with a request."""
+        """Report an error in a request."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
-    """Answers the page and nobody else: requests for other hosts, or without its token, are not."""
+    """The handler of the page; requests for other hosts, or without its token, are refused."""
 
     server_version, sys_version = "legcal", ""
 
@@ -150,15 +150,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         super().__init__(*args)
 
     def do_GET(self) -> None:
-        """Send the page or a picture of it."""
-        found = self.clicks.content(urlsplit(self.path).path) if self._is_for_here() else None
-        if found is None:
+        """Send the page or one of its pictures."""
+        content = self.clicks.content(urlsplit(self.path).path) if self._is_for_here() else None
+        if content is None:
             self.send_error(404)
             return
-        self._send(*found)
+        self._send(*content)
 
     def do_POST(self) -> None:
-        """Take clicks."""
+        """Handle posted clicks."""
         token = self.headers.get(TOKEN_HEADER, "")
         if not self._is_for_here() or not secrets.compare_digest(
             token.encode(), self.clicks.token.encode()
@@ -185,7 +185,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send("application/json", json.dumps(answer).encode())
 
     def _is_for_here(self) -> bool:
-        """Say whether a request names this machine: other names may be those of other pages."""
+        """Return whether a request names this host: other names may belong to other pages."""
         port = self.clicks.address.port
         return self.headers.get("Host", "") in (f"{HOST}:{port}", f"localhost:{port}")
 
@@ -198,4 +198,4 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""

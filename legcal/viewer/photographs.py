@@ -1,4 +1,4 @@
-"""Cameras where they stand, their photographs without distortion, and outlines in space."""
+"""Placed cameras, their undistorted photographs, and outlines in space."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from legcal.vision.camera import Camera
 
 MAX_CAMERAS = 200
-_SIDE = 720  # longer side of a photograph as it is shown [px]
+_SIDE = 720  # longer side of a displayed photograph [px]
 _RIM = 17  # points along each side of an image
-_WIDEST = 3.0  # tangent of half the field of view that is shown at most
-_EMPTY = 235.0  # grey level where a lens shows nothing
+_WIDEST = 3.0  # largest tangent of half the displayed field of view
+_EMPTY = 235.0  # grey level outside the image of a lens
 
 Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A camera where it stands."""
+    """A camera with its pose."""
 
-    view: int  # of the measurements
+    view: int  # index of the view
     name: str
     camera: Camera
     T_base_camera: RigidTransform
-    half: Array  # (2,) tangents of half the field of view that holds the image, x and y
+    half: Array  # (2,) tangents of half the field of view of the whole image, x and y
 
     @property
     def fov(self) -> float:
@@ -50,18 +50,18 @@ class Place:
 
 
 class Photographs:
-    """The session of a source as its cameras see it.
+    """The session of a source from its cameras.
 
     Attributes
     ----------
     places : tuple of Place
-        The cameras that stand somewhere: as calibrated, else as the dataset says.
+        The cameras with a pose, calibrated or stated in the dataset.
     names : tuple of str
-        What the images are called, by row.
+        Names of the images, by row.
     poses : tuple of str
-        What the poses of the session are called, by images.
+        Names of the poses of the session, from images.
     q : (n_poses, n_legs) array
-        Their readings [m].
+        Readings at these poses [m].
     """
 
     def __init__(self, source: Source) -> None:
@@ -83,11 +83,11 @@ class Photographs:
 
     @property
     def has_outlines(self) -> bool:
-        """Whether outlines were measured or given."""
+        """Whether there are outlines, measured or given."""
         return self._dataset is not None and self._dataset.observations is not None
 
     def row(self, place: Place, pose: int) -> int | None:
-        """Return the row of the measurements that a camera took at a pose, None without."""
+        """Return the row of the image of a camera at a pose, None without image."""
         if self._dataset is None:
             return None
         measurements = self._dataset.measurements
@@ -95,11 +95,11 @@ class Photographs:
         return int(rows[0]) if len(rows) else None
 
     def name(self, row: int) -> str:
-        """Return the name of the image of a row."""
+        """Return the name of the image in a row."""
         return self.names[row]
 
     def picture(self, place: Place, row: int) -> tuple[Picture | None, str]:
-        """Return the photograph of a row as a pinhole takes it (h, w, 3), or why there is none."""
+        """Return the photograph of a row as a pinhole image (h, w, 3), or why there is none."""
         if self._dataset is None or self._dataset.image_path(row) is None:
             return None, ""
         try:
@@ -114,7 +114,7 @@ class Photographs:
         return np.repeat(levels[..., None], 3, axis=2), ""
 
     def _map(self, place: Place) -> NDArray[np.float32]:
-        """Return where in its image a camera shows each pixel of a picture, (h, w, 2) [px]."""
+        """Return the pixel in the original image for each pixel of a picture, (h, w, 2) [px]."""
         if place.view in self._maps:
             return self._maps[place.view]
         camera = place.camera
@@ -129,35 +129,37 @@ class Photographs:
     def outlines(self, place: Place, row: int, depth: float) -> tuple[Array, BoolArray]:
         """Return the outlines of an image at a depth [m] of its camera, in the base link.
 
-        Ends (m, 2, 3) [m], and which of them are used, (m,).
+        The result is their ends (m, 2, 3) [m], and which outlines are used, (m,).
         """
         none = np.zeros((0, 2, 3)), np.zeros(0, dtype=np.bool_)
         if self._dataset is None or self._dataset.observations is None:
             return none
-        found = self._dataset.observations
-        chosen = np.flatnonzero((found.row == row) & np.isfinite(found.ends).all(axis=(1, 2)))
+        observations = self._dataset.observations
+        chosen = np.flatnonzero(
+            (observations.row == row) & np.isfinite(observations.ends).all(axis=(1, 2))
+        )
         if len(chosen) == 0:
             return none
-        xy = place.camera.undistort(found.ends[chosen].reshape(-1, 2))
+        xy = place.camera.undistort(observations.ends[chosen].reshape(-1, 2))
         rays = depth * np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-        return place.T_base_camera.apply(rays).reshape(-1, 2, 3), found.used[chosen]
+        return place.T_base_camera.apply(rays).reshape(-1, 2, 3), observations.used[chosen]
 
 
 def _places(dataset: Dataset, result: EarlierResult | None) -> tuple[Place, ...]:
-    """Return the cameras whose place is known."""
-    found: list[Place] = []
+    """Return the cameras with a known pose."""
+    places: list[Place] = []
     for v, view in enumerate(dataset.measurements.views):
         T = view.T_base_camera
         if result is not None and view.name in result.result.views:
             pose = result.result.views[view.name].T_base_camera
             T = motion_from_xyz_quat(pose.xyz, pose.quat_xyzw)
-        if T is not None and len(found) < MAX_CAMERAS:
-            found.append(Place(v, view.name, view.camera, T, _half(view.camera)))
-    return tuple(found)
+        if T is not None and len(places) < MAX_CAMERAS:
+            places.append(Place(v, view.name, view.camera, T, _half(view.camera)))
+    return tuple(places)
 
 
 def _half(camera: Camera) -> Array:
-    """Return the tangents of half the field of view that holds the image of a camera, (2,)."""
+    """Return the tangents of half the field of view of the whole image of a camera, (2,)."""
     w, h = camera.width - 0.5, camera.height - 0.5
     s = np.linspace(-0.5, 1.0, _RIM)
     x, y = np.linspace(-0.5, w, len(s)), np.linspace(-0.5, h, len(s))

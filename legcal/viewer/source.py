@@ -1,4 +1,4 @@
-"""What is looked at: a model, a result with what is known of it, a session with photographs."""
+"""The source of the viewer: a model, a result with its uncertainty, a session with photographs."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A machine, and what there is of its calibration and its session."""
+    """A machine, with its calibration and its session, if any."""
 
-    machine: Machine  # the calibrated one of a result
-    nominal: Machine | None = None  # of which only the legs are looked at; None without a result
+    machine: Machine  # the calibrated machine of a result
+    nominal: Machine | None = None  # nominal machine (legs only); None without a result
     result: EarlierResult | None = None
-    dataset: Dataset | None = None  # its readings in the order of the machine's legs
+    dataset: Dataset | None = None  # session, with readings in the order of the legs
 
     @property
     def name(self) -> str:
@@ -35,21 +35,21 @@ class Source:
 
 
 def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
-    """Return what a path or the name of a shipped model stands for.
+    """Return the source at a path, or with the name of a shipped model.
 
     Parameters
     ----------
     given : str or Path
         A dataset folder, a result folder, or a mechanism.
     dataset : str or Path, optional
-        The dataset that a result was computed from, or one of the model, which do not name it.
+        The dataset of a result or a model, which do not name it themselves.
 
     Raises
     ------
     UsageError
-        If it is not there, or a folder that is none of the three, or two datasets are given.
+        If it does not exist, is a folder of another kind, or two datasets are given.
     DatasetError, ModelError, OutOfClass
-        If its files cannot be used.
+        If its files are not valid.
     """
     path = Path(given)
     if not os.path.exists(path) and str(given) not in shipped_names():
@@ -73,8 +73,8 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
             )
         from legcal.data.dataset import load_dataset
 
-        found = load_dataset(path, check_images=False)
-        return Source(found.machine, dataset=found)
+        loaded = load_dataset(path, check_images=False)
+        return Source(loaded.machine, dataset=loaded)
     subject = load_subject(given)
     if dataset is None:
         return Source(subject.machine, subject.nominal, subject.result)

@@ -1,4 +1,4 @@
-"""What is seen of a machine at a posture: legs, rims, ellipsoids; numbers in, numbers out."""
+"""The visible geometry of a machine at a posture: legs, rims, ellipsoids, as arrays."""
 
 from __future__ import annotations
 
@@ -19,53 +19,53 @@ from legcal.scene.shapes import around, ellipsoids, enlargement
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 
-_THIN = 0.006  # of the size of the machine: the radius of a leg without cylinders
-_STANDING, _MOVING = 0.8, 1.4  # of the thickest rod: rails and axes, arms and carriages
-_USUAL = 0.02  # of it: the median ellipsoid, and
-_WIDER = 4.0  # of the ball that it must be seen about
-_JOINT = 1.25  # of the thickest cylinder of a leg: the ball at its joints
+_THIN = 0.006  # radius of a leg without cylinders, relative to the machine
+_STANDING, _MOVING = 0.8, 1.4  # radii of fixed and moving parts of motors, in thickest rods
+_USUAL = 0.02  # least displayed size of the median ellipsoid, relative to the machine
+_WIDER = 4.0  # the same, in radii of the ball at a joint
+_JOINT = 1.25  # radius of the ball at joints, relative to the thickest cylinder of the leg
 
 
 @dataclass(frozen=True, eq=False)
 class Rods:
-    """Cylinders of a length along z, moved into place."""
+    """Cylinders with poses and sizes."""
 
-    position: Array  # (m, 3) of their middles [m]
+    position: Array  # (m, 3) middles [m]
     wxyz: Array  # (m, 4) unit quaternions
     scale: Array  # (m, 3) radius, radius, length [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What is seen of a machine, in the base link [m]."""
+    """The visible geometry of a machine, in the base link [m]."""
 
     A: Array  # (n, 3)
     B: Array  # (n, 3)
-    rods: Rods  # of Stage.rod_legs
-    base: Array  # (n, 3) what its base is drawn about: A, or where motors stand that move these
-    motors: Rods  # rails and axes of those motors, then carriages and arms
-    beside: tuple[Array, Array] | None  # A and B of what it is compared with
-    skeleton: Array | None  # (m, 2, 3) lines of that
-    apart: float  # how far joints are from those beside, without exaggeration [m]
+    rods: Rods  # cylinders of Stage.rod_legs
+    base: Array  # (n, 3) corners of the base: A, or the positions of motors that move A
+    motors: Rods  # rails and axes of these motors, then carriages and arms
+    beside: tuple[Array, Array] | None  # A and B of the compared model
+    skeleton: Array | None  # (m, 2, 3) lines of the compared model
+    apart: float  # largest distance of joints from the compared ones, not exaggerated [m]
 
 
 class Stage:
-    """All that does not move: sizes, rims, ellipsoids, what can be compared.
+    """The constant geometry: sizes, rims, ellipsoids, and models for comparison.
 
     Attributes
     ----------
     size : float
-        Of the machine at home [m].
+        Size of the machine at home [m].
     rims : tuple of two lists of int
-        Joints of base and platform in the order around it, the first twice.
+        Joints of base and platform in order around it, the first twice.
     rod_legs : (m,) array of int
         The leg of each rod.
     rod_is_thick : (m,) array of bool
-        Whether it is a part of the base's half.
+        Whether it belongs to the half at the base.
     n_standing : int
-        The first of ``Seen.motors``, which stand.
+        Number of fixed parts, which are first in ``Seen.motors``.
     motions : tuple of str
-        What else can be shown as a motion: weak and held directions.
+        Names of further motions: weak and held directions.
     """
 
     def __init__(self, source: Source) -> None:
@@ -108,12 +108,12 @@ class Stage:
 
     @property
     def motions(self) -> tuple[str, ...]:
-        """What weak and held directions are called."""
+        """Names of the weak and held directions."""
         return tuple(words for words, _ in self._directions)
 
     @cached_property
     def ellipsoids(self) -> tuple[dict[str, Array], float]:
-        """Half axes of one sigma by side, (n, 3, 3) [m], and by how much they are enlarged."""
+        """Half axes of one sigma by side, (n, 3, 3) [m], and their magnification."""
         if self.source.result is None:
             return {}, 1.0
         axes = ellipsoids(self.source.result.result)
@@ -123,9 +123,9 @@ class Stage:
     def compared(
         self, posture: Posture, motion: int | None = None
     ) -> tuple[PlacedModel, PlacedModel] | None:
-        """Return the joints before and after what is compared, at the readings of a posture.
+        """Return the two compared models, at the readings of a posture.
 
-        That is what the calibration changed, or one sigma along a direction, number *motion*.
+        They differ by the calibration, or by one sigma along the direction with index *motion*.
         """
         here = self._placed(self._legs, posture, by_readings=False)
         if motion is not None:
@@ -138,7 +138,7 @@ class Stage:
         return self._placed(self._nominal, posture), here
 
     def first_step(self, posture: Posture, motion: int) -> int:
-        """Return which of the factors of exaggeration shows a direction at first."""
+        """Return the index of the default magnification for a direction."""
         compared = self.compared(posture, motion)
         if compared is None:
             return FACTORS.index(1)
@@ -152,18 +152,18 @@ class Stage:
         factor: float = 1.0,
         phase: float = 1.0,
     ) -> Seen:
-        """Return what is seen at a posture.
+        """Return the visible geometry at a posture.
 
         Parameters
         ----------
         posture : Posture
-            Where the machine stands.
+            Posture of the machine.
         motion : int, optional
-            The weak direction along which it is moved; without it, nominal and calibrated.
+            Index of the weak direction of motion; by default nominal and calibrated are compared.
         factor : float
-            By how much the difference is exaggerated; 1 shows the machine as it is.
+            Magnification of the difference; 1 shows the actual machine.
         phase : float
-            Of a motion, -1 to 1.
+            Phase of a motion, -1 to 1.
         """
         compared = self.compared(posture, motion)
         if compared is None:
@@ -186,7 +186,7 @@ class Stage:
     def _placed(
         self, legs: Sequence[Leg], posture: Posture, *, by_readings: bool = True
     ) -> PlacedModel:
-        """Return what is seen of legs at the readings of a posture, k = 1."""
+        """Return the model of legs at the readings of a posture, k = 1."""
         near = platform_in_base(self.machine, posture.T)
         by_readings = by_readings and self.machine.is_determined
         return placed_model(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
@@ -194,10 +194,10 @@ class Stage:
     def _skeleton(self, placed: PlacedModel) -> Array:
         """Return legs, motors and rims as lines (m, 2, 3)."""
         A, B = placed.A[0], placed.B[0]
-        found = [np.stack([A, B], axis=1), _motors(placed)]
+        lines = [np.stack([A, B], axis=1), _motors(placed)]
         for joints, rim in zip((corners_of_base(A, placed.anchors), B), self.rims, strict=True):
-            found.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
-        return np.concatenate(found)
+            lines.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
+        return np.concatenate(lines)
 
     def _rods(self, A: Array, B: Array) -> Rods:
         """Return the cylinders of legs from A to B (n, 3)."""
@@ -213,7 +213,7 @@ class Stage:
 
 
 def _motors(placed: PlacedModel) -> Array:
-    """Return motors as lines (m, 2, 3): what stands, then what moves."""
+    """Return motors as lines (m, 2, 3), fixed parts first."""
     return np.concatenate([placed.standing, placed.moving[0]])
 
 
@@ -228,7 +228,7 @@ def _between(ends: Array, radii: Array) -> Rods:
 def from_z(u: Array) -> Array:
     """Return quaternions wxyz (m, 4) of the shortest turns from z to unit vectors (m, 3)."""
     zero = np.zeros(len(u))
-    found = np.stack([1.0 + u[:, 2], -u[:, 1], u[:, 0], zero], axis=1)
-    length = np.linalg.norm(found, axis=1)
-    found[length < 1e-6] = [0.0, 1.0, 0.0, 0.0]
-    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None])
+    quaternions = np.stack([1.0 + u[:, 2], -u[:, 1], u[:, 0], zero], axis=1)
+    length = np.linalg.norm(quaternions, axis=1)
+    quaternions[length < 1e-6] = [0.0, 1.0, 0.0, 0.0]
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1)[:, None])

@@ -1,7 +1,7 @@
-"""The window in the browser: sliders, and the machine as the stage says, drawn with viser.
+"""The browser window: sliders, and the machine drawn with viser.
 
-Controls only note what is wanted; one loop takes the latest of it, moves the machine and sends what
-has changed, so that a slider that is dragged faster than that never lags behind.
+Controls only store requests; one loop takes the latest ones, moves the machine and sends the
+changes, so that dragging a slider quickly causes no lag.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from legcal.viewer.stage import Seen, Stage
 if TYPE_CHECKING:
     import viser
 
-FRAMES = 60.0  # at most, a second
-_PERIOD = 2.0  # of a motion that is played [s]
-_EYE = np.array([1.1, -1.5, 0.9])  # where it is looked at from, in its size
-_AWAY = 1.5  # times farther, where there are cameras to be seen too
-_DEPTH = 0.45  # of the size of the machine: how far from its camera a photograph is drawn
+FRAMES = 60.0  # largest frame rate [1/s]
+_PERIOD = 2.0  # period of a played motion [s]
+_EYE = np.array([1.1, -1.5, 0.9])  # viewpoint, in sizes of the machine
+_AWAY = 1.5  # factor of its distance if cameras are shown
+_DEPTH = 0.45  # distance of a photograph from its camera, in sizes of the machine
 _PLAIN = "nominal and calibrated"
 _NONE = "none"
-_STEP = 0.01  # of sliders [mm, deg]
+_STEP = 0.01  # step of sliders [mm, deg]
 _STEEL, _ROD, _BASE, _PLATFORM = (88, 96, 108), (190, 197, 206), (70, 74, 80), (31, 95, 168)
 _ARM = (138, 109, 59)
 _BESIDE, _RED, _AMBER, _GREEN = (150, 156, 164), (190, 20, 15), (190, 95, 0), (30, 125, 70)
@@ -49,7 +49,7 @@ _USED, _LEFT_OUT = (60, 220, 90), (235, 70, 60)
 
 
 def require_viser() -> None:
-    """Refuse to go on without viser.
+    """Refuse to continue without viser.
 
     Raises
     ------
@@ -69,11 +69,11 @@ class Window:
     Attributes
     ----------
     motion : Motion
-        Where the machine stands.
+        The machine and its posture.
     seen : Seen
-        What was drawn last.
+        The scene drawn last.
     address : Address
-        Where it is served.
+        Address of the server.
     """
 
     def __init__(self, source: Source, address: Address) -> None:
@@ -83,7 +83,7 @@ class Window:
         self.motion, self.stage = Motion(source.machine), Stage(source)
         self.photographs = Photographs(source)
         self._changed = threading.Condition()
-        self._drawing = threading.Lock()  # nothing is sent once the server has stopped
+        self._drawing = threading.Lock()  # nothing is sent after the server has stopped
         self._wanted: dict[Any, Callable[[], object]] = {}
         self._is_over = False
         self._shown_motion: int | None = None
@@ -131,7 +131,7 @@ class Window:
         with self._drawing, redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    # What is drawn
+    # Drawing
 
     def _add_machine(self) -> None:
         scene, stage, size = self._server.scene, self.stage, self.stage.size
@@ -242,7 +242,7 @@ class Window:
             )  # fmt: skip
 
     def _look_through(self, place: Place, event: Any) -> None:
-        """Put the eye of a client where a camera is."""
+        """Move the viewpoint of a client to a camera."""
         if event.client is None:
             return
         camera = event.client.camera
@@ -254,7 +254,7 @@ class Window:
             camera.fov = place.fov
 
     def _draw(self) -> None:
-        """Send what is seen now."""
+        """Send the current scene."""
         posture, stage = self.motion.posture, self.stage
         seen = stage.seen(posture, self._shown_motion, self._factor, self._phase)
         self.seen = seen
@@ -286,14 +286,14 @@ class Window:
         self._say(seen)
 
     def _say(self, seen: Seen) -> None:
-        """Bring sliders and words up to date."""
+        """Update sliders and text."""
         posture, motion = self.motion.posture, self.motion
         for j, slider in self._reading_sliders.items():
             slider.value = _shown(self._scale(j) * posture.q[j], slider.min, slider.max)
         for k, (slider, value) in enumerate(
             zip(self._pose_sliders, motion.coordinates.tolist(), strict=True)
         ):
-            slider.value = _shown(value * _scale(int(motion.own[k])), slider.min, slider.max)
+            slider.value = _shown(value * _scale(int(motion.columns[k])), slider.min, slider.max)
         legs = [self.source.machine.legs[j] for j in np.flatnonzero(motion.at_end)]
         ends = dict.fromkeys(leg.motor_label for leg in legs)
         lines = []
@@ -302,24 +302,24 @@ class Window:
         if posture.problem:
             lines.append(f"**Not reached.** {_plain(posture.problem)}")
         if seen.beside is not None:
-            what = "The motion" if self._shown_motion is not None else "The calibration"
+            subject = "The motion" if self._shown_motion is not None else "The calibration"
             times = "" if self._factor == 1.0 else f", shown {self._factor:g} times as large"
-            lines.append(f"{what} moves joints by up to {1e3 * seen.apart:.3g} mm here{times}.")
+            lines.append(f"{subject} moves joints by up to {1e3 * seen.apart:.3g} mm here{times}.")
         self._words.content = "\n\n".join(lines) or "Drag to turn, scroll to zoom."
 
     # Controls
 
     def ask(self, key: Any, do: Callable[[], object]) -> None:
-        """Have something done by the loop, instead of what was asked for under the same key."""
+        """Schedule an action for the loop, replacing an earlier one with the same key."""
         with self._changed:
             self._wanted[key] = do
             self._changed.notify_all()
 
     def _on_update(self, control: Any, key: Any, do: Callable[[Any], object]) -> None:
-        """Have something done with the value of a control whenever a person changes it."""
+        """Schedule an action with the value of a control whenever the user changes it."""
 
         def changed(event: Any) -> None:
-            if event.client is not None:  # and not the loop
+            if event.client is not None:  # not by the loop
                 self.ask(key, partial(do, event.target.value))
 
         control.on_update(changed)
@@ -351,7 +351,7 @@ class Window:
         with gui.add_folder("Pose of the platform [mm, deg]"):
             values = motion.coordinates
             for k, (low, high) in enumerate(motion.ranges_of_coordinates().tolist()):
-                which = int(motion.own[k])
+                which = int(motion.columns[k])
                 low = float(np.floor(low * _scale(which)))
                 high = float(np.ceil(high * _scale(which)))
                 slider = gui.add_slider(
@@ -365,14 +365,14 @@ class Window:
         self.motion.read(leg, value / self._scale(leg))
 
     def _scale(self, leg: int) -> float:
-        """Return by what the reading of a leg is multiplied for people: mm, or degrees of arms."""
+        """Return the display factor of the reading of a leg: mm, or degrees of arms."""
         return SHOWN_IN[self.source.machine.legs[leg].reading_unit][0]
 
     def _place(self, k: int, value: float) -> None:
-        self.motion.place(k, value / _scale(int(self.motion.own[k])))
+        self.motion.place(k, value / _scale(int(self.motion.columns[k])))
 
     def _add_session(self) -> None:
-        """Add what steps through the photographs."""
+        """Add the controls of the photographs."""
         gui, photographs = self._server.gui, self.photographs
         if not photographs.poses:
             return
@@ -407,14 +407,14 @@ class Window:
         self.show_pose(0)
 
     def show_pose(self, pose: int) -> None:
-        """Stand at a pose of the session, with its photographs."""
+        """Move to a pose of the session, with its photographs."""
         self._pose.value = pose + 1
         self.motion.show(self.photographs.q[pose])
         self._show_photographs()
 
     def _show_photographs(self) -> None:
-        """Send the photographs and outlines of the pose of the session."""
-        pose, said = int(self._pose.value) - 1, []
+        """Send the photographs and outlines of the current pose."""
+        pose, sentences = int(self._pose.value) - 1, []
         depth = _DEPTH * self.stage.size
         for place, frustum, segments in zip(
             self.photographs.places, self._frusta, self._segments, strict=True
@@ -425,7 +425,7 @@ class Window:
                 name = self.photographs.name(row)
                 if self._show_pictures.value:
                     picture, problem = self.photographs.picture(place, row)
-                said.append(_plain(problem or f"{place.name}: {name}"))
+                sentences.append(_plain(problem or f"{place.name}: {name}"))
             frustum.image = picture
             ends, used = np.zeros((0, 2, 3)), np.zeros(0, dtype=np.bool_)
             if row is not None and self._show_outlines.value:
@@ -437,11 +437,11 @@ class Window:
                 segments.colors = np.repeat(colours, 2, axis=1).astype(np.uint8)
         title = f"Pose {pose + 1} of {len(self.photographs.poses)}"
         if not self.photographs.places:
-            said.append("No camera stands anywhere yet: the dataset has no hints.")
-        self._pose_words.content = "\n\n".join([title, *said])
+            sentences.append("No camera has a pose yet: the dataset has no hints.")
+        self._pose_words.content = "\n\n".join([title, *sentences])
 
     def _add_comparison(self) -> None:
-        """Add what compares nominal and calibrated, and plays weak directions."""
+        """Add the controls that compare nominal and calibrated, and play weak directions."""
         gui, stage = self._server.gui, self.stage
         result = self.source.result
         if result is None:
@@ -470,7 +470,7 @@ class Window:
         )
 
     def show_motion(self, motion: int) -> None:
-        """Show a weak direction as a motion, or for -1 what the calibration changed."""
+        """Show a weak direction as a motion, or for -1 the change by the calibration."""
         self._shown_motion = None if motion < 0 else motion
         step = FACTORS.index(1)
         if motion >= 0:
@@ -484,14 +484,14 @@ class Window:
 
 
 class _Constant:
-    """A control that is not there."""
+    """A dummy control with a constant value."""
 
     def __init__(self, value: bool) -> None:
         self.value = value
 
 
 def _serve(name: str, address: Address) -> viser.ViserServer:
-    """Start a server that is shared with nobody else."""
+    """Start a private server."""
     import viser
 
     class Server(viser.ViserServer):
@@ -500,7 +500,8 @@ def _serve(name: str, address: Address) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # of what connects and is no browser
+    # Not the errors of clients that are no browsers.
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with redirect_stdout(io.StringIO()):
         server = Server(address.host, address.port, label=name, verbose=False)
     server.gui.configure_theme(
@@ -510,17 +511,17 @@ def _serve(name: str, address: Address) -> viser.ViserServer:
 
 
 def _scale(coordinate: int) -> float:
-    """Return by what a coordinate is multiplied for people: mm and degrees."""
+    """Return the display factor of a coordinate: mm and degrees."""
     return 1e3 if coordinate < 3 else float(np.degrees(1.0))
 
 
 def _shown(value: float, low: float, high: float) -> float:
-    """Return a number as a slider can show it."""
+    """Return a number clipped to a slider."""
     return float(np.clip(np.round(value, 2), low, high))
 
 
 def _plain(text: str) -> str:
-    """Return text that Markdown shows as it is."""
+    """Return text escaped for Markdown."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]()#+-.!|<>~$" else c for c in text)
 
 
@@ -570,6 +571,6 @@ def _plate(joints: Array, rim: list[int]) -> tuple[Any, Any]:
 
 
 def _principal(axes: Array) -> tuple[Rotation, Array]:
-    """Return how ellipsoids with half axes (n, 3, 3) are turned, and their radii (n, 3)."""
+    """Return the rotations of ellipsoids with half axes (n, 3, 3), and their radii (n, 3)."""
     U, radii, _ = np.linalg.svd(axes)
     return Rotation.from_matrix(U * np.sign(np.linalg.det(U))[:, None, None]), radii

@@ -1,4 +1,4 @@
-"""Calibration boards: what is printed on them, and their corners in the board frame."""
+"""Calibration boards: their print, and their corners in the board frame."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 class Board:
     """A flat calibration board."""
 
-    kind: BoardKind  # what is printed on it
-    columns: int  # along x: squares, black and white ones (chessboard, ChArUco), or tags
+    kind: BoardKind
+    columns: int  # along x: squares, black and white (chessboard, ChArUco), or tags
     rows: int  # along y, the same
     side: float  # side of a square, or of the black frame of a tag (AprilGrid) [m]
     marker: float = 0.0  # side of a marker of a ChArUco board [m]; zero for other kinds
     spacing: float = 0.0  # gap between the tags of an AprilGrid as a part of their side
-    dictionary: str = ""  # what markers and tags are taken from, as OpenCV names it
+    dictionary: str = ""  # of markers and tags, as OpenCV names it
     legacy: bool = False  # ChArUco as OpenCV printed it before version 4.6
 
     @property
@@ -60,7 +60,7 @@ class Board:
 
     @cached_property
     def extent(self) -> Array:
-        """The four outer corners of what is printed, around it, (4, 3) in the board frame [m]."""
+        """The four outer corners of the print, in cyclic order, (4, 3) in the board frame [m]."""
         if self.kind == "aprilgrid":
             gap = self.spacing * self.side
             low, high = np.array([-gap, -gap]), self.points[-1, :2] + gap
@@ -102,18 +102,18 @@ LINKS: tuple[Link, ...] = ("base", "platform")
 class FixedBoard:
     """A board that is fixed to a link of a machine.
 
-    Numbers of corners go on from board to board, so that one number says which corner of which
-    board: those of the platform's follow on those of the base's.
+    Corners are numbered across boards: the corners of the platform's board come after the corners
+    of the base's.
     """
 
     board: Board
-    link: Link  # what it is fixed to
-    T_link_board: RigidTransform | None = None  # its pose in that link, where it is known
+    link: Link
+    T_link_board: RigidTransform | None = None  # None if not known
     first: int = 0  # the number of its first corner
 
     @property
     def name(self) -> str:
-        """What parameters and messages call it."""
+        """Its name in parameters and messages."""
         return board_name(self.link)
 
     def has(self, corner: IntArray) -> BoolArray:
@@ -122,7 +122,7 @@ class FixedBoard:
 
 
 def board_name(link: Link) -> str:
-    """Return what the board on a link is called."""
+    """Return the name of the board on a link."""
     return "board" if link == "base" else f"{link}_board"
 
 
@@ -140,14 +140,14 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def dictionary_size(name: str) -> int:
-    """Return how many markers a dictionary has."""
+    """Return the number of markers in a dictionary."""
     return len(dictionary(name).bytesList)
 
 
 def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     """Return a ChArUco board as an object of OpenCV, lengths in metres."""
-    found = cv2.aruco.CharucoBoard(
+    board_object = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.side, board.marker, dictionary(board.dictionary)
     )
-    found.setLegacyPattern(board.legacy)
-    return found
+    board_object.setLegacyPattern(board.legacy)
+    return board_object

@@ -1,4 +1,4 @@
-"""Boards as files and options name them: the block ``board`` of YAML, and ``--board``."""
+"""Boards in files and options: the block ``board`` of YAML, and ``--board``."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from legcal.vision.board import (
     dictionary_size,
 )
 
-SIDES = (0.0005, 1.0)  # [m] of a square, a marker or a tag
-MAX_COUNT = 100  # squares or tags along a side
+SIDES = (0.0005, 1.0)  # [m] limits of the side of a square, a marker or a tag
+MAX_COUNT = 100  # maximum number of squares or tags along a side
 
 
 def _in_metres(side: float) -> float:
@@ -59,7 +59,7 @@ Count = Annotated[
 
 
 class _BoardEntry(FileSchema):
-    """What every board has."""
+    """The common entries of all boards."""
 
     on: Literal["base", "platform"] = "base"
     T_base_board: MotionEntry | None = None
@@ -209,12 +209,12 @@ _KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
 }
 
 
-def parse_boards(found: Any, path: Path) -> tuple[FixedBoard, ...]:
-    """Return the boards of a block, one mapping or a list of them, that on the base first.
+def parse_boards(entry: Any, path: Path) -> tuple[FixedBoard, ...]:
+    """Return the boards of a block (one mapping or a list of them), the board on the base first.
 
-    Raises DatasetError if a link has two, or images cannot tell them apart.
+    Raises DatasetError if a link has two boards, or if images cannot distinguish them.
     """
-    blocks = found if isinstance(found, list) else [found]
+    blocks = entry if isinstance(entry, list) else [entry]
     boards = [parse_board(block, path) for block in blocks]
     boards.sort(key=lambda board: LINKS.index(board.link))
     if not boards:
@@ -223,67 +223,68 @@ def parse_boards(found: Any, path: Path) -> tuple[FixedBoard, ...]:
             "or remove the block."
         )
     placed: list[FixedBoard] = []
-    for one in boards:
-        for other in placed:
-            if other.link == one.link:
+    for fixed_board in boards:
+        for earlier in placed:
+            if earlier.link == fixed_board.link:
                 raise DatasetError(
-                    f"{path}: board could not be used: found two boards on the {one.link}, needed "
-                    "at most one on the base and one on the platform; remove one, or correct on."
+                    f"{path}: board could not be used: found two boards on the {fixed_board.link}, "
+                    "needed at most one on the base and one on the platform; remove one, or "
+                    "correct on."
                 )
-            if same := _looks_like(one.board, other.board):
+            if likeness := _looks_like(fixed_board.board, earlier.board):
                 raise DatasetError(
-                    f"{path}: board could not be used: found {same} on base and platform, which "
-                    "images cannot tell apart, needed two boards with other markers or numbers of "
-                    "squares, or of two kinds; print one of them anew, such as ChArUco with "
-                    "another dictionary."
+                    f"{path}: board could not be used: found {likeness} on base and platform, "
+                    "which images cannot tell apart, needed two boards with other markers or "
+                    "numbers of squares, or of two kinds; print one of them anew, such as ChArUco "
+                    "with another dictionary."
                 )
-        placed.append(replace(one, first=sum(b.board.n_corners for b in placed)))
+        placed.append(replace(fixed_board, first=sum(b.board.n_corners for b in placed)))
     return tuple(placed)
 
 
-def _looks_like(one: Board, other: Board) -> str:
-    """Return what two boards have in common that an image cannot tell apart; "" for nothing."""
-    if one.kind == other.kind == "chessboard":
-        counts = {one.columns, one.rows}, {other.columns, other.rows}
+def _looks_like(board: Board, other_board: Board) -> str:
+    """Return a property of two boards that makes them indistinguishable in images; "" if none."""
+    if board.kind == other_board.kind == "chessboard":
+        counts = {board.columns, board.rows}, {other_board.columns, other_board.rows}
         return "chessboards of the same numbers of squares" if counts[0] == counts[1] else ""
-    markers = _markers(one)
-    return f"markers of {markers}" if markers and markers == _markers(other) else ""
+    markers = _markers(board)
+    return f"markers of {markers}" if markers and markers == _markers(other_board) else ""
 
 
 def _markers(board: Board) -> str:
-    """Return the family of the markers of a board: sizes of one family have markers in common."""
+    """Return the family of the markers of a board; all sizes of a family share markers."""
     name = board.dictionary
     return name.rsplit("_", 1)[0] if name[5:6].isdigit() else name
 
 
-def parse_board(found: Any, path: Path) -> FixedBoard:
+def parse_board(mapping: Any, path: Path) -> FixedBoard:
     """Return the board that one mapping describes."""
-    if not isinstance(found, Mapping):
+    if not isinstance(mapping, Mapping):
         raise DatasetError(
-            f"{path}: board could not be read: found {describe(found)}, needed a mapping with its "
-            "kind, or a list of such mappings; describe the board."
+            f"{path}: board could not be read: found {describe(mapping)}, needed a mapping with "
+            "its kind, or a list of such mappings; describe the board."
         )
-    link = found.get("on", LINKS[0])
+    link = mapping.get("on", LINKS[0])
     if link not in LINKS:
         raise DatasetError(
             f"{path}: board.on could not be used: found a board on {describe(link)}, needed base "
             "or platform, the only links whose motion the joint fit follows; fix the board to one "
             "of these and correct on."
         )
-    kind = found.get("kind")
+    kind = mapping.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
-        what = "no such key" if "kind" not in found else describe(kind)
+        kind_in_words = "no such key" if "kind" not in mapping else describe(kind)
         raise DatasetError(
-            f"{path}: board.kind could not be read: found {what}, needed {', '.join(_KINDS)}; "
-            "name the kind of the board."
+            f"{path}: board.kind could not be read: found {kind_in_words}, needed "
+            f"{', '.join(_KINDS)}; name the kind of the board."
         )
-    entry = validate(_KINDS[kind], found, path, "board")
+    entry = validate(_KINDS[kind], mapping, path, "board")
     pose = entry.T_base_board if entry.on == "base" else entry.T_platform_board
     return FixedBoard(entry.board(), entry.on, None if pose is None else pose.motion())
 
 
 def board_document(board: Board) -> dict[str, Any]:
-    """Return a board as the block of ``dataset.yaml`` has it, without its pose."""
+    """Return the block of ``dataset.yaml`` for a board, without its pose."""
     n = (board.columns, board.rows)
     if board.kind == "aprilgrid":
         sizes = {"tag_size": board.side, "tag_spacing": board.spacing}
@@ -300,7 +301,7 @@ FORMS = {
     "charuco": "charuco:7x5:40mm:29mm:DICT_4X4_50 (squares, side, marker, dictionary)",
     "aprilgrid": "aprilgrid:6x6:88mm:0.3 (tags, side, gap as a part of it)",
 }
-_MIN_SQUARES = 4  # along a side of a chessboard
+_MIN_SQUARES = 4  # minimum number of squares along a side of a chessboard
 _COUNTS = re.compile(r"(\d{1,4})[xX](\d{1,4})", re.ASCII)
 _OPTION = "--board"
 
@@ -325,23 +326,23 @@ def board_of(spec: str | Path | Board) -> Board:
             spacing = float(words[2])
         except ValueError as error:
             raise _refused(str(spec), describe(words[2]), "the gap as a number, 0.3") from error
-        found = {"tags_x": x, "tags_y": y, "tag_size": side, "tag_spacing": spacing}
+        entries = {"tags_x": x, "tags_y": y, "tag_size": side, "tag_spacing": spacing}
     else:
         marker = parse_quantity(words[2], LENGTH, _OPTION)
-        found = {"squares_x": x, "squares_y": y, "square": side, "marker": marker}
-        found["dictionary"] = words[3]  # type: ignore[assignment]
+        entries = {"squares_x": x, "squares_y": y, "square": side, "marker": marker}
+        entries["dictionary"] = words[3]  # type: ignore[assignment]
         if words[4:]:
             if words[4] != "legacy":
                 raise _refused(str(spec), describe(words[4]), "legacy, or nothing, at the end")
-            found["legacy_pattern"] = True
+            entries["legacy_pattern"] = True
     try:
-        return parse_board({"kind": kind, **found}, Path(_OPTION)).board
+        return parse_board({"kind": kind, **entries}, Path(_OPTION)).board
     except DatasetError as error:
         raise UsageError(error.facts) from error
 
 
 def _chessboard(spec: str, x: int, y: int, words: list[str]) -> Board:
-    """Return a chessboard; which of its sides is up does not matter to a camera."""
+    """Return a chessboard; its orientation does not matter to a camera."""
     side = parse_quantity(words[0], LENGTH, _OPTION) if words else 0.025
     if not _MIN_SQUARES <= min(x, y) <= max(x, y) <= MAX_COUNT:
         needed = f"{_MIN_SQUARES} to {MAX_COUNT} squares each way, black and white ones counted"
@@ -357,17 +358,17 @@ def read_board_file(path: Path) -> Board:
     if not os.path.isfile(path):
         kinds = "; ".join(FORMS.values())
         raise _refused(str(path), describe(str(path)), f"a YAML file or one of: {kinds}")
-    found = read_yaml(path, "board file").get("board")
-    if not isinstance(found, dict):
+    block = read_yaml(path, "board file").get("board")
+    if not isinstance(block, dict):
         raise DatasetError(
             f"{path}: the board could not be read: found no block board, needed one as in "
             "dataset.yaml; add it."
         )
-    return parse_board(found, path).board
+    return parse_board(block, path).board
 
 
-def _refused(spec: str, found: str, needed: str) -> UsageError:
+def _refused(spec: str, actual: str, needed: str) -> UsageError:
     return UsageError(
-        f"The board {describe(spec)} could not be used: found {found}, needed {needed}; correct "
+        f"The board {describe(spec)} could not be used: found {actual}, needed {needed}; correct "
         f"{_OPTION}."
     )

@@ -1,11 +1,10 @@
-"""The camera: a pinhole with a distortion model of OpenCV, and its intrinsics by their names.
+"""The camera: a pinhole with a distortion model of OpenCV, and its intrinsics by name.
 
 A distortion model is one entry of ``DISTORTION_MODELS`` and its name in
-:mod:`legcal.vision.distortion`: files, fits and the calibration of cameras take from there what
-they need of it.
+:mod:`legcal.vision.distortion`, for use in files, fits and the calibration of cameras.
 
-Views whose cameras have the same intrinsics are taken to show one camera: they share these, named
-after the first of them in the order of names.
+Views with the same intrinsics are assumed to be from one camera: they share the intrinsics, under
+the name of the first view in the order of names.
 """
 
 from __future__ import annotations
@@ -22,22 +21,22 @@ from legcal.geometry.types import Array
 from legcal.vision.distortion import DistortionModel
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
-MAX_RADIUS = 10.0  # on the sensor plane, beyond which nothing is looked for
-N_DIRECTIONS, N_RADII = 16, 256  # in which a lens is looked at for folds
-_NEWTON_STEPS, _SMALL_STEP = 8, 1e-9  # of undistortion from points nearby, on the sensor plane
-_STEP = 1e-6  # of the central differences of undistortion, in units of the sensor plane
+MAX_RADIUS = 10.0  # maximum radius of the search on the sensor plane
+N_DIRECTIONS, N_RADII = 16, 256  # grid for the search of folds of a lens
+_NEWTON_STEPS, _SMALL_STEP = 8, 1e-9  # maximum number, and last size, of steps of undistortion
+_STEP = 1e-6  # step of central differences of undistortion, in units of the sensor plane
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion model: what its coefficients are called, and its functions.
+    """A distortion model: the names of its coefficients, and its functions.
 
     The functions take a camera matrix K and all coefficients; points are (n, 1, 2).
     """
 
     coefficients: tuple[str, ...]  # in OpenCV's order
     counts: tuple[int, ...]  # numbers of coefficients that a file may give; the others are zero
-    prior_sigma: float  # of a coefficient of which nothing is known
+    prior_sigma: float  # prior standard deviation of a coefficient
     distort: Callable[[Array, Array, Array], Array]  # (x, y) of the sensor plane to pixels
     undistort: Callable[[Array, Array, Array], Array]  # pixels to (x, y)
     # pixels (n, 1, 2), and their derivatives (2 n, 2 + 4 + m) by x and y, then by intrinsics
@@ -112,9 +111,9 @@ class Camera:
     model: DistortionModel = "plumb_bob"  # meaning of the coefficients
     gamma: float = 1.0  # grey levels are light to the power 1 / gamma
     gamma_is_given: bool = True  # false where it is assumed
-    # (n, n) of ``intrinsic_names``, zero for what is exact; None where none is stated
+    # (n, n) of ``intrinsic_names``, zero for exact values; None if not stated
     covariance: Array | None = None
-    # What the files of the photographs said that it was calibrated from, where that is recorded
+    # Metadata of the photographs used for its calibration, if recorded
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
     @cached_property
@@ -124,26 +123,26 @@ class Camera:
 
     @cached_property
     def unfolded(self) -> float:
-        """Radius on the sensor plane up to which points farther from the axis are seen farther out.
+        """Radius on the sensor plane up to which the radius in the image increases.
 
         Beyond it the polynomials of a lens may fold points back into the image.
         """
         x, y = self.width - 1.0, self.height - 1.0
         border = np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]])
-        seen = float(np.linalg.norm(self.undistort(border), axis=1).max())
-        most = 1.1 * (seen if seen < MAX_RADIUS else MAX_RADIUS)
+        border_radius = float(np.linalg.norm(self.undistort(border), axis=1).max())
+        most = 1.1 * (border_radius if border_radius < MAX_RADIUS else MAX_RADIUS)
         turn = np.linspace(0.0, 2.0 * np.pi, N_DIRECTIONS, endpoint=False)
         radius = np.linspace(0.0, most, N_RADII)
         rays = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-        out = np.linalg.norm(self.distort(rays) - self.K[:2, 2], axis=-1)
-        folds = np.any(np.diff(out, axis=0) <= 0.0, axis=1)
+        image_radius = np.linalg.norm(self.distort(rays) - self.K[:2, 2], axis=-1)
+        folds = np.any(np.diff(image_radius, axis=0) <= 0.0, axis=1)
         return float(radius[max(int(np.argmax(folds)) - 1, 0)] if folds.any() else most)
 
     def project(
         self,
         P_camera: Array,  # (..., 3) points in front of the camera, in its frame [m]
     ) -> Array:
-        """Return the pixels at which points are seen, (..., 2)."""
+        """Return the pixels (..., 2) of points."""
         xy = P_camera[..., :2] / P_camera[..., 2:]
         return self.distort(xy)
 
@@ -205,7 +204,7 @@ class Camera:
         return np.asarray(value / np.linalg.norm(normal, axis=-1))
 
 
-_PINHOLE = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # places in K
+_PINHOLE = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # indices in K
 
 
 def sample_camera() -> Camera:
@@ -257,11 +256,11 @@ def undistort_with_derivatives(
     camera: Camera,
     pixels: Array,  # (..., 2) pixels
     names: Sequence[str],
-    near: Array,  # (..., 2) points of the sensor plane near those that are seen there
+    near: Array,  # (..., 2) points of the sensor plane near the solutions
 ) -> tuple[Array, Array]:
-    """Return the points of the sensor plane seen at pixels, and how intrinsics move them.
+    """Return the points of the sensor plane at pixels, and their derivatives by intrinsics.
 
-    These are (..., 2) and (..., 2, n_names). A pixel stays where it is, so that
+    These are (..., 2) and (..., 2, n_names). A pixel is constant, so that
     d(u, v)/d(x, y) d(x, y) + d(u, v)/d(intrinsic) = 0.
     """
     flat = pixels.reshape(-1, 2)
@@ -269,16 +268,16 @@ def undistort_with_derivatives(
         return pixels, np.zeros((*pixels.shape, len(names)))
     xy = _undistorted(camera, flat, near.reshape(-1, 2))
     _, by_point, moved = _with_derivatives(camera, xy, names)
-    found = -_solved(by_point, moved)
-    return xy.reshape(pixels.shape), found.reshape(*pixels.shape, len(names))
+    by_intrinsics = -_solved(by_point, moved)
+    return xy.reshape(pixels.shape), by_intrinsics.reshape(*pixels.shape, len(names))
 
 
 def _undistorted(camera: Camera, pixels: Array, near: Array) -> Array:
-    """Return points (n, 2) seen at pixels, by Newton's method from points nearby if that ends."""
+    """Return points (n, 2) at pixels, by Newton's method from points nearby if it converges."""
     xy = near
     for _ in range(_NEWTON_STEPS if camera.has_distortion else 0):
-        there, by_point, _ = _with_derivatives(camera, xy, ())
-        step = _solved(by_point, (pixels - there)[..., None])[..., 0]
+        projected, by_point, _ = _with_derivatives(camera, xy, ())
+        step = _solved(by_point, (pixels - projected)[..., None])[..., 0]
         xy = xy + step
         if np.abs(step).max() < _SMALL_STEP:
             return np.asarray(xy)
@@ -293,7 +292,7 @@ def _solved(M: Array, right: Array) -> Array:
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return for each view the name of the view whose intrinsics it has."""
+    """Return for each view the name of the first view with the same intrinsics."""
     keys = [tuple(camera_numbers(camera).items()) for camera in cameras]
     owner: dict[object, str] = {}
     for name, key in sorted(zip(names, keys, strict=True), key=lambda pair: pair[0]):
@@ -302,16 +301,16 @@ def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str
 
 
 def stated_covariances(names: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Array]:
-    """Return the stated covariances of intrinsics by the view that stands for each camera.
+    """Return the stated covariances of intrinsics by the view that names each camera.
 
-    Of several files with the same numbers, the first of the views that states one counts.
+    Among several files with the same numbers, the covariance of the first view counts.
     """
-    found: dict[str, Array] = {}
+    covariances: dict[str, Array] = {}
     owners = shared_cameras(names, cameras)
     for _, owner, camera in sorted(zip(names, owners, cameras, strict=True), key=lambda v: v[0]):
         if camera.covariance is not None:
-            found.setdefault(owner, camera.covariance)
-    return found
+            covariances.setdefault(owner, camera.covariance)
+    return covariances
 
 
 def camera_numbers(camera: Camera) -> dict[str, float | str]:
@@ -323,7 +322,7 @@ def camera_numbers(camera: Camera) -> dict[str, float | str]:
 
 
 def _padded(camera: Camera) -> Array:
-    """Return all the coefficients of a camera's model, those that are left out being zero."""
+    """Return all the coefficients of a camera's model, with zeros for omitted ones."""
     distortion = np.zeros(len(_coefficients(camera)))
     distortion[: len(camera.distortion)] = camera.distortion
     return distortion
@@ -339,12 +338,12 @@ def _with_derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return pixels (n, 2) of points (n, 2), derivatives by these (n, 2, 2), and by intrinsics.
 
-    Pixels are those of a camera without skew.
+    The camera is assumed to have no skew.
     """
-    known = (*_PINHOLE, *_coefficients(camera))
-    both = DISTORTION_MODELS[camera.model].with_derivatives
-    pixels, J = both(xy.reshape(-1, 1, 2), camera.K, _padded(camera))
-    J = J.reshape(len(xy), 2, 2 + len(known))
+    intrinsics = (*_PINHOLE, *_coefficients(camera))
+    with_derivatives = DISTORTION_MODELS[camera.model].with_derivatives
+    pixels, J = with_derivatives(xy.reshape(-1, 1, 2), camera.K, _padded(camera))
+    J = J.reshape(len(xy), 2, 2 + len(intrinsics))
     by_point = J[:, :, :2] if camera.has_distortion else camera.pixels_per_unit(xy)
-    columns = [2 + known.index(name) for name in names]
+    columns = [2 + intrinsics.index(name) for name in names]
     return pixels.reshape(-1, 2), by_point, np.asarray(J[:, :, columns])

@@ -21,11 +21,11 @@ from legcal.vision.image_file import quiet_opencv, size_problem
 
 _PixelCount = Annotated[int, Field(gt=0)]
 Sigma = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-CALIBRATED = "legcal_camera"  # the key under which legcal camera says what it found
+CALIBRATED = "legcal_camera"  # the key of the result of legcal camera
 
 
 class _OpenSchema(FileSchema):
-    """A block whose other keys belong to other programs."""
+    """A block that may have keys of other programs."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -65,7 +65,7 @@ _Positive = Annotated[float, Field(gt=0.0)]
 
 
 class PhotographsEntry(_OpenSchema):
-    """What the files of the photographs of the board said: the distinct values of each fact."""
+    """Metadata of the photographs of the board: the distinct values of each fact."""
 
     device: list[_Text] = Field(default_factory=list)
     serial: list[_Text] = Field(default_factory=list)
@@ -79,7 +79,7 @@ class PhotographsEntry(_OpenSchema):
 
 
 class CalibratedEntry(_OpenSchema):
-    """What legcal adds to a camera that it calibrated: how well its intrinsics are known."""
+    """The uncertainty of the intrinsics, added by legcal to a camera that it calibrated."""
 
     version: Literal[1]
     sigma: dict[str, Sigma]
@@ -127,10 +127,10 @@ _OPENCV_KEYS = {
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
     "fisheye_model": ("fisheye_model",),
 }
-_SIGMAS = (1e-12, 1e6)  # least and greatest standard deviation of an intrinsic [px, or none]
-_ROUNDING = 1e-9  # of correlations
-_SIGMA_DIGITS = 1e-4  # relative, to which standard deviations are written
-_SINGULAR = 1e-9  # smallest focal length, as a part of the image size
+_SIGMAS = (1e-12, 1e6)  # plausible standard deviations of an intrinsic [px, or none]
+_ROUNDING = 1e-9  # rounding of correlations
+_SIGMA_DIGITS = 1e-4  # relative precision of written standard deviations
+_SINGULAR = 1e-9  # minimum focal length, in units of the image size
 
 
 def read_camera(path: Path) -> Camera:
@@ -138,28 +138,28 @@ def read_camera(path: Path) -> Camera:
     content = content_of(path, "camera file")
     if _OPENCV_MARKS.search(content):
         return _from_opencv(_read_storage(content, path), path)
-    found = parse_yaml(content, path, "camera file")
-    cameras = [key for key, value in found.items() if _is_kalibr(value)]
-    if cameras or _is_kalibr(found):
-        return _from_kalibr(found, cameras, path)
-    if "camera_matrix" in found:
-        return _from_ros(found, path)
+    document = parse_yaml(content, path, "camera file")
+    cameras = [key for key, value in document.items() if _is_kalibr(value)]
+    if cameras or _is_kalibr(document):
+        return _from_kalibr(document, cameras, path)
+    if "camera_matrix" in document:
+        return _from_ros(document, path)
     raise DatasetError(
         f"{path}: the camera file could not be read: found the keys "
-        f"{', '.join(list(found)[:8]) or 'none'}, needed those of a ROS camera_info "
+        f"{', '.join(list(document)[:8]) or 'none'}, needed those of a ROS camera_info "
         "(camera_matrix, distortion_model, ...), of an OpenCV FileStorage or of a Kalibr camchain "
         "(cam0: camera_model, intrinsics, ...); write the calibration in one of these forms."
     )
 
 
 def _is_kalibr(value: object) -> bool:
-    """Say whether a block looks like one camera of a Kalibr camchain."""
+    """Return whether a block looks like one camera of a Kalibr camchain."""
     return isinstance(value, dict) and ("intrinsics" in value or "camera_model" in value)
 
 
-def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
+def _from_ros(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of a ROS camera_info file."""
-    entry = validate(RosEntry, found, path)
+    entry = validate(RosEntry, document, path)
     camera = _checked(
         path,
         _matrix(entry.camera_matrix),
@@ -170,22 +170,22 @@ def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
     if entry.legcal_camera is None:
         return camera
     photographs = entry.legcal_camera.photographs.model_dump()
-    known = {name: values for name, values in photographs.items() if values}
+    recorded = {name: values for name, values in photographs.items() if values}
     covariance = _covariance(entry.legcal_camera, camera, path)
-    return replace(camera, covariance=covariance, photographs=known)
+    return replace(camera, covariance=covariance, photographs=recorded)
 
 
 def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | None:
     """Return the covariance of all intrinsics, None where only standard deviations are stated."""
-    known, names, rows = intrinsic_names(camera), entry.names, entry.covariance
-    for key, given in (("sigma", list(entry.sigma)), ("names", names or [])):
-        unknown = [name for name in given if name not in known]
-        twice = sorted({name for name in given if given.count(name) > 1})
+    intrinsics, names, rows = intrinsic_names(camera), entry.names, entry.covariance
+    for key, listed in (("sigma", list(entry.sigma)), ("names", names or [])):
+        unknown = [name for name in listed if name not in intrinsics]
+        twice = sorted({name for name in listed if listed.count(name) > 1})
         if unknown or twice:
-            found = ", ".join(unknown) or f"{', '.join(twice)} twice"
+            wrong_names = ", ".join(unknown) or f"{', '.join(twice)} twice"
             raise DatasetError(
-                f"{path}: legcal_camera.{key} could not be used: found {found}, needed "
-                f"names of {camera.model}: {', '.join(known)}; calibrate the camera again."
+                f"{path}: legcal_camera.{key} could not be used: found {wrong_names}, needed "
+                f"names of {camera.model}: {', '.join(intrinsics)}; calibrate the camera again."
             )
     if names is None and rows is None:
         return None
@@ -195,19 +195,22 @@ def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | N
             f"{path}: legcal_camera.covariance could not be used: found {problem}; calibrate the "
             "camera again."
         )
-    covariance, where = np.zeros((len(known), len(known))), [known.index(n) for n in names or ()]
-    C = np.array(rows).reshape(len(where), len(where))
-    covariance[np.ix_(where, where)] = 0.5 * (C + C.T)
+    covariance, indices = (
+        np.zeros((len(intrinsics), len(intrinsics))),
+        [intrinsics.index(n) for n in names or ()],
+    )
+    C = np.array(rows).reshape(len(indices), len(indices))
+    covariance[np.ix_(indices, indices)] = 0.5 * (C + C.T)
     return covariance
 
 
 def _covariance_problem(
     names: Sequence[str] | None, rows: Sequence[Sequence[float]] | None, sigma: Mapping[str, float]
 ) -> str:
-    """Return what was found and what was needed of a covariance; "" if it is one."""
+    """Return the actual and the needed content of an invalid covariance, in words; "" if valid."""
     if names is None or rows is None:
-        missing, given = ("names", "covariance") if names is None else ("covariance", "names")
-        return f"{given} without {missing}, needed both"
+        missing, present = ("names", "covariance") if names is None else ("covariance", "names")
+        return f"{present} without {missing}, needed both"
     n = len(names)
     if len(rows) != n or any(len(row) != n for row in rows):
         lengths = "rows of other lengths" if len(rows) == n else f"{len(rows)} rows"
@@ -240,9 +243,9 @@ def _covariance_problem(
     return ""
 
 
-def _from_opencv(found: Mapping[str, Any], path: Path) -> Camera:
-    """Return the camera of an OpenCV FileStorage: the number of coefficients names the model."""
-    entry = validate(OpenCVEntry, found, path)
+def _from_opencv(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of an OpenCV FileStorage, with the model by the number of coefficients."""
+    entry = validate(OpenCVEntry, document, path)
     coefficients = entry.distortion_coefficients.data
     model: DistortionModel = "plumb_bob"
     if entry.fisheye_model:
@@ -253,7 +256,7 @@ def _from_opencv(found: Mapping[str, Any], path: Path) -> Camera:
     return _checked(path, K, (entry.image_width, entry.image_height), model, coefficients)
 
 
-def _from_kalibr(found: Mapping[str, Any], cameras: Sequence[str], path: Path) -> Camera:
+def _from_kalibr(document: Mapping[str, Any], cameras: Sequence[str], path: Path) -> Camera:
     """Return the only camera of a Kalibr camchain."""
     if len(cameras) > 1:
         raise DatasetError(
@@ -262,7 +265,7 @@ def _from_kalibr(found: Mapping[str, Any], cameras: Sequence[str], path: Path) -
             "its own and name that file in its view."
         )
     prefix = cameras[0] if cameras else ""
-    entry = validate(KalibrEntry, found[prefix] if cameras else found, path, prefix)
+    entry = validate(KalibrEntry, document[prefix] if cameras else document, path, prefix)
     fx, fy, cx, cy = entry.intrinsics
     model = next(m for m, d in DISTORTION_MODELS.items() if entry.distortion_model in d.kalibr)
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -317,11 +320,11 @@ def _matrix(entry: MatrixEntry) -> Array:
     return np.array(entry.data, dtype=np.float64).reshape(entry.rows, entry.cols)
 
 
-def _wrong_count(path: Path, model: str, found: int, needed: str) -> str:
+def _wrong_count(path: Path, model: str, n_coefficients: int, needed: str) -> str:
     """Return the problem of a wrong number of distortion coefficients."""
     return (
-        f"{path}: the distortion could not be used: found {found} coefficients, needed {needed} "
-        f"for {model}; copy all of them from the calibration."
+        f"{path}: the distortion could not be used: found {n_coefficients} coefficients, needed "
+        f"{needed} for {model}; copy all of them from the calibration."
     )
 
 
@@ -333,7 +336,7 @@ def _checked(
     coefficients: Sequence[float],
     problems: Sequence[str] = (),
 ) -> Camera:
-    """Return a camera if its numbers make one."""
+    """Return a camera; refuse numbers that no camera has."""
     problems = list(problems)
     distortion = np.array(coefficients, dtype=np.float64)
     if model == "rational_polynomial" and len(distortion) in (12, 14) and not distortion[8:].any():
@@ -359,7 +362,7 @@ def _checked(
 
 
 def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
-    """Return what is wrong with a camera matrix, one sentence each."""
+    """Return the problems of a camera matrix, one sentence each."""
     start = f"{path}: the camera matrix could not be used: found"
     if not np.all(np.isfinite(K)):
         return [f"{start} a value that is not finite, needed numbers; calibrate the camera again."]

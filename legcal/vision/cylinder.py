@@ -1,4 +1,4 @@
-"""A cylinder seen by a camera, eqs (1) to (5): its outlines, its axis, and the axis in angles.
+"""The image of a cylinder, eqs (1) to (5): its outlines, its axis, and the angles of the axis.
 
 The paper names the Euler angles of Table 1 and does not define them. Here psi is the tilt out of
 the plane of the image and theta the angle in the image, from its y axis: the axis is the camera's y
@@ -80,7 +80,7 @@ def angles_of_direction(
 ) -> tuple[Array, Array]:
     """Return psi = asin(u_z) and theta = atan2(-u_x, u_y)."""
     x, y, z = np.moveaxis(u, -1, 0)
-    # The same as asin(u_z), without its loss of digits near the optical axis.
+    # Equal to asin(u_z), without its loss of digits near the optical axis.
     return np.arctan2(z, np.hypot(x, y)), np.arctan2(-x, y)
 
 

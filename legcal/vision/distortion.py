@@ -1,4 +1,4 @@
-"""Names of distortion models: what commands offer, without anything heavy."""
+"""Names of distortion models for options of commands, without heavy imports."""
 
 from typing import Literal
 

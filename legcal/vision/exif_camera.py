@@ -1,4 +1,4 @@
-"""A camera of which nothing is known but what its photographs say: a focal length, roughly."""
+"""A rough camera from nothing but the focal length in the metadata of its photographs."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from legcal.vision.camera_file import CALIBRATED, camera_info
 from legcal.vision.image_facts import ImageFacts
 
 FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
-# Standard deviations, in parts of the focal length: whole millimetres, cropping, focus; and of fx
-# against fy, whose pixels are square
+# Standard deviations, relative to the focal length: of f (whole millimetres, cropping, focus), and
+# of the difference between fx and fy (pixels are square)
 FOCAL_SIGMA, ASPECT_SIGMA = 0.04, 0.002
-CENTRE_SIGMA = 0.02  # of the principal point from the middle, in parts of the longer side
-DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1}  # of lenses without it, or where programs remove it
+CENTRE_SIGMA = 0.02  # standard deviation of the principal point, in units of the longer side
+DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1}  # standard deviations of the distortion of usual lenses
 
 
 def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) -> Camera | None:
     """Return the camera of photographs of one size by their focal length on 35 mm film.
 
-    Its covariance says how roughly that is known. None where they state none, or not one.
+    Its covariance states the uncertainty. None if they state no focal length, or several.
     """
-    stated = {(one.device, one.focal_length_35mm) for one in facts}
+    stated = {(photograph.device, photograph.focal_length_35mm) for photograph in facts}
     focal = next(iter(stated))[1] if len(stated) == 1 else None
     if focal is None:
         return None
@@ -40,14 +40,14 @@ def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) 
 
 
 def rough_camera_info(camera: Camera, name: str) -> str:
-    """Return the text of the camera file of such a camera, with its covariance."""
+    """Return the text of the camera file of a rough camera, with its covariance."""
     names = intrinsic_names(camera)
     C = np.zeros((len(names), len(names))) if camera.covariance is None else camera.covariance
-    known = [i for i in range(len(names)) if C[i, i] > 0.0]
+    inexact = [i for i in range(len(names)) if C[i, i] > 0.0]
     stated = {
         "version": 1,
-        "sigma": {names[i]: float(np.sqrt(C[i, i])) for i in known},
-        "names": [names[i] for i in known],
-        "covariance": C[np.ix_(known, known)].tolist(),
+        "sigma": {names[i]: float(np.sqrt(C[i, i])) for i in inexact},
+        "names": [names[i] for i in inexact],
+        "covariance": C[np.ix_(inexact, inexact)].tolist(),
     }
     return camera_info(camera, name, {CALIBRATED: stated})

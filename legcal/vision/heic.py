@@ -1,7 +1,7 @@
 """HEIC photographs, read by the package pi-heif where it is installed (``legcal[heic]``).
 
-Its wheels hold the decoders libheif and libde265 (LGPL-3). Those of pillow-heif, of which it is a
-part, hold the encoder x265 too (GPL-2). Pixels come turned as the file says.
+Its wheels hold the decoders libheif and libde265 (LGPL-3); the wheels of pillow-heif, of which it
+is a part, hold the encoder x265 too (GPL-2). Pixels are rotated according to the file.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
-_REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # of the package
+_REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
 
 
 class UnreadableError(ValueError):
@@ -22,12 +22,12 @@ class UnreadableError(ValueError):
 
 
 def is_heic(content: bytes) -> bool:
-    """Say whether the bytes of a file look like HEIC."""
+    """Return whether the bytes of a file look like HEIC."""
     return content[4:8] == b"ftyp" and content[8:12] in _BRANDS
 
 
 def can_read_heic() -> bool:
-    """Say whether the package is there."""
+    """Return whether the package is installed."""
     return _package() is not None
 
 
@@ -43,7 +43,7 @@ def heic_pixels(content: bytes) -> NDArray[np.generic]:
         pixels = np.asarray(_opened(content))
     except _REFUSALS as error:
         raise UnreadableError(str(error)) from error
-    return pixels[..., :3] if pixels.ndim == 3 else pixels  # without what is transparent
+    return pixels[..., :3] if pixels.ndim == 3 else pixels  # without the alpha channel
 
 
 def heic_exif(content: bytes) -> bytes:
@@ -59,8 +59,8 @@ def _package() -> ModuleType | None:
         import pi_heif
     except ImportError:
         return None
-    found: ModuleType = pi_heif
-    return found
+    module: ModuleType = pi_heif
+    return module
 
 
 def _opened(content: bytes) -> Any:

@@ -1,7 +1,7 @@
-"""What the file of a photograph says of how it was made: compression, camera, lens, zoom, time.
+"""The metadata of a photograph: compression, camera, lens, zoom, time.
 
-Pillow reads the headers; no pixel is decoded. Nothing here refuses a file: what is damaged or
-absent says nothing.
+Pillow reads the headers; no pixel is decoded. Nothing here refuses a file: damaged or absent
+metadata are ignored.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 PILLOW_ERRORS = (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError,
                  AttributeError, EOFError, struct.error)  # fmt: skip
-"""What Pillow raises of damaged files."""
+"""The exceptions of Pillow for damaged files."""
 
-_MOST_TEXT = 60  # characters of a text that are shown
+_MOST_TEXT = 60  # maximum number of characters shown
 # Sum of the steps of table K.1 of ITU-T T.81, which is quality 50 on the scale of the IJG
 _STEPS_AT_50 = 3688.0
 
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What an image file says of itself; "" and None where it says nothing.
+    """The metadata of an image file; "" and None for missing values.
 
     Attributes
     ----------
     jpeg_quality : int or None
-        About what quality the steps of a JPEG have on the scale of the IJG, 1 to 100.
+        Approximate quality of a JPEG on the scale of the IJG, 1 to 100, from its quantisation.
     device, serial, lens, software : str
         Make and model of the camera, its number, its lens, and the program that wrote the file.
     focal_length, focal_length_35mm : float or None
-        Of the lens, and of one with the same field of view on 35 mm film [mm].
+        Focal length of the lens, and of a lens with the same field of view on 35 mm film [mm].
     focus_distance : float or None
-        Distance that is in focus [m].
+        Distance in focus [m].
     digital_zoom : float or None
-        How many times the middle of the image was made larger.
+        Magnification of the middle of the image.
     orientation : int or None
-        How to turn the image for looking at it, 1 to 8; 1 is as it is.
+        EXIF orientation for display, 1 to 8; 1 is unrotated.
     taken_size : tuple of int or None
-        Width and height that the camera wrote [px].
+        Original width and height [px].
     taken_at : str
-        When it was taken by the clock of the camera, ``2026:11:23 10:15:00``.
+        Time by the clock of the camera, ``2026:11:23 10:15:00``.
     """
 
     jpeg_quality: int | None = None
@@ -80,7 +80,7 @@ def quiet_pillow() -> Iterator[None]:
 
 
 def read_facts(content: bytes) -> ImageFacts:
-    """Return what the bytes of an image file say of how it was made."""
+    """Return the metadata in the bytes of an image file."""
     with quiet_pillow():
         try:
             if content.startswith(JPEG_SIGNATURE):
@@ -93,7 +93,7 @@ def read_facts(content: bytes) -> ImageFacts:
                 return _facts(software | exif_tags(info.get("exif", b"")))
             if content.startswith(TIFF_SIGNATURES):
                 return _facts(exif_tags(content))
-            if is_heic(content):  # whose pixels come turned
+            if is_heic(content):  # its pixels are decoded upright
                 return _facts(exif_tags(heic_exif(content)) | {Base.Orientation: None})
         except PILLOW_ERRORS:
             pass
@@ -129,7 +129,7 @@ def _facts(tags: Mapping[int, Any], jpeg_quality: int | None = None) -> ImageFac
         focal_length=_number(tags, Base.FocalLength, 1e-3, 1e5),
         focal_length_35mm=_number(tags, Base.FocalLengthIn35mmFilm, 1e-3, 1e5),
         focus_distance=_number(tags, Base.SubjectDistance, 1e-3, 1e5),
-        digital_zoom=1.0 if zoom == 0.0 else zoom,  # 0 says that there was none
+        digital_zoom=1.0 if zoom == 0.0 else zoom,  # 0 means no zoom
         orientation=None if orientation is None else int(orientation),
         taken_size=None if width is None or height is None else (int(width), int(height)),
         taken_at=_text(tags, Base.DateTimeOriginal),

@@ -66,14 +66,14 @@ def quiet_opencv() -> Iterator[None]:
 
 
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-_DEEP, _FULL = 12, 16  # bits that the data in files of 16 bits may have
+_DEEP, _FULL = 12, 16  # possible bit depths of the data in files of 16 bits
 _END_OF_IMAGE = b"\xff\xd9"  # of a JPEG
-_CHECKSUM = 4  # bytes, of a chunk of a PNG
+_CHECKSUM = 4  # bytes of the checksum of a chunk in a PNG
 
 
 MAX_SIDE, MAX_AREA = 30_000, 100_000_000  # [px] of an image or a camera; the largest sensors
-_SIDEWAYS = 5  # EXIF orientation, from which on width and height are exchanged for looking
-_STRIP = 256  # rows of an image that become grey levels at once
+_SIDEWAYS = 5  # smallest EXIF orientation with exchanged width and height
+_STRIP = 256  # rows of an image converted to grey levels at a time
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
@@ -93,7 +93,7 @@ NOWHERE = Place()
 
 
 class BadImage(BadValue):
-    """What is wrong with the bytes of an image file."""
+    """A problem with the bytes of an image file."""
 
     def __init__(self, found: str | Cause, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
         super().__init__(found, needed, remedy)
@@ -113,7 +113,7 @@ def read_image(path: Path, camera: Camera) -> Grey:
 
 
 def decode_image(path: Path, camera: Camera, named: Place = NOWHERE) -> NDArray[np.uint8] | Grey:
-    """Read an image as grey levels: those of 8 bits as they are, which takes the least memory."""
+    """Read an image as grey levels; 8-bit levels stay 8-bit, which takes the least memory."""
     content, problem = _complete_content(path, camera, named)
     if problem:
         raise DatasetError(problem)
@@ -127,8 +127,8 @@ def decode_image(path: Path, camera: Camera, named: Place = NOWHERE) -> NDArray[
     except (cv2.error, UnreadableError):
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
-        raise DatasetError(_problem(path, named, found, _LEVELS))
+        actual = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
+        raise DatasetError(_problem(path, named, actual, _LEVELS))
     if pixels.dtype == np.uint8 and pixels.ndim == 2:
         return np.asarray(pixels, dtype=np.uint8)
     scale = 255.0 / (2 ** _depth(pixels) - 1) if pixels.dtype == np.uint16 else 1.0
@@ -144,10 +144,10 @@ def decode_image(path: Path, camera: Camera, named: Place = NOWHERE) -> NDArray[
 
 
 def _depth(pixels: NDArray[np.generic]) -> int:
-    """Return how many bits the data of a file of 16 bits have.
+    """Return the bit depth of the data in a file of 16 bits.
 
-    Data that are moved to the upper bits leave the lower ones empty and have all 16. An image of 16
-    bits that needs no more than 12 is nearly black.
+    Data shifted to the upper bits leave the lower bits empty and count as 16. A true 16-bit image
+    with all levels below 2^12 would be nearly black.
     """
     used = int(np.bitwise_or.reduce(pixels, axis=None))
     is_moved = used % 2 ** (_FULL - _DEEP) == 0
@@ -157,7 +157,7 @@ def _depth(pixels: NDArray[np.generic]) -> int:
 def inspect_image(
     path: Path, camera: Camera, named: Place = NOWHERE
 ) -> tuple[ImageFacts, Problem | None]:
-    """Return what an image file says of itself, and what keeps it from being used, if anything.
+    """Return the metadata of an image file, and the problem that prevents its use, if any.
 
     The pixels are not decoded.
     """
@@ -166,7 +166,7 @@ def inspect_image(
 
 
 def image_size(content: bytes) -> ImageSize:
-    """Return the size of an image from the bytes of its file; refuse one that is cut off."""
+    """Return the size of an image from the bytes of its file; refuse a truncated file."""
     if not content:
         raise BadImage("an empty file")
     if is_heic(content):
@@ -189,19 +189,19 @@ def image_size(content: bytes) -> ImageSize:
 
 
 def _size_read(form: str, read: Callable[[bytes], tuple[int, int]], content: bytes) -> ImageSize:
-    """Return the size of a picture, as Pillow reads it."""
+    """Return the size of an image, read by Pillow."""
     try:
         with quiet_pillow():
             return ImageSize(*read(content))
     except BadImage:
         raise
     except (*PILLOW_ERRORS, UserWarning) as error:
-        found = Cause("a {} file of {} bytes, damaged or cut off", (form, len(content)))
-        raise BadImage(found) from error
+        cause = Cause("a {} file of {} bytes, damaged or cut off", (form, len(content)))
+        raise BadImage(cause) from error
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Return the size of a JPEG, whose data must come to their end."""
+    """Return the size of a JPEG; refuse data without an end marker."""
     file = BytesIO(content)
     picture = JpegImageFile(file)
     if content.find(_END_OF_IMAGE, file.tell()) < 0:  # behind the header of the first scan
@@ -210,7 +210,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
 
 
 def _png_size(content: bytes) -> tuple[int, int]:
-    """Return the size of a PNG, whose checksums must be right."""
+    """Return the size of a PNG; refuse wrong checksums."""
     file = BytesIO(content)
     picture = PngImageFile(file)
     picture.verify()
@@ -220,7 +220,7 @@ def _png_size(content: bytes) -> tuple[int, int]:
 
 
 def _tiff_size(content: bytes) -> tuple[int, int]:
-    """Return the size of a TIFF, whose tags, strips and tiles must all be there."""
+    """Return the size of a TIFF; refuse missing tags, strips or tiles."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # of tags that are cut off
         tags = exif_tags(content)
@@ -251,7 +251,7 @@ def image_suffixes() -> tuple[str, ...]:
 
 
 def size_problem(width: int, height: int) -> tuple[str, str] | None:
-    """Return found and needed of a size that no image and no camera can have, else None."""
+    """Return the actual and the needed size in words if no image can have it, else None."""
     if min(width, height) > 0 and max(width, height) <= MAX_SIDE and width * height <= MAX_AREA:
         return None
     needed = f"at most {MAX_SIDE} px a side and {MAX_AREA} px in all"
@@ -259,7 +259,7 @@ def size_problem(width: int, height: int) -> tuple[str, str] | None:
 
 
 def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
-    """Return in brackets why an image has another size than its camera, "" if nothing shows."""
+    """Return in brackets the likely cause of an image size unlike the camera's, "" if unknown."""
     causes = []
     if size == ImageSize(needed.height, needed.width) and (facts.orientation or 1) >= _SIDEWAYS:
         causes.append(
@@ -284,11 +284,11 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
 
 
 def _complete_content(path: Path, camera: Camera, named: Place) -> tuple[bytes, Problem | None]:
-    """Return the bytes of an image file, and what is wrong with them if anything."""
+    """Return the bytes of an image file, and their problem if any."""
     if not os.path.isfile(path):
-        found = "something that is not a file" if os.path.exists(path) else "no such file"
+        actual = "something that is not a file" if os.path.exists(path) else "no such file"
         remedy = "correct the path or remove the row"
-        return b"", _problem(path, named, found, _COMPLETE, remedy, Code.MISSING_FILE)
+        return b"", _problem(path, named, actual, _COMPLETE, remedy, Code.MISSING_FILE)
     try:
         content = read_bytes(path, MAX_IMAGE)
         size = image_size(content)
@@ -318,13 +318,13 @@ def _problem(
     remedy: str = _AGAIN,
     code: Code = Code.UNREADABLE_FILE,
 ) -> Problem:
-    """Return why an image cannot be used."""
-    what = f"image {path} could not be read"
-    return Problem(what, found, needed, remedy, *named, name=str(path), code=code)
+    """Return the problem of an image that cannot be read."""
+    sentence = f"image {path} could not be read"
+    return Problem(sentence, found, needed, remedy, *named, name=str(path), code=code)
 
 
 def possible_scale(image: NDArray[np.generic], wanted: float, max_pixels: int) -> float:
-    """Return the scale at which an image has at most so many pixels, and no more than wanted."""
+    """Return the scale of an image with at most *max_pixels* pixels, at most *wanted*."""
     return min(wanted, float(np.sqrt(max_pixels / image.size)))
 
 
@@ -339,5 +339,5 @@ def rescaled(image: NDArray[_Level], scale: float) -> NDArray[_Level]:
 
 
 def reduced(px: Array, scale: float) -> Array:
-    """Return pixels of a rescaled image as those of the image; middles of pixels are whole."""
+    """Return the coordinates in the image of pixels of a rescaled image; centres are integers."""
     return np.asarray((px + 0.5) / scale - 0.5)

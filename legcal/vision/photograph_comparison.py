@@ -1,9 +1,9 @@
-"""Whether one calibration can hold for photographs, by what their files say of how they were made.
+"""Check by the metadata of photographs whether one camera calibration can hold for all of them.
 
 A calibration holds for one camera with one lens, focal length, focus and size of image, and for one
-way of processing. What cannot move an edge in the image (exposure, the quality of a JPEG, how the
-camera was held) is not compared, and neither is what a file does not say, but for what is only
-written where something was done to the picture.
+way of processing. Facts that cannot move an edge in the image (exposure, the quality of a JPEG, the
+orientation of the camera) are not compared, and neither are missing values, except for facts that
+are only written if a picture was processed.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ Recorded = Mapping[str, Sequence[Any]]  # distinct values by their keys in camer
 
 Size = tuple[int, int]  # width and height [px]
 
-_FOCAL = 0.005  # part of a focal length, a zoom: less is rounding
-_BREATHING = 1e-3  # part of the focal length that another focus changes
-_MOST_RECORDED = 20  # values of a fact
+_FOCAL = 0.005  # minimum relative difference of a focal length or zoom: less is rounding
+_BREATHING = 1e-3  # minimum relative change of the focal length by another focus
+_MOST_RECORDED = 20  # maximum number of values of a fact
 
 
 @dataclass(frozen=True)
 class Fact:
-    """A fact that must be the same in all photographs that one calibration holds for."""
+    """A fact that must be equal in all photographs for one calibration to hold."""
 
     key: str  # in camera files
     name: str  # of the attribute of ImageFacts
-    what: str  # how a sentence calls what must be one
-    words: Callable[[Any, Size], str]  # of a value: how images of a size are that have it
+    what: str  # name of the fact in a sentence
+    words: Callable[[Any, Size], str]  # description of images of a size with a value
     differ: Callable[[Any, Any, ImageFacts], bool]  # value, another value, the image of the first
-    plain: object = None  # value that needs no calibration of its own
+    plain: object = None  # value that needs no separate calibration
     where_so: bool = False  # whether cameras and programs write it only where it is not plain
 
 
@@ -49,7 +49,7 @@ def _far_35mm(a: float, b: float, _: ImageFacts) -> bool:
 
 
 def _refocused(a: float, b: float, facts: ImageFacts) -> bool:
-    """Say whether another focus changes the focal length, as the one of a thin lens."""
+    """Return whether another focus changes the focal length, according to a thin lens."""
     if facts.focal_length is None:
         return False
     parts = [1e-3 * facts.focal_length / distance for distance in (a, b)]
@@ -57,7 +57,7 @@ def _refocused(a: float, b: float, facts: ImageFacts) -> bool:
 
 
 def _other_program(a: str, b: str, _: ImageFacts) -> bool:
-    """Say whether programs differ by more than their versions."""
+    """Return whether programs differ by more than their versions."""
     first, second = (
         next((k for k, c in enumerate(name) if c.isdigit()), len(name)) for name in (a, b)
     )
@@ -78,7 +78,7 @@ def _zoom(value: float, _: Size) -> str:
 
 
 def _processed(taken: Size, size: Size) -> str:
-    """Return how images of a size came from those that a camera took."""
+    """Return in words the processing from the size a camera took to the size of an image."""
     if taken == size:
         return "of the size that they were taken with"
     factor = size[0] / taken[0]
@@ -109,31 +109,32 @@ FACTS = (
 
 
 def recorded(facts: Sequence[ImageFacts]) -> dict[str, list[Any]]:
-    """Return what a camera file records of the photographs that it comes from."""
-    found = {}
+    """Return the record of photographs in the camera file of their calibration."""
+    record = {}
     for fact in FACTS:
-        values = sorted({x for one in facts if (x := getattr(one, fact.name)) not in (None, "")})
+        values = sorted(
+            {x for image_facts in facts if (x := getattr(image_facts, fact.name)) not in (None, "")}
+        )
         if values:
             plain = [list(x) if isinstance(x, tuple) else x for x in values]
-            found[fact.key] = plain[:_MOST_RECORDED]
-    return found
+            record[fact.key] = plain[:_MOST_RECORDED]
+    return record
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Photographs that differ from others where one calibration allows only one value."""
+    """Photographs that differ in a fact for which a calibration allows only one value."""
 
     fact: Fact
-    # what is found, in words, and the images of each; more than one where they differ among
-    # themselves
+    # images by value in words; several values where images differ among themselves
     images: Mapping[str, Sequence[str]]
-    needed: str  # in words, "" where nobody says
+    needed: str  # needed value in words, "" if unknown
 
 
 def differences(
     named: Sequence[tuple[str, ImageFacts]], size: Size, board: Recorded | None
 ) -> list[Difference]:
-    """Return in what photographs that share a calibration differ.
+    """Return the differences between photographs that share a calibration.
 
     Parameters
     ----------
@@ -142,52 +143,63 @@ def differences(
     size : tuple of int
         Width and height [px].
     board : mapping or None
-        What is recorded of the photographs that the calibration comes from; None if these are the
-        photographs themselves. Facts that are not in it, but that few calibrations hold for, are
-        differences too.
+        The record of the photographs of the calibration; None if these are the photographs
+        themselves. Facts without a record that hold for few calibrations are differences too.
     """
-    found: list[Difference] = []
+    result: list[Difference] = []
     for fact in FACTS:
-        known = [(name, one, getattr(one, fact.name)) for name, one in named]
-        known = [(name, one, value) for name, one, value in known if value not in (None, "")]
+        with_value = [
+            (name, image_facts, getattr(image_facts, fact.name)) for name, image_facts in named
+        ]
+        with_value = [
+            (name, image_facts, value)
+            for name, image_facts, value in with_value
+            if value not in (None, "")
+        ]
         of_board = [] if board is None else _comparable(board.get(fact.key, ()))
         plain = fact.plain if fact.key != "taken_size" else size
         by_words: dict[str, list[str]] = {}
         if of_board:
             needed = fact.words(of_board[0], size)
-            for name, one, value in known:
-                if all(fact.differ(value, other, one) for other in of_board):
+            for name, image_facts, value in with_value:
+                if all(fact.differ(value, board_value, image_facts) for board_value in of_board):
                     by_words.setdefault(fact.words(value, size), []).append(name)
-            if by_words and not _said(found, by_words):
-                found.append(Difference(fact, by_words, needed))
+            if by_words and not _is_listed(result, by_words):
+                result.append(Difference(fact, by_words, needed))
             continue
         groups: list[tuple[Any, list[str]]] = []
-        for name, one, value in known:
-            like = next((g for v, g in groups if not fact.differ(value, v, one)), None)
+        for name, image_facts, value in with_value:
+            like = next((g for v, g in groups if not fact.differ(value, v, image_facts)), None)
             if like is None:
                 groups.append((value, like := []))
             like.append(name)
         is_odd, silent = any(v != plain for v, _ in groups), list[str]()
         if is_odd and fact.where_so:
             silent = [
-                name for name, one in named if one.device and getattr(one, fact.name) in (None, "")
+                name
+                for name, image_facts in named
+                if image_facts.device and getattr(image_facts, fact.name) in (None, "")
             ]
         if len(groups) > 1 or silent or (is_odd and plain is not None and board is not None):
             by_words = {fact.words(value, size): names for value, names in groups}
             if silent:
                 by_words["that say nothing of it"] = silent
-            by_words = dict(sorted(by_words.items(), key=lambda one: len(one[1])))
-            if not _said(found, by_words):
-                found.append(Difference(fact, by_words, ""))
-    return found
+            by_words = dict(sorted(by_words.items(), key=lambda item: len(item[1])))
+            if not _is_listed(result, by_words):
+                result.append(Difference(fact, by_words, ""))
+    return result
 
 
 def _comparable(values: Sequence[Any]) -> list[Any]:
-    """Return recorded values as photographs have them."""
+    """Return recorded values in the types of photographs: lists as tuples."""
     return [tuple(x) if isinstance(x, list) else x for x in values]
 
 
-def _said(found: Sequence[Difference], by_words: Mapping[str, Sequence[str]]) -> bool:
-    """Say whether a difference between the same images is found already: one reason is enough."""
+def _is_listed(
+    known_differences: Sequence[Difference], by_words: Mapping[str, Sequence[str]]
+) -> bool:
+    """Return whether there is a difference between the same images already: one is enough."""
     parts = sorted(map(tuple, by_words.values()))
-    return any(sorted(map(tuple, other.images.values())) == parts for other in found)
+    return any(
+        sorted(map(tuple, earlier.images.values())) == parts for earlier in known_differences
+    )

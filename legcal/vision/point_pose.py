@@ -1,8 +1,8 @@
-"""Where a camera stands before points that are known: perspective-n-point, some points being wrong.
+"""The pose of a camera from known points: perspective-n-point, robust against wrong points.
 
-Poses of four points each are judged by all of them, the better ones refined with a robust loss.
-Points of a plane that is seen with little perspective have two poses that show them almost alike;
-both are returned.
+Poses from four points each are compared by the robust cost of all points, and the better ones
+refined. Points of a plane with little perspective have two poses of almost the same cost; both are
+returned.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from legcal.geometry.types import Array, IntArray
 from legcal.vision.camera import Camera
 
 MIN_POINTS = 4
-MAX_SUBSETS, SEED = 120, 1965  # of four points whose poses are tried
+MAX_SUBSETS, SEED = 120, 1965  # maximum number of subsets of four points, and seed of their choice
 N_REFINED = 8
-TRUNCATION = 4.0  # standard deviations from where a point counts as wrong
+TRUNCATION = 4.0  # standard deviations from which on a point counts as wrong
 SAME_ANGLE = np.deg2rad(3.0)
-MAX_STEPS, SMALL_STEP = 60, 1e-10  # of a refinement; of rotation and distance
-LINE = 0.02  # of the length of points, below which their width makes a line of them
+MAX_STEPS, SMALL_STEP = 60, 1e-10  # maximum number of steps, and relative size of the last step
+LINE = 0.02  # maximum ratio of width to length of collinear points
 
 
 @dataclass(frozen=True, eq=False)
 class PointPose:
-    """A pose of a camera before points."""
+    """A camera pose from points, with cost and covariance."""
 
     T_camera_base: RigidTransform
     cost: float  # half the sum of squares of distances [sigma], none larger than the truncation
     off_px: Array  # (n,) distance of each point from where it should be seen [px]
-    covariance: Array  # (6, 6) of a turn [rad] and a shift [m] of the camera in its own frame
+    covariance: Array  # (6, 6) of a rotation [rad] and a shift [m] of the camera in its frame
 
 
 def on_a_line(points: Array) -> bool:
-    """Say whether points (n, 3) lie on a line, or nearly."""
+    """Return whether points (n, 3) are on a line, or nearly."""
     size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return len(points) < 3 or bool(size[1] <= LINE * size[0])
 
@@ -46,13 +46,13 @@ def on_a_line(points: Array) -> bool:
 def camera_poses_by_points(
     camera: Camera,
     points: Array,  # (n, 3) four points or more, not all on a line [m]
-    px: Array,  # (n, 2) where they are seen [px]
+    px: Array,  # (n, 2) their pixels
     sigma_px: Array,  # (n,) standard deviations of either coordinate [px]
 ) -> list[PointPose]:
-    """Return the poses from which points are seen where they are, the likeliest first.
+    """Return the camera poses that fit the pixels of points, the likeliest first.
 
-    Points that are far from where all others put them count little. Without any pose that has the
-    points before the camera the list is empty.
+    Points that contradict all others count little. The list is empty if no pose has the points in
+    front of the camera.
     """
     middle, xy = points.mean(axis=0), camera.undistort(px)
     starts = [
@@ -62,30 +62,38 @@ def camera_poses_by_points(
     ]
     shown = points - middle
     cost = np.array([_cost(camera, pose, shown, px, sigma_px) for pose in starts])
-    found: list[PointPose] = []
+    refined: list[PointPose] = []
     tried: list[RigidTransform] = []
     for k in np.argsort(cost, kind="stable").tolist():
         if len(tried) == N_REFINED or not np.isfinite(cost[k]):
             break
         if _is_new(starts[k], tried):
             tried.append(starts[k])
-            found.append(_refined(camera, starts[k], shown, px, sigma_px))
+            refined.append(_refined(camera, starts[k], shown, px, sigma_px))
     best = list[PointPose]()
-    for one in sorted(found, key=lambda pose: pose.cost):
-        if np.isfinite(one.cost) and _is_new(one.T_camera_base, [p.T_camera_base for p in best]):
-            best.append(one)
+    for candidate in sorted(refined, key=lambda pose: pose.cost):
+        if np.isfinite(candidate.cost) and _is_new(
+            candidate.T_camera_base, [p.T_camera_base for p in best]
+        ):
+            best.append(candidate)
     back = RigidTransform.from_translation(-middle)
     return [
-        PointPose(one.T_camera_base * back, one.cost, one.off_px, one.covariance) for one in best
+        PointPose(
+            candidate.T_camera_base * back,
+            candidate.cost,
+            candidate.off_px,
+            candidate.covariance,
+        )
+        for candidate in best
     ]
 
 
 def _subsets(n: int) -> Iterator[IntArray]:
     """Yield all points together, and many choices of four of them."""
     yield np.arange(n)
-    every = list(itertools.islice(itertools.combinations(range(n), MIN_POINTS), MAX_SUBSETS + 1))
-    if len(every) <= MAX_SUBSETS:
-        yield from (np.array(one, dtype=np.intp) for one in every if n > MIN_POINTS)
+    subsets = list(itertools.islice(itertools.combinations(range(n), MIN_POINTS), MAX_SUBSETS + 1))
+    if len(subsets) <= MAX_SUBSETS:
+        yield from (np.array(subset, dtype=np.intp) for subset in subsets if n > MIN_POINTS)
         return
     rng = np.random.default_rng(SEED)
     for _ in range(MAX_SUBSETS):
@@ -117,13 +125,13 @@ def closed_form_poses(points: Array, xy: Array, method: int) -> Iterator[RigidTr
             yield RigidTransform.from_components(np.ravel(t) - R.apply(middle), R)
 
 
-def _is_new(one: RigidTransform, others: list[RigidTransform]) -> bool:
-    """Say whether a pose is turned by more than an angle from all others."""
-    return all((one.rotation * o.rotation.inv()).magnitude() > SAME_ANGLE for o in others)
+def _is_new(pose: RigidTransform, others: list[RigidTransform]) -> bool:
+    """Return whether a pose differs from all others by more than ``SAME_ANGLE``."""
+    return all((pose.rotation * o.rotation.inv()).magnitude() > SAME_ANGLE for o in others)
 
 
 def _cost(camera: Camera, pose: RigidTransform, points: Array, px: Array, sigma_px: Array) -> float:
-    """Return what points say against a pose; infinite if it puts most of them behind the camera."""
+    """Return the robust cost of a pose; infinite if most points are behind the camera."""
     P = pose.apply(points)
     ahead = P[:, 2] > 0.0
     if 2 * np.count_nonzero(ahead) <= len(P):
@@ -146,10 +154,10 @@ def _refined(
         A = JtJ * np.outer(scale, scale)
         step = -scale * np.linalg.solve(A + damping * np.diag(np.diag(A)) + 1e-12 * np.eye(6),
                                         scale * gradient)  # fmt: skip
-        there = Rotation.from_rotvec(step[:3]).as_matrix() @ R, t + step[3:]
-        tried = _normal_equations(camera, *there, points, px, sigma_px)
+        moved = Rotation.from_rotvec(step[:3]).as_matrix() @ R, t + step[3:]
+        tried = _normal_equations(camera, *moved, points, px, sigma_px)
         if tried[0] < value:
-            (R, t), (value, JtJ, gradient) = there, tried
+            (R, t), (value, JtJ, gradient) = moved, tried
             damping = max(0.2 * damping, 1e-9)
         else:
             damping *= 5.0
@@ -160,7 +168,7 @@ def _refined(
     ahead = P[:, 2] > 0.0
     off = np.full(len(P), np.inf)
     off[ahead] = np.linalg.norm(camera.project(P[ahead]) - px[ahead], axis=1)
-    # Of a turn about the middle of the points and its shift, to those of the camera
+    # From a rotation about the middle of the points and its shift to the camera's
     C = scale[:, None] * np.linalg.pinv(JtJ * np.outer(scale, scale), hermitian=True) * scale
     x, y, z = t
     by = np.eye(6)
@@ -178,8 +186,8 @@ def _normal_equations(
     ahead = P[:, 2] > 1e-3 * np.linalg.norm(t)
     width = 0.5 * TRUNCATION
     behind = float(np.count_nonzero(~ahead)) * 0.5 * width**2 * np.log1p(1e4)
-    seen, by_point = camera.project_with_derivative(P[ahead])
-    r = (seen - px[ahead]) / sigma_px[ahead, None]
+    projected, by_point = camera.project_with_derivative(P[ahead])
+    r = (projected - px[ahead]) / sigma_px[ahead, None]
     square = np.sum(r**2, axis=1) / width**2
     x, y, z = turned[ahead].T
     zero = np.zeros_like(x)

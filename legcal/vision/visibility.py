@@ -1,4 +1,4 @@
-"""Which parts of which legs an image should show: outlines, bands along legs, what hides."""
+"""Predicted visibility of legs in an image: outlines, bands along legs, occlusion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from legcal.machine.leg import Cylinder, main_cylinders
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
-EQUAL_RADII = 0.01  # relative difference below which two cylinders look like one
+EQUAL_RADII = 0.01  # maximum relative difference of radii without a visible step
 END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder [radii]
 N_SAMPLES = 64  # points along a leg that are tested for visibility
-MIN_DEPTH_SHARE = 0.05  # of the leg length: points nearer to the image plane are cut off
-MIN_LENGTH = (30.0, 1.0)  # of an outline that is measured: [px] and in widths of the leg
+MIN_DEPTH_SHARE = 0.05  # minimum depth of points, in leg lengths: nearer points are cut off
+MIN_LENGTH = (30.0, 1.0)  # minimum length of a measured outline: [px], and in widths of the leg
 
 
 def least_length(width: float | Array) -> Array:
-    """Return how much of cylinders of a width in the image must be seen to be measured [px]."""
+    """Return the minimum visible length [px] of cylinders to measure, by width in the image."""
     return np.maximum(MIN_LENGTH[0], MIN_LENGTH[1] * np.asarray(width))
 
 
@@ -32,8 +32,8 @@ class Segment:
 
     link: str  # the URDF link that names the part
     radius: float  # [m]
-    start: float  # distance from A along the leg from which on its outline is looked for [m]
-    end: float  # distance from A up to which it is [m]
+    start: float  # distance from A along the leg to the start of the outline [m]
+    end: float  # distance from A to its end [m]
 
 
 def visible_segments(
@@ -52,7 +52,12 @@ def visible_segments(
             for _, thicker, first, last in parts
             if thicker > radius
         ]
-        inside = {c for one in cylinders if look_alike(one.radius, radius) for c in one.covers}
+        inside = {
+            c
+            for cylinder in cylinders
+            if look_alike(cylinder.radius, radius)
+            for c in cylinder.covers
+        }
         hiding += [(cover, *solid.span(length)) for solid in inside]
         for gap, first, last in hiding:
             stretches = [
@@ -69,23 +74,23 @@ def visible_segments(
 def _merge_equal(
     cylinders: Sequence[Cylinder], length: float
 ) -> list[tuple[str, float, float, float]]:
-    """Return spans (link, radius, start, end) of cylinders, those of equal radius joined."""
+    """Return spans (link, radius, start, end) of cylinders, with joined spans of equal radius."""
     spans = [((c.end - c.start, c.link), c.radius, *c.span(length)) for c in cylinders]
     merged: list[tuple[tuple[float, str], float, float, float]] = []
     for name, radius, start, end in sorted(spans, key=lambda span: (span[2], span[3], span[0])):
-        for i, (other_name, other, low, high) in enumerate(merged):
-            if look_alike(radius, other) and start <= high + radius:
+        for i, (other_name, other_radius, low, high) in enumerate(merged):
+            if look_alike(radius, other_radius) and start <= high + radius:
                 longest = max(name, other_name)  # of equal lengths the later name, in any pose
-                merged[i] = (longest, max(radius, other), low, max(high, end))
+                merged[i] = (longest, max(radius, other_radius), low, max(high, end))
                 break
         else:
             merged.append((name, radius, start, end))
     return [(link, radius, start, end) for (_, link), radius, start, end in merged]
 
 
-def look_alike(one: float, two: float) -> bool:
-    """Say whether cylinders of two radii are seen as one: too near to show a step."""
-    return abs(one - two) <= EQUAL_RADII * max(one, two)
+def look_alike(radius: float, other_radius: float) -> bool:
+    """Return whether two radii are too close to show a step between cylinders."""
+    return abs(radius - other_radius) <= EQUAL_RADII * max(radius, other_radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +122,7 @@ class Band:
     def line(self, v0: Array | float, v1: Array | float) -> Array:
         """Return the unit (a, b, c) of the line through (0, v0) and (length, v1), eq (2).
 
-        The sign is that of eq (3): positive on the side of greater v.
+        The sign follows eq (3): positive on the side of greater v.
         """
         ends = np.stack([np.asarray(v0, dtype=np.float64), np.asarray(v1, dtype=np.float64)], -1)
         (x0, y0), (x1, y1) = np.moveaxis(
@@ -205,7 +210,7 @@ def longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True, eq=False)
 class PredictedLeg:
-    """One leg as it should appear in one image."""
+    """The predicted appearance of one leg in one image."""
 
     row: int  # of the image
     leg: int  # index of the leg
@@ -242,42 +247,52 @@ def predict_legs(
     A_camera, B_camera = ((X - T[:3, 3]) @ T[:3, :3] for X in (A_base, B_base))
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
-    segments = [visible_segments(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
+    segments = [
+        visible_segments(of_leg, leg_of_axis)
+        for of_leg, leg_of_axis in zip(cylinders, length, strict=True)
+    ]
     whole = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in segments]
     parts = [(leg, segment) for leg, some in enumerate(segments) for segment in some]
-    of = [*range(len(segments)), *(leg for leg, _ in parts)]
+    leg_of_axis = [*range(len(segments)), *(leg for leg, _ in parts)]
     ends = np.array([*whole, *((part.start, part.end) for _, part in parts)]).reshape(-1, 2).T
-    bands = bands_of_legs(camera, A_camera[of], B_camera[of], *ends)
+    bands = bands_of_legs(camera, A_camera[leg_of_axis], B_camera[leg_of_axis], *ends)
     of_parts = iter(bands[len(segments) :])
     bands_of_parts = [tuple(islice(of_parts, len(some))) for some in segments]
     radius = np.array([max((segment.radius for segment in some), default=0.0) for some in segments])
     distance = np.linalg.norm(A_camera - u * np.sum(u * A_camera, axis=1, keepdims=True), axis=1)
-    seen = {
+    visible_bands = {
         leg: band
         for leg, band in enumerate(bands[: len(segments)])
         if band is not None and distance[leg] > 1.01 * radius[leg]
     }
-    axes = [leg for leg in seen for _ in segments[leg]]
-    radii = np.array([segment.radius for leg in seen for segment in segments[leg]])
+    axes = [leg for leg in visible_bands for _ in segments[leg]]
+    radii = np.array([segment.radius for leg in visible_bands for segment in segments[leg]])
     outlines = outlines_of_axis(u[axes], A_camera[axes], radii)
-    of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in seen])[:-1])
+    of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in visible_bands])[:-1])
     return [
         PredictedLeg(
-            row, leg, A_camera[leg], B_camera[leg], segments[leg], own, bands_of_parts[leg], band
+            row,
+            leg,
+            A_camera[leg],
+            B_camera[leg],
+            segments[leg],
+            leg_outlines,
+            bands_of_parts[leg],
+            band,
         )
-        for (leg, band), own in zip(seen.items(), of_leg, strict=False)
+        for (leg, band), leg_outlines in zip(visible_bands.items(), of_leg, strict=False)
     ]
 
 
 def rays_past_axes(
-    P_camera: Array,  # (..., n, 3) points that are looked at [m]
+    P_camera: Array,  # (..., n, 3) observed points [m]
     A: Array,  # (..., n_legs, 3) one end of the axis of each leg [m]
     u: Array,  # (..., n_legs, 3) its unit direction
     length: Array,  # (..., n_legs) [m]
 ) -> tuple[Array, Array, Array]:
-    """Return how far points are (..., n), and where their rays come nearest to the axes of legs.
+    """Return the distances of points (..., n) [m], and the closest approach of rays to leg axes.
 
-    That is the depth along the ray and the square of the gap, (..., n, n_legs) each [m, m^2].
+    The approach has the depth along the ray and the squared gap, (..., n, n_legs) each [m, m^2].
     """
     distance = np.linalg.norm(P_camera, axis=-1)
     ray = P_camera / distance[..., None]
@@ -292,20 +307,20 @@ def rays_past_axes(
 
 def hidden_by(
     legs: Sequence[PredictedLeg],
-    own: IntArray,  # (n,) the leg to whose outline each point belongs
+    leg_of_point: IntArray,  # (n,) the leg to whose outline each point belongs
     P_camera: Array,  # (n, 3) the points [m]
     margin: Array,  # (n,) points this near to another leg's outline count as hidden
 ) -> IntArray:
-    """Return which other leg stands in front of points of legs, (n,)."""
+    """Return the index (n,) of another leg in front of points of legs, -1 for none."""
     u, A, B = (
         np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
     )
     length = np.linalg.norm(B - A, axis=1)
-    radius = np.array([max(segment.radius for segment in other.segments) for other in legs])
+    radius = np.array([max(segment.radius for segment in other_leg.segments) for other_leg in legs])
     distance, depth, square = rays_past_axes(P_camera, A, u, length)
     reach = radius + margin[:, None] * depth
     hides = (reach > 0.0) & (square < reach**2) & (depth < distance[:, None])
     front = np.full(len(P_camera), -1, dtype=np.intp)
-    for k, other in enumerate(legs):
-        front[hides[:, k] & (own != other.leg)] = other.leg
+    for k, other_leg in enumerate(legs):
+        front[hides[:, k] & (leg_of_point != other_leg.leg)] = other_leg.leg
     return front

@@ -78,14 +78,14 @@
     const letters = atob(packed), bytes = new Uint8Array(letters.length);
     for (let k = 0; k < bytes.length; k++) bytes[k] = letters.charCodeAt(k);
     const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
-    const lines = parse(text), image = new Map(images.map((one, k) => [JSON.stringify([one.view, one.image]), k]));
+    const lines = parse(text), image = new Map(images.map((entry, k) => [JSON.stringify([entry.view, entry.image]), k]));
     header = lines[0].cells;
     column = Object.fromEntries(header.map((name, k) => [name, k]));
     rows = lines.slice(1).map(({ text: line, cells }, i) => {
       const [view, name, leg, part, edge] = cells, h = numbers(cells, "a", "b", "c"), e = numbers(cells, "u0", "v0", "u1", "v1");
-      const found = [...h, ...e].every(Number.isFinite);
+      const isMeasured = [...h, ...e].every(Number.isFinite);
       const k = image.get(JSON.stringify([view, name])) ?? -1;
-      return { i, line, cells, image: k, leg, part, edge, h: found ? h : null, ends: found ? [e.slice(0, 2), e.slice(2)] : null,
+      return { i, line, cells, image: k, leg, part, edge, h: isMeasured ? h : null, ends: isMeasured ? [e.slice(0, 2), e.slice(2)] : null,
         used: cells[column.verdict] === "used", expected: images[k]?.expected?.[`${leg}\n${part}\n${edge}`] ?? null };
     });
   };
@@ -113,8 +113,8 @@
       ["u0", "v0", "u1", "v1"].forEach((name, k) => put(name, ends.flat()[k]));
       for (const name of MEASURED) put(name, ""); // of another line
     }
-    const variance = edit.sigma ** 2, known = edit.ends || (used && !covarianceOf(row, ends)) ? [variance, 0, variance] : null;
-    if (known) ["s00", "s01", "s11"].forEach((name, k) => put(name, known[k]));
+    const variance = edit.sigma ** 2, covariance = edit.ends || (used && !covarianceOf(row, ends)) ? [variance, 0, variance] : null;
+    if (covariance) ["s00", "s01", "s11"].forEach((name, k) => put(name, covariance[k]));
     return cells.map((cell) => (/[",\n\r]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell)).join(",");
   };
   const tableText = () => [header.join(","), ...rows.map(lineText), ""].join("\n");
@@ -136,14 +136,14 @@
     show(row.i);
   };
   const step = (from, to, side) => {
-    const one = from.pop();
-    if (!one) { say(side === "before" ? "Nothing to undo." : "Nothing to do again."); return; }
-    one.series = "";
-    to.push(one);
-    put(one.i, one[side]);
-    if (rows[one.i].image !== at) open(rows[one.i].image);
-    show(one.i);
-    say(`${nameOf(rows[one.i])}: ${stateOf(rows[one.i])}.`);
+    const edited = from.pop();
+    if (!edited) { say(side === "before" ? "Nothing to undo." : "Nothing to do again."); return; }
+    edited.series = "";
+    to.push(edited);
+    put(edited.i, edited[side]);
+    if (rows[edited.i].image !== at) open(rows[edited.i].image);
+    show(edited.i);
+    say(`${nameOf(rows[edited.i])}: ${stateOf(rows[edited.i])}.`);
   };
   const undo = () => step(past, future, "before"), redo = () => step(future, past, "after");
   const use = (row) => {
@@ -166,10 +166,10 @@
 
   // What is seen.
   const make = (name, attributes, parent) => {
-    const one = document.createElementNS(stage.namespaceURI, name);
-    for (const [key, value] of Object.entries(attributes)) one.setAttribute(key, value);
-    parent?.append(one);
-    return one;
+    const element = document.createElementNS(stage.namespaceURI, name);
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    parent?.append(element);
+    return element;
   };
   const partOf = ({ leg, part }) => (part.startsWith(leg) ? part.slice(leg.length).replace(/^[_\- ]+/, "") : part);
   const nameOf = (row) => `${row.leg} ${partOf(row)}, edge ${row.edge}`;
@@ -229,7 +229,7 @@
     saved = n === 0;
     summary.textContent = n ? `${n} outline${n === 1 ? " is" : "s are"} edited and not downloaded yet.` : "Nothing is edited.";
     elements.image.selectedOptions[0].textContent = optionOf(at);
-    for (const one of document.querySelectorAll("[data-download]")) one.disabled = n === 0;
+    for (const button of document.querySelectorAll("[data-download]")) button.disabled = n === 0;
   };
   const optionOf = (k) => {
     const n = [...edits.keys()].filter((i) => rows[i].image === k).length;
@@ -239,15 +239,15 @@
     const before = chosen;
     chosen = i;
     if (rows[before]?.image === at) drawLine(rows[before]);
-    if (i < 0) { for (const one of list.querySelectorAll("button")) one.setAttribute("aria-pressed", false); return; }
+    if (i < 0) { for (const button of list.querySelectorAll("button")) button.setAttribute("aria-pressed", false); return; }
     stage.append(stage.querySelector(`[data-row="${i}"]`)); // above the others
     show(i);
     say(`${nameOf(rows[i])}: ${stateOf(rows[i])}.`);
   };
   const rescale = () => {
     stage.classList.toggle("near", scale() > 4);
-    for (const one of stage.querySelectorAll(".label, .handle")) {
-      one.setAttribute("transform", one.getAttribute("transform").replace(/scale\(.*\)/, `scale(${1 / scale()})`));
+    for (const mark of stage.querySelectorAll(".label, .handle")) {
+      mark.setAttribute("transform", mark.getAttribute("transform").replace(/scale\(.*\)/, `scale(${1 / scale()})`));
     }
   };
   const look = (x, y, width, height) => {

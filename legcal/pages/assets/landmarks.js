@@ -43,7 +43,7 @@
     const before = past.pop();
     if (!before) { say("Nothing to undo."); return; }
     clicks.clear();
-    for (const [name, one] of before.clicks) clicks.set(name, one);
+    for (const [name, click] of before.clicks) clicks.set(name, click);
     saved = false;
     drawn = null;
     if (before.at !== at) open(before.at);
@@ -54,10 +54,10 @@
 
   // The table.
   const quoted = (text) => (/[",]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
-  const rowsOf = () => [...clicks].map(([name, one]) => [...name.split(" ").map(Number), one])
+  const rowsOf = () => [...clicks].map(([name, click]) => [...name.split(" ").map(Number), click])
     .sort(([a, b], [c, d]) => a - c || b - d);
-  const tableText = () => ["view,image,joint,u,v,sigma", ...rowsOf().map(([image, joint, one]) => [
-    quoted(images[image].view), quoted(images[image].image), quoted(joints[joint].name), one.u.toFixed(2), one.v.toFixed(2), one.sigma,
+  const tableText = () => ["view,image,joint,u,v,sigma", ...rowsOf().map(([image, joint, click]) => [
+    quoted(images[image].view), quoted(images[image].image), quoted(joints[joint].name), click.u.toFixed(2), click.v.toFixed(2), click.sigma,
   ].join(","))].join("\n") + "\n";
   const download = () => {
     downloadTable(file, tableText());
@@ -99,10 +99,10 @@
 
   // What is seen.
   const make = (name, attributes, parent) => {
-    const one = document.createElementNS(stage.namespaceURI, name);
-    for (const [attribute, value] of Object.entries(attributes)) one.setAttribute(attribute, value);
-    parent?.append(one);
-    return one;
+    const element = document.createElementNS(stage.namespaceURI, name);
+    for (const [attribute, value] of Object.entries(attributes)) element.setAttribute(attribute, value);
+    parent?.append(element);
+    return element;
   };
   const scale = () => stage.getScreenCTM()?.a || 1;
   const place = (group, [x, y], more) => make("g", { transform: `translate(${x} ${y}) scale(${1 / scale()})`, ...more }, group);
@@ -115,17 +115,17 @@
       for (const edge of edges) make("polyline", { points: edge.map((p) => p.join(",")).join(" ") }, legs);
     }
     for (const [name, px] of Object.entries(drawn?.image === at ? drawn.joints : {})) {
-      const joint = joints.findIndex((one) => one.name === name);
+      const joint = joints.findIndex((entry) => entry.name === name);
       if (clickAt(joint)) continue;
       const mark = place(marks, px, { class: "expected" });
       make("path", { d: "M-5 0h10M0 -5v10" }, mark);
       make("text", { x: 7, y: -5 }, mark).textContent = joints[joint].label;
     }
     joints.forEach(({ name, label }, joint) => {
-      const one = clickAt(joint);
-      if (!one) return;
-      const mark = place(marks, [one.u, one.v], { class: `handle click${joint === chosen ? " chosen" : ""}`, "data-click": joint, tabindex: 0, role: "button",
-        "aria-label": `${name} at ${one.u.toFixed(1)}, ${one.v.toFixed(1)} px; arrow keys move it` });
+      const click = clickAt(joint);
+      if (!click) return;
+      const mark = place(marks, [click.u, click.v], { class: `handle click${joint === chosen ? " chosen" : ""}`, "data-click": joint, tabindex: 0, role: "button",
+        "aria-label": `${name} at ${click.u.toFixed(1)}, ${click.v.toFixed(1)} px; arrow keys move it` });
       make("circle", { r: 10 }, mark);
       make("path", { d: "M-15 0h10M5 0h10M0 -15v10M0 5v10" }, mark);
       make("text", { x: 13, y: -9 }, mark).textContent = label;
@@ -136,14 +136,14 @@
   const summarise = (did) => {
     const views = new Set(rowsOf().map(([image]) => images[image].view));
     summary.textContent = clicks.size ? `${clicks.size} click${clicks.size === 1 ? "" : "s"} in ${views.size} view${views.size === 1 ? "" : "s"} ${did}.` : "Nothing is clicked.";
-    for (const one of document.querySelectorAll("[data-landmarks]")) one.disabled = !clicks.size;
+    for (const button of document.querySelectorAll("[data-landmarks]")) button.disabled = !clicks.size;
     if (elements.save) elements.save.disabled = !clicks.size;
   };
   const show = () => {
     joints.forEach((_, joint) => {
-      const button = list.querySelector(`[data-of="${joint}"]`), one = clickAt(joint);
+      const button = list.querySelector(`[data-of="${joint}"]`), click = clickAt(joint);
       button.setAttribute("aria-pressed", joint === chosen);
-      button.lastElementChild.textContent = one ? `${one.u.toFixed(1)}, ${one.v.toFixed(1)}` : "";
+      button.lastElementChild.textContent = click ? `${click.u.toFixed(1)}, ${click.v.toFixed(1)}` : "";
     });
     for (const disc of drawing.querySelectorAll("[data-joint]")) {
       const joint = joints.findIndex(({ name }) => name === disc.dataset.joint);
@@ -258,12 +258,12 @@
     if (pressed === "Escape") { if (abandon()) done(); return; }
     if (event.ctrlKey || event.metaKey) { if (word === "z") { done(); undo(); } return; }
     if (["INPUT", "SELECT"].includes(event.target.tagName)) return;
-    const arrow = ARROWS[pressed], one = clickAt();
+    const arrow = ARROWS[pressed], click = clickAt();
     if (arrow && event.target.dataset.of !== undefined && arrow[1]) { done(); choose(chosen + arrow[1]); list.querySelector(`[data-of="${chosen}"]`).focus(); return; }
-    if (arrow && one) {
+    if (arrow && click) {
       done();
       const size = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
-      put([one.u + size * arrow[0], one.v + size * arrow[1]], chosen, `${at} ${chosen}`);
+      put([click.u + size * arrow[0], click.v + size * arrow[1]], chosen, `${at} ${chosen}`);
       return;
     }
     const keys = { delete: remove, backspace: remove, 0: whole, "+": () => zoom(0.7, ...middle()), "-": () => zoom(1 / 0.7, ...middle()),

@@ -1,4 +1,4 @@
-"""How a photograph looks: lights, lens, sensor, and random patterns of surfaces and backgrounds."""
+"""The appearance of photographs: lights, lens, sensor, patterns of surfaces and backgrounds."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -23,7 +23,7 @@ _MAX = {
 }  # fmt: skip
 
 _SIZE = 512  # points of the tile along a side
-_PERIOD = 0.25  # [m] after which a surface's pattern repeats
+_PERIOD = 0.25  # [m] period of a surface's pattern
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class Light:
     Attributes
     ----------
     direction : tuple of float
-        Where it stands, seen from the middle of the machine, in the base frame.
+        Direction of the lamp from the middle of the machine, in the base frame.
     with_camera : bool
         The direction is (right, up, back) of the camera instead: the lamp moves with it.
     distance : float
-        How far from there, in radii of the machine.
+        Distance from the middle, in radii of the machine.
     strength : float
         Radiance of a white surface that faces it at the middle of the machine; 1 is full scale.
     radius : float
         Its size in radii of the machine: soft shadows, 0 for hard ones.
     shadows : bool
-        Whether solids cast shadows of it.
+        Whether solids cast shadows in its light.
     """
 
     direction: tuple[float, float, float]
@@ -62,7 +62,7 @@ WORKSHOP_LIGHTS = (
 
 @dataclass(frozen=True)
 class Appearance:
-    """How a photograph looks. The defaults are a workshop; :meth:`clean` is flat light.
+    """The appearance of a photograph. The defaults are a workshop; :meth:`clean` is flat light.
 
     Attributes
     ----------
@@ -73,12 +73,12 @@ class Appearance:
     shadows : bool
         Whether any shadows are cast.
     limb, specular, texture : float
-        Factors on what the materials say: darkening towards grazing incidence, highlights and
+        Factors on the properties of materials: darkening towards grazing incidence, highlights and
         reflections, and mottled patterns. Zero leaves them out.
     background : float
         Mean radiance behind everything; 1 is full scale.
     background_contrast : float
-        How much the background varies, as a part of its mean; 0 for a plain one.
+        Variation of the background, as a fraction of its mean; 0 for a plain one.
     clutter : int
         Rods, boxes and balls around and behind the machine.
     cables : int
@@ -103,21 +103,21 @@ class Appearance:
     colour : bool
         Blue, green, red as OpenCV has them instead of grey.
     samples : int
-        Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144. An outline is not
-        biased by it, but its place scatters from one row of pixels to the next, by 0.030 px
+        Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144. It does not bias
+        outlines, but their position scatters from one row of pixels to the next, by 0.030 px
         (root mean square over directions) with 21 rays, 0.026 with 34, 0.015 with 55, 0.011
         with 89.
     camera : {"industrial", "machine-jpeg", "webcam", "phone", "action"}
-        What the camera does to the light: an industrial one nothing, others process it and write
+        Kind of camera: an industrial camera does not process the light, others process it and write
         JPEG files of 8 bits. A webcam, phone or action camera has a mosaic of colour filters, which
-        counts where ``colour`` is set.
+        matters if ``colour`` is set.
     jpeg : int or None
-        Quality of the JPEG, 1 to 100, in place of the camera's own.
+        Quality of the JPEG, 1 to 100, in place of the default of the camera.
 
     Raises
     ------
     UsageError
-        If a number makes no sense.
+        If a number is outside its range.
     """
 
     lights: tuple[Light, ...] = WORKSHOP_LIGHTS
@@ -175,7 +175,7 @@ class Appearance:
 
     @property
     def pipeline(self) -> CameraPipeline:
-        """What the camera does to the light."""
+        """The processing of the light by the camera."""
         camera = CAMERAS[self.camera]
         return camera if self.jpeg is None else replace(camera, jpeg=self.jpeg)
 
@@ -184,7 +184,7 @@ class Appearance:
         """Return flat light on a dark plain background, without blur or noise, linear, 16 bit.
 
         Every surface has one grey level, its albedo, so that outlines are edges between two
-        constants. Keyword arguments replace any of it.
+        constants. Keyword arguments override these.
         """
         plain = cls(
             lights=(), ambient=1.0, shadows=False, limb=0.0, specular=0.0, texture=0.0,
@@ -195,7 +195,7 @@ class Appearance:
 
 
 def _check_number(name: str, value: float) -> None:
-    """Refuse a number that makes no sense."""
+    """Refuse a number out of range."""
     most = _MAX.get(name, 1e6)
     least = _MIN.get(name, 0.0)
     words = "above" if name in _POSITIVE else "of at least"
@@ -207,7 +207,7 @@ def _check_number(name: str, value: float) -> None:
 
 
 def _check_choice(name: str, value: int, choices: tuple[int, ...]) -> None:
-    """Refuse a value that is not one of a few."""
+    """Refuse a value that is not among the choices."""
     if value not in choices:
         raise UsageError(
             f"The appearance could not be used: found {name} = {value}, needed one of "
@@ -230,7 +230,7 @@ def tile() -> Single:
 
 
 def mottled(local: Single) -> Single:
-    """Return the pattern at points (3, n) of a solid's own frame [m], (n,)."""
+    """Return the pattern (n,) at points (3, n) in the frame of a solid [m]."""
     k = np.float32(_SIZE / _PERIOD)
     a, b, c = local * k
     i = (a + np.float32(0.31) * c).astype(np.int32) & (_SIZE - 1)

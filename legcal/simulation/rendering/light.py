@@ -1,4 +1,4 @@
-"""Light on surfaces: what each lamp gives them, and the shadows that solids cast on them."""
+"""Light on surfaces: the light of each lamp, and the shadows of solids."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from legcal.simulation.solids import Box, SolidCylinder, Sphere
 
 _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
-_CHUNK = 8192  # points at a time
-_SPARE = 1e-4  # [m] for rounding
+_CHUNK = 8192  # points processed at a time
+_SPARE = 1e-4  # [m] margin for rounding
 
-_SHARP = 0.3  # strength of highlights from which a surface mirrors its surroundings
+_SHARP = 0.3  # minimum strength of highlights of a surface that mirrors its surroundings
 
 _STEP = 4  # [px] between traced pixels
 
-_LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
+_LARGE = 20_000  # minimum number of pixels of a solid with coarsely traced shadows
 
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
     """A light in the camera frame."""
 
-    position: Array  # (3,) where it stands [m]
+    position: Array  # (3,) [m]
     power: float  # radiance of a white surface that faces it, times its squared distance [m^2]
     radius: float  # its size [m]
     shadows: bool  # whether solids cast shadows of it
 
 
 class Occluders:
-    """Solids that stand between points and lamps: long ones around a line, others in a ball."""
+    """Solids that may be between points and lamps: long solids by a line, others by a ball."""
 
     def __init__(self, solids: Sequence[SolidInView]) -> None:
         long = [
@@ -58,9 +58,9 @@ class Occluders:
         self._reach = np.array([solids[i].reach for i in self._balls])
 
     def near(self, lamp: Lamp, to_lamp: Single) -> Iterator[tuple[int, IntArray]]:
-        """Yield solids with the points whose way to a lamp passes near them.
+        """Yield solids with the points that have a ray to a lamp near the solid.
 
-        The way l from a point to the lamp at O passes the line (u, w) at the distance
+        The ray l from a point to the lamp at O passes the line (u, w) at the distance
         l . (u x (O - w)) / |l x u|, and the ball about c at |l x (O - c)| / |l|.
         """
         l2 = np.einsum("in,in->n", to_lamp, to_lamp)
@@ -71,35 +71,37 @@ class Occluders:
         close = moment * moment < limit * (l2 - along * along + np.float32(1e-6) * l2)
         for row in np.flatnonzero(close.any(axis=1)):
             yield self._lines[row], np.flatnonzero(close[row])
-        away = lamp.position - self._centre
-        along = away.astype(np.float32) @ to_lamp
-        rest = np.sum(away**2, axis=1) - (self._reach + spare) ** 2
-        close = rest.astype(np.float32)[:, None] * l2 < along * along
+        lamp_from_centre = lamp.position - self._centre
+        along = lamp_from_centre.astype(np.float32) @ to_lamp
+        excess = np.sum(lamp_from_centre**2, axis=1) - (self._reach + spare) ** 2
+        close = excess.astype(np.float32)[:, None] * l2 < along * along
         for row in np.flatnonzero(close.any(axis=1)):
             yield self._balls[row], np.flatnonzero(close[row])
 
 
-def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: IntArray | int = -1) -> Single:
-    """Return the share of a lamp that is seen from points past solids, (n,).
+def seen_of_lamp(
+    lamp: Lamp, P: Single, occluders: Occluders, solid_of_point: IntArray | int = -1
+) -> Single:
+    """Return the share of a lamp that is visible from points past solids, (n,).
 
-    The half-shadow is that of a straight edge: it goes smoothly from none to all over the
-    apparent size of the lamp. That of a box or a mesh is hard.
+    The half-shadow is modelled by a straight edge: it rises smoothly from 0 to 1 over the apparent
+    size of the lamp. The shadow of a box or a mesh is hard.
     """
-    seen = np.ones(P.shape[1], dtype=np.float32)
-    own = np.broadcast_to(own, seen.shape)
+    share_of_lamp = np.ones(P.shape[1], dtype=np.float32)
+    solid_of_point = np.broadcast_to(solid_of_point, share_of_lamp.shape)
     position = lamp.position.astype(np.float32)[:, None]
     for start in range(0, P.shape[1], _CHUNK):
         points = P[:, start : start + _CHUNK]
         to_lamp = position - points
-        owners = own[start : start + _CHUNK]
+        owners = solid_of_point[start : start + _CHUNK]
         for i, some in occluders.near(lamp, to_lamp):
             some = some[owners[some] != i]
             if len(some):
                 share = _past(
                     occluders.solids[i], lamp, points.take(some, axis=1), to_lamp.take(some, axis=1)
                 )
-                seen[start + some] *= share
-    return seen
+                share_of_lamp[start + some] *= share
+    return share_of_lamp
 
 
 def _past(solid: SolidInView, lamp: Lamp, P: Single, to_lamp: Single) -> Single:
@@ -121,7 +123,7 @@ def _past_cylinder(
     R = solid.R.T.astype(np.float32)
     qx, qy, qz = R @ (P - solid.w.astype(np.float32)[:, None])
     lx, ly, lz = R @ to_lamp
-    # The part of the way that lies between the planes of the caps.
+    # The part of the ray between the planes of the caps.
     safe = np.where(np.abs(lz) < _TINY, np.float32(_TINY), lz)
     t1, t2 = (-0.5 * shape.length - qz) / safe, (0.5 * shape.length - qz) / safe
     first = np.minimum(np.maximum(np.minimum(t1, t2), 0.0), 1.0)
@@ -163,7 +165,7 @@ def _past_box(solid: SolidInView, shape: Box, P: Single, to_lamp: Single) -> Sin
 def _half_shadow(gap: Single, t: Single, lamp: Lamp) -> Single:
     """Return the share of the lamp past an edge: the ray misses it by a gap, t of the way."""
     width = t * np.float32(lamp.radius) + np.float32(_SMALLEST)
-    # A surface that coincides with the points' own one does not shade it.
+    # A surface that coincides with the surface of the points does not shade it.
     share = np.clip((gap + np.float32(_SMALLEST)) / width * 0.5 + 0.5, 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
@@ -175,7 +177,7 @@ class Lighting:
     lamps: tuple[Lamp, ...]  # the lamps
     ambient: float  # radiance of a white surface by light from everywhere
     up: Array  # (3,) away from the floor
-    limb: float  # limb, specular, texture: factors on what the materials say
+    limb: float  # limb, specular, texture: factors on the properties of materials
     specular: float
     texture: float
     colour: bool  # whether there are three channels
@@ -191,7 +193,7 @@ class Shaded:
     """Light from points of a surface, apart by where it comes from."""
 
     P: Single  # (3, n) the points in the camera frame [m]
-    fixed: Single  # (n_channels, n) what no shadow takes away
+    fixed: Single  # (n_channels, n) light that shadows do not affect
     of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
     faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
 
@@ -275,17 +277,17 @@ class CoarseSurface:
         self._where = i // _STEP, j // _STEP
         self._P: Single = np.stack([x * depth, y * depth, depth])
 
-    def seen(self, lamp: Lamp, occluders: Occluders, own: int = -1) -> Single:
-        """Return the share of a lamp that the surface sees, (width * height,)."""
+    def seen(self, lamp: Lamp, occluders: Occluders, solid: int = -1) -> Single:
+        """Return the share of a lamp that is visible from the surface, (width * height,)."""
         shape = -(-self._rays.height // _STEP), -(-self._rays.width // _STEP)
-        share, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        share[self._where] = seen_of_lamp(lamp, self._P, occluders, own)
-        known[self._where] = 1.0
-        around = cv2.blur(known, (3, 3))
+        share, is_traced = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        share[self._where] = seen_of_lamp(lamp, self._P, occluders, solid)
+        is_traced[self._where] = 1.0
+        around = cv2.blur(is_traced, (3, 3))
         spread = np.divide(
             cv2.blur(share, (3, 3)), around, out=np.ones_like(share), where=around > 0.05
         )
-        share = np.where(known > 0.0, share, spread)
+        share = np.where(is_traced > 0.0, share, spread)
         share = np.asarray(cv2.GaussianBlur(share, (3, 3), 0.0), np.float32)  # contacts show steps
         fine = cv2.resize(share, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
         whole = fine[: self._rays.height, : self._rays.width]
@@ -294,24 +296,24 @@ class CoarseSurface:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSolid:
-    """What is seen of one solid."""
+    """The visible part of one solid."""
 
     solid: int  # the solid, as an index
-    pixels: IntArray  # (n_pixels,) the pixels that show it, in order
+    pixels: IntArray  # (n_pixels,) its pixels, ascending
     shaded: Shaded  # the light from its points
     # (n_pixels,) the first point of each pixel where a pixel has several
     first: IntArray | None = None
 
     def faces(self, lamp: int) -> BoolArray:
-        """Return the pixels in which the surface faces a lamp, (n_pixels,)."""
+        """Return a mask (n_pixels,) of the pixels where the surface faces a lamp."""
         faces = self.shaded.faces_lamp[lamp]
         return faces if self.first is None else np.logical_or.reduceat(faces, self.first)
 
-    def radiance(self, seen: Sequence[Single | None], n_terms: int) -> Single:
+    def radiance(self, shares: Sequence[Single | None], n_terms: int) -> Single:
         """Return the light summed over points, (n_terms, n_channels, n_pixels)."""
         lit = [
             light if share is None else light * self._spread(share)
-            for light, share in zip(self.shaded.of_lamp, seen, strict=True)
+            for light, share in zip(self.shaded.of_lamp, shares, strict=True)
         ]
         fixed = self.shaded.fixed
         terms = np.stack([fixed, *lit]) if n_terms > 1 else np.asarray(sum(lit, fixed))[None]
@@ -320,7 +322,7 @@ class VisibleSolid:
         return np.asarray(np.add.reduceat(terms, self.first, axis=-1))
 
     def _spread(self, share: Single) -> Single:
-        """Return what holds for pixels for all of their points."""
+        """Return the shares of pixels, repeated for all of their points."""
         if self.first is None:
             return share
         return np.repeat(share, np.diff(self.first, append=self.shaded.P.shape[1]))
@@ -329,15 +331,15 @@ class VisibleSolid:
 def shares_of_lamps(
     parts: Sequence[VisibleSolid], lamps: Sequence[Lamp], occluders: Occluders, rays: PixelRays
 ) -> list[list[Single | None]]:
-    """Return the share of each lamp that each part sees, for each part and lamp.
+    """Return the visible share of each lamp for each part, by part and lamp.
 
-    A pixel with several points is traced from the first of them. Where a solid fills many
-    pixels, some of them are traced.
+    A pixel with several points is traced from the first point. Where a solid fills many pixels,
+    only some of them are traced.
     """
-    found: list[list[Single | None]] = [[] for _ in parts]
+    shares_by_part: list[list[Single | None]] = [[] for _ in parts]
     for k, lamp in enumerate(lamps):
         if not lamp.shadows:
-            for shares in found:
+            for shares in shares_by_part:
                 shares.append(None)
             continue
         lit = [np.flatnonzero(part.faces(k)) for part in parts]
@@ -345,23 +347,25 @@ def shares_of_lamps(
         small = [len(some) <= _LARGE for some in lit]
         together = [P for P, is_small in zip(points, small, strict=True) if is_small]
         owners = [np.full(P.shape[1], p.solid) for p, P in zip(parts, points, strict=True)]
-        own = [o for o, is_small in zip(owners, small, strict=True) if is_small]
-        seen = np.ones(0, dtype=np.float32)
+        small_owners = [o for o, is_small in zip(owners, small, strict=True) if is_small]
+        traced_shares = np.ones(0, dtype=np.float32)
         if together:
             P = np.concatenate(together, axis=1)
-            seen = seen_of_lamp(lamp, P, occluders, np.concatenate(own))
+            traced_shares = seen_of_lamp(lamp, P, occluders, np.concatenate(small_owners))
         start = 0
-        for part, some, P, is_small, shares in zip(parts, lit, points, small, found, strict=True):
+        for part, some, P, is_small, shares in zip(
+            parts, lit, points, small, shares_by_part, strict=True
+        ):
             share = np.ones(len(part.pixels), dtype=np.float32)
             if is_small:
-                share[some] = seen[start : start + len(some)]
+                share[some] = traced_shares[start : start + len(some)]
                 start += len(some)
             else:
                 pixels = part.pixels[some]
                 surface = CoarseSurface(rays, pixels, P[2])
                 share[some] = surface.seen(lamp, occluders, part.solid).take(pixels)
             shares.append(share)
-    return found
+    return shares_by_part
 
 
 def _traced(part: VisibleSolid, some: IntArray) -> Single:

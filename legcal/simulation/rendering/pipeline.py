@@ -1,9 +1,9 @@
-"""What a camera makes of the light of a scene: lens, sensor, processing, and the file it writes.
+"""From the light of a scene to the file of a camera: lens, sensor, processing, compression.
 
-An industrial camera hands on what its sensor counts. Cameras for people do more: a mosaic of
-colour filters is filled in, noise is smoothed away, edges are sharpened until they overshoot, tones
-are bent, and what is left is written as a JPEG. :data:`CAMERAS` are typical ones; the numbers of
-each lie within what reviews and standards (ISO 12233, ISO 15739, IEC 61966-2-1) report of its kind.
+An industrial camera writes the counts of its sensor. Consumer cameras do more: a mosaic of colour
+filters is filled in, noise is smoothed, edges are sharpened until they overshoot, a tone curve is
+applied, and the result is written as a JPEG. :data:`CAMERAS` are typical cameras; their numbers
+are within the ranges that reviews and standards (ISO 12233, ISO 15739, IEC 61966-2-1) report.
 """
 
 from dataclasses import dataclass
@@ -24,41 +24,41 @@ _FACTORS: dict[Subsampling, int] = {
     "4:2:0": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
 }
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
-_FIELD_LEVELS = 4  # of blur between the middle and the corners
-_CHANNELS = (-1.0, 0.0, 1.0)  # of chromatic aberration: blue, green, red
-_SAMPLED_BLUR = 1.0  # [px] from which on light that pixels have counted can be blurred
-_MOST_FINE = 2**23  # pixels of a finer picture, for memory
+_FIELD_LEVELS = 4  # levels of blur between the middle and the corners
+_CHANNELS = (-1.0, 0.0, 1.0)  # factors of chromatic aberration: blue, green, red
+_SAMPLED_BLUR = 1.0  # [px] minimum blur that can be applied to whole pixels
+_MOST_FINE = 2**23  # maximum number of pixels of a finer picture, for memory
 
 
 @dataclass(frozen=True)
 class CameraPipeline:
-    """What a kind of camera does to the light that its lens gathers.
+    """The processing of light by a kind of camera.
 
     Attributes
     ----------
     colour : bool
-        Whether a mosaic of colour filters (RGGB) is before the sensor, and filled in after it.
+        Whether a mosaic of colour filters (RGGB) is in front of the sensor, and filled in after it.
     vignetting : float
-        Part of the light that is lost in the corners; it grows with the square of the distance
+        Fraction of the light that is lost in the corners; it grows with the square of the distance
         from the middle.
     chromatic : float
-        By what part red is larger than green, and blue smaller.
+        Relative magnification of red over green, and of green over blue.
     field_blur : float
-        Standard deviation of the blur in the corners, besides that of the middle [px].
+        Standard deviation of the blur in the corners, besides the blur of the middle [px].
     sensor_bits : int
-        Of what the sensor counts.
+        Bits of the sensor's counts.
     denoise : float
-        Standard deviation of the grey levels, as a part of full scale, up to which differences of
-        neighbours are smoothed away (a bilateral filter); 0 for none.
+        Standard deviation of the grey levels, as a fraction of full scale, up to which differences
+        of neighbours are smoothed (a bilateral filter); 0 for none.
     tone : float
-        Strength of a tone curve in the shape of an S: how much steeper than straight it is in the
-        middle, as a part; 0 is straight. It follows the gamma.
+        Strength of an S-shaped tone curve: relative increase of its slope in the middle; 0 is
+        straight. It follows the gamma.
     sharpen, radius : float
-        Unsharp mask: how many times the difference from a Gaussian blur of a radius [px] is added.
+        Unsharp mask: factor of the difference from a Gaussian blur of a radius [px].
     jpeg : int
         Quality of the JPEG, 1 to 100; 0 for a PNG.
     subsampling : {"4:4:4", "4:2:2", "4:2:0"}
-        How coarse colours are in the JPEG.
+        Chroma subsampling of the JPEG.
     """
 
     colour: bool = False
@@ -75,23 +75,23 @@ class CameraPipeline:
 
     @property
     def suffix(self) -> str:
-        """Return what the names of its files end with."""
+        """Return the suffix of its file names."""
         return ".jpg" if self.jpeg else ".png"
 
     def fineness(self, blur: float, n_pixels: int) -> int:
-        """Return into how many along rows and columns pixels must be divided for a blur [px].
+        """Return the number of parts of a pixel along rows and columns that a blur [px] needs.
 
-        A lens blurs light before pixels count it. Values of whole pixels cannot tell how light is
-        spread inside them: blurred by less than a pixel, edges would be spread by another shape
-        than a Gaussian, and outlines of a picture would seem to lie inside by a tenth of a pixel.
+        A lens blurs light before pixels count it. Values of whole pixels do not resolve the
+        distribution of light inside them: with a blur below a pixel, edges would not be spread by a
+        Gaussian, and outlines would move inwards by a tenth of a pixel.
         """
         is_fine = blur < _SAMPLED_BLUR and (blur > 0.0 or self.field_blur > 0.0)
         return 2 if is_fine and 4 * n_pixels <= _MOST_FINE else 1
 
     def through_lens(self, light: Single, blur: float, fineness: int = 1) -> Single:
-        """Return what pixels gather of light (height, width[, 3]), its blur in the middle in px.
+        """Return the light (height, width[, 3]) on pixels, with a blur in the middle [px].
 
-        The light is that of parts of pixels, ``fineness`` along rows and columns.
+        The light is sampled ``fineness`` times a pixel along rows and columns.
         """
         light = self._refracted(light, blur, fineness)
         if fineness > 1:
@@ -103,7 +103,7 @@ class CameraPipeline:
         return light
 
     def _refracted(self, light: Single, blur: float, fineness: int) -> Single:
-        """Return light as the lens spreads it."""
+        """Return light after the lens: chromatic aberration and blur."""
         if self.chromatic > 0.0 and light.ndim == 3:
             light = np.stack(
                 [
@@ -132,7 +132,7 @@ class CameraPipeline:
     def counted(
         self, light: Single, electrons: float, read_noise: float, rng: np.random.Generator
     ) -> Single:
-        """Return what the sensor counts of light (height, width[, 3]), 0 to 1 at full scale.
+        """Return the counts of the sensor for light (height, width[, 3]), 0 to 1 at full scale.
 
         Electrons of a pixel at full scale (infinite: no noise) and noise in the dark [electrons].
         Behind a mosaic of filters each pixel counts one colour; the others are filled in.
@@ -155,7 +155,7 @@ class CameraPipeline:
         return level
 
     def processed(self, level: Single, gamma: float) -> Single:
-        """Return what the camera's processor makes of counts (height, width[, 3]), 0 to 1."""
+        """Return the processed counts (height, width[, 3]), 0 to 1: gamma, tone, sharpening."""
         if gamma != 1.0:
             level = np.asarray(cv2.pow(level, 1.0 / gamma))
         if self.denoise > 0.0:
@@ -231,8 +231,8 @@ def _scaled(light: Single, scale: float) -> Single:
 
 
 def _mosaic(light: Single) -> Single:
-    """Return what pixels behind filters see of blue, green, red (height, width, 3): R G, G B."""
-    seen = light[..., 1].copy()
-    seen[0::2, 0::2] = light[0::2, 0::2, 2]
-    seen[1::2, 1::2] = light[1::2, 1::2, 0]
-    return seen
+    """Return counts (height, width) behind filters R G, G B from blue, green, red (..., 3)."""
+    counted = light[..., 1].copy()
+    counted[0::2, 0::2] = light[0::2, 0::2, 2]
+    counted[1::2, 1::2] = light[1::2, 1::2, 0]
+    return counted

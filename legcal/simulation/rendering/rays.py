@@ -1,4 +1,4 @@
-"""Rays of a camera's pixels, and where they meet solids: depths, faces, normals and prints."""
+"""Rays of a camera's pixels and their intersections with solids: depth, face, normal, print."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,20 +18,20 @@ from legcal.vision.camera import Camera
 Single = NDArray[np.float32]
 Faces = NDArray[np.integer[Any]]
 
-_TILE = 64  # pixels after which the shifts of the lattice repeat
-_SPACING = 8  # [px] between the pixels at which distortion is undone
+_TILE = 64  # [px] period of the shifts of the lattice
+_SPACING = 8  # [px] between the pixels that are undistorted exactly
 
 CAP = 1  # the face of a cylinder; 0 is its lateral surface
 _TINY = 1e-12
 
 NEAR = 1e-4  # [m] in front of the camera
 MARGIN = 2  # [px]
-_SPARE = 0.02  # of the picture, around it
-_PIECES = 12  # of each side of a polygon, which the lens bends
-_SHIFT = 4  # bits of a fraction of a pixel
+_SPARE = 0.02  # margin around the picture, in units of its size
+_PIECES = 12  # segments of each side of a polygon, which the lens bends
+_SHIFT = 4  # fractional bits of pixels
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
-_PIXELS = 8192  # at a time
+_PIXELS = 8192  # pixels processed at a time
 
 
 class PixelRays:
@@ -52,8 +52,8 @@ class PixelRays:
     def within(self, pixels: IntArray, samples: int) -> tuple[Single, Single]:
         """Return several points (x, y) inside each of some pixels, both (n, samples).
 
-        They are a Fibonacci lattice, shifted differently in each pixel, so that the share of
-        them on one side of an edge is an unbiased estimate of the pixel's area there.
+        They are a Fibonacci lattice, shifted differently in each pixel, so that the share of points
+        on one side of an edge is an unbiased estimate of the pixel's area there.
         """
         rows, columns = np.divmod(pixels, self.width)
         du, dv = _offsets(samples)
@@ -93,12 +93,12 @@ def _undistorted(camera: Camera) -> tuple[Single, Single]:
 
 @lru_cache(maxsize=4)
 def pixel_rays(camera: Camera, fineness: int = 1) -> PixelRays:
-    """Return the rays of the parts of a camera's pixels, the same ones for all of its images."""
+    """Return the rays of the parts of a camera's pixels, shared by all of its images."""
     return PixelRays(camera if fineness == 1 else divided(camera, fineness))
 
 
 def divided(camera: Camera, fineness: int) -> Camera:
-    """Return a camera whose pixels are parts of those of another, so many in each row of one."""
+    """Return a camera with each pixel divided into ``fineness`` x ``fineness`` pixels."""
     K = camera.K * [[fineness], [fineness], [1.0]]
     K[:2, 2] += 0.5 * (fineness - 1)
     width, height = fineness * camera.width, fineness * camera.height
@@ -107,7 +107,7 @@ def divided(camera: Camera, fineness: int) -> Camera:
 
 @lru_cache(maxsize=4)
 def _offsets(samples: int) -> tuple[Single, Single]:
-    """Return where in each pixel of a tile the rays are, (_TILE * _TILE, samples) [px]."""
+    """Return the positions of rays in each pixel of a tile, (_TILE * _TILE, samples) [px]."""
     before, now = 1, 1
     while now < samples:
         before, now = now, before + now
@@ -135,16 +135,16 @@ def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> lis
     if not solids:
         return []
     motions = np.stack([placed.T_base_solid.as_matrix() for placed in solids])
-    found = []
+    in_camera = []
     for placed, T in zip(solids, T_camera_base.as_matrix() @ motions, strict=True):
         shape, R, w = placed.solid.shape, T[:3, :3], T[:3, 3]
         middle, reach = holding_sphere(shape)
-        found.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
-    return found
+        in_camera.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
+    return in_camera
 
 
 def holding_sphere(shape: Shape) -> tuple[Array, float]:
-    """Return middle (3,) and radius of a sphere around a shape, in its own frame [m]."""
+    """Return middle (3,) and radius of a sphere around a shape, in the shape's frame [m]."""
     if isinstance(shape, Mesh):
         low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
         middle = 0.5 * (low + high)
@@ -157,9 +157,9 @@ def holding_sphere(shape: Shape) -> tuple[Array, float]:
 
 
 def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tuple[Single, IntArray]:
-    """Return depth [m] and triangle of a mesh that rays (x, y, 1) meet first; infinite where none.
+    """Return depth [m] and index of the first triangle on rays (x, y, 1); infinite for a miss.
 
-    Embree finds the triangle in single precision; the depth is that of its plane.
+    Embree finds the triangle in single precision; the depth is computed from its plane.
     """
     rays = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float64) @ solid.R
     origin = -solid.R.T @ solid.w
@@ -175,7 +175,7 @@ def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tupl
 
 
 def is_hidden(solid: SolidInView, mesh: Mesh, P: Single, lamp: Array) -> Single:
-    """Return 1 where a mesh stands between points (3, n) of the camera frame and a lamp, else 0."""
+    """Return 1 where a mesh is between points (3, n) of the camera frame and a lamp, else 0."""
     points = (P.T - solid.w) @ solid.R
     towards = (lamp - solid.w) @ solid.R - points
     hidden = _caster(mesh).intersects_any(points, towards)
@@ -184,14 +184,14 @@ def is_hidden(solid: SolidInView, mesh: Mesh, P: Single, lamp: Array) -> Single:
 
 @lru_cache(maxsize=256)
 def _caster(mesh: Mesh) -> Any:
-    """Return what casts rays at a mesh."""
+    """Return the ray caster of a mesh."""
     import trimesh  # half a second: only where there is a mesh
 
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).ray
 
 
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
-    """Return where rays enter a solid."""
+    """Return the depths and faces of the entry points of rays into a solid."""
     shape = solid.shape
     if isinstance(shape, SolidCylinder):
         return _cylinder(solid, shape, x, y)
@@ -294,8 +294,8 @@ def _box(solid: SolidInView, shape: Box, x: Single, y: Single) -> tuple[Single, 
 def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
     """Return the pixels that a solid may cover, with a small margin.
 
-    The hull of points around the solid is cut to the part of the sensor plane that the picture
-    shows, where the lens is known, before it is distorted.
+    The hull of points around the solid is clipped to the picture's part of the sensor plane, where
+    the lens model is valid, before it is distorted.
     """
     points = surrounding_points(solid)
     in_front = points[:, 2] > NEAR
@@ -312,7 +312,7 @@ def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
 
 
 def surrounding_points(solid: SolidInView) -> Array:
-    """Return points whose convex hull holds the solid, (n, 3), in the camera frame [m]."""
+    """Return points (n, 3) in the camera frame with a convex hull that contains the solid [m]."""
     shape = solid.shape
     if isinstance(shape, SolidCylinder):
         n = 12
@@ -344,11 +344,11 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
             inside = sign * (polygon[:, axis] - bound)
             kept = []
             for i in range(len(polygon)):
-                here, before = inside[i], inside[i - 1]
-                if (here >= 0.0) != (before >= 0.0):
-                    t = before / (before - here)
+                distance, previous = inside[i], inside[i - 1]
+                if (distance >= 0.0) != (previous >= 0.0):
+                    t = previous / (previous - distance)
                     kept.append(polygon[i - 1] + t * (polygon[i] - polygon[i - 1]))
-                if here >= 0.0:
+                if distance >= 0.0:
                     kept.append(polygon[i])
             if not kept:
                 return np.zeros((0, 2))
@@ -373,9 +373,9 @@ def _filled(hull: Array, width: int, height: int) -> IntArray:
     corners = np.rint((hull - low) * 2**_SHIFT).astype(np.int32)
     cv2.fillConvexPoly(mask, corners, 1, shift=_SHIFT)
     cv2.polylines(mask, [corners], True, 1, thickness=2 * MARGIN + 1, shift=_SHIFT)
-    where = np.flatnonzero(mask)
+    inside = np.flatnonzero(mask)
     skipped = width - mask.shape[1]  # pixels between the end of a row and the start of the next
-    return np.asarray(where + where // mask.shape[1] * skipped + low[1] * width + low[0])
+    return np.asarray(inside + inside // mask.shape[1] * skipped + low[1] * width + low[0])
 
 
 def printed(solid: SolidInView, x: Single, y: Single, face: Faces) -> Single | None:
@@ -404,11 +404,11 @@ def printed_inside(
         return None
     means = []
     for start in range(0, len(pixels), _PIXELS):
-        here = pixels[start : start + _PIXELS]
-        x, y = rays.within(here, samples)
+        pixel_chunk = pixels[start : start + _PIXELS]
+        x, y = rays.within(pixel_chunk, samples)
         faces = np.repeat(face[start : start + _PIXELS], samples)
-        found = printed(solid, x.ravel(), y.ravel(), faces)
-        if found is None:
+        ink = printed(solid, x.ravel(), y.ravel(), faces)
+        if ink is None:
             return None
-        means.append(found.reshape(len(here), samples).mean(axis=1))
+        means.append(ink.reshape(len(pixel_chunk), samples).mean(axis=1))
     return np.concatenate(means) if means else np.zeros(0, dtype=np.float32)

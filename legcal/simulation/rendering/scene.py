@@ -1,4 +1,4 @@
-"""Photographs: surroundings of a view, what pixels show, what lens and sensor make of it."""
+"""Photographs: surroundings of a view, radiance of pixels, then lens and sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,13 +48,13 @@ _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=
                   tint=(1.15, 1.0, 0.85))  # fmt: skip
 _CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
 
-_UP = np.array([0.0, 0.0, 1.0])  # of the base frame: lamps, tables
+_UP = np.array([0.0, 0.0, 1.0])  # in the base frame, for lamps and tables
 
-_TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
-_THIN = 3.0  # [px] solids that rays through pixel centres may miss
-_PIXELS = 8192  # on edges, at a time
-_SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
-_FACES = 8  # that are told apart in the search for edges
+_TIE = 1.0 - 3e-6  # minimum ratio of depths of coincident surfaces
+_THIN = 3.0  # [px] maximum width of solids that rays through pixel centres may miss
+_PIXELS = 8192  # pixels on edges painted at a time
+_SHADED = 3  # one in so many of a pixel's rays that meet a solid is shaded
+_FACES = 8  # number of faces distinguished in the search for edges
 
 
 def _around(placed: Sequence[PlacedSolid]) -> tuple[Array, float]:
@@ -122,7 +122,7 @@ def _piece(
     turn = (
         Rotation.random(rng=rng) if kind == 0 else Rotation.from_euler("z", rng.uniform(0.0, 7.0))
     )
-    where = T_base_camera.apply(z * np.array([xy[0], xy[1], 1.0]))
+    position = T_base_camera.apply(z * np.array([xy[0], xy[1], 1.0]))
     material = Material(
         albedo=float(rng.uniform(0.05, 0.7)),
         specular=float(rng.choice([0.05, 0.15, 0.6])),
@@ -132,7 +132,7 @@ def _piece(
         tint=_tint(rng),
     )
     return _placed(
-        f"clutter{number + 1}", shape, RigidTransform.from_components(where, turn), material
+        f"clutter{number + 1}", shape, RigidTransform.from_components(position, turn), material
     )
 
 
@@ -153,13 +153,15 @@ def _cable(
     turn = T_base_camera.rotation * Rotation.from_euler(
         "xz", [np.pi / 2 + rng.uniform(-0.3, 0.3), rng.uniform(0.0, np.pi)]
     )
-    where = eye + t * way + width * aside
+    position = eye + t * way + width * aside
     shape = SolidCylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
-    return _placed(f"cable{number + 1}", shape, RigidTransform.from_components(where, turn), _CABLE)
+    return _placed(
+        f"cable{number + 1}", shape, RigidTransform.from_components(position, turn), _CABLE
+    )
 
 
 def _placed(name: str, shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
-    """Return a solid that is no part of the machine."""
+    """Return a placed solid outside the machine."""
     return PlacedSolid(Solid(name, None, shape, T, material), T)
 
 
@@ -175,7 +177,7 @@ def develop(
 ) -> Image:
     """Return the image of a radiance: lens, saturation, noise, processing, rounding.
 
-    The radiance is that of parts of pixels, ``fineness`` along rows and columns.
+    The radiance is sampled ``fineness`` times a pixel along rows and columns.
     """
     camera = appearance.pipeline
     exposed = radiance * np.float32(appearance.exposure)
@@ -191,9 +193,9 @@ def develop(
 class FrameBuffer:
     """A picture being painted."""
 
-    z: Single  # (n,) depth of what every pixel's centre shows [m]; infinite for the background
-    # (n_terms, n_channels, n) radiance: the sum, or apart what no shadow takes away and the light
-    # of each lamp
+    z: Single  # (n,) depth at every pixel's centre [m]; infinite for the background
+    # (n_terms, n_channels, n) radiance: the sum, or separately the light without shadows and the
+    # light of each lamp
     terms: Single
 
 
@@ -209,7 +211,7 @@ class Painter:
         solids: Sequence[SolidInView],
         bystanders: Sequence[SolidInView] = (),
     ) -> None:
-        """Paint solids over a picture, where they are in front of what it shows."""
+        """Paint solids over a picture where they are in front of its surfaces."""
         behind = canvas.z.copy()
         occluders = Occluders([*solids, *bystanders])
         feet = [footprint(self.rays, solid) for solid in solids]
@@ -225,10 +227,10 @@ class Painter:
                 ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
                 parts.append(VisibleSolid(i, inside, shaded))
-        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
-        for part, shares in zip(parts, seen, strict=True):
+        lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares in zip(parts, lamp_shares, strict=True):
             canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
-        del key, face, parts, seen
+        del key, face, parts, lamp_shares
         for start in range(0, len(on_edge), _PIXELS):
             pixels = on_edge[start : start + _PIXELS]
             shown = near[:, start : start + _PIXELS]
@@ -237,7 +239,7 @@ class Painter:
     def _first_hits(
         self, z: Single, solids: Sequence[SolidInView], feet: Sequence[IntArray]
     ) -> tuple[NDArray[np.uint16], NDArray[np.int32]]:
-        """Find what every pixel's centre shows: solid and face as a key (0: none of them), face."""
+        """Return for every pixel's centre a key of solid and face (0: none), and the face."""
         key = np.zeros(len(z), dtype=np.uint16)
         faces = np.zeros(len(z), dtype=np.int32)
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
@@ -255,7 +257,7 @@ class Painter:
     ) -> BoolArray:
         """Return the pixels that an edge of a painted surface may cross.
 
-        A straight edge through a pixel parts its centre from that of one of the four beside it.
+        A straight edge through a pixel separates its centre from the centre of a neighbour.
         """
         picture = key.reshape(self.rays.height, self.rays.width)
         cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -272,21 +274,21 @@ class Painter:
         solids: Sequence[SolidInView],
         feet: Sequence[IntArray],
     ) -> BoolArray:
-        """Return which solids each of some pixels may show, (n_solids, n): those of pixels around.
+        """Return a mask (n_solids, n) of solids that pixels may show: the solids of pixels around.
 
-        Thin ones may be anywhere in their footprints.
+        Thin solids may be anywhere in their footprints.
         """
         rows, columns = np.divmod(on_edge, self.rays.width)
         above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, self.rays.height - 1)
         left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, self.rays.width - 1)
         shown = np.zeros((len(solids) + 1, len(on_edge)), dtype=np.bool_)
-        every = np.arange(len(on_edge))
+        indices = np.arange(len(on_edge))
         for row in (above, rows, below):
             for column in (left, columns, right):
-                shown[key.take(row * self.rays.width + column) // _FACES, every] = True
-        for solid, foot, here in zip(solids, feet, shown[1:], strict=True):
+                shown[key.take(row * self.rays.width + column) // _FACES, indices] = True
+        for solid, foot, on_solid in zip(solids, feet, shown[1:], strict=True):
             if self._is_thin(solid):
-                here |= np.isin(on_edge, foot, assume_unique=True)
+                on_solid |= np.isin(on_edge, foot, assume_unique=True)
         return shown[1:]
 
     def _is_thin(self, solid: SolidInView) -> bool:
@@ -303,7 +305,7 @@ class Painter:
         shown: BoolArray,
         occluders: Occluders,
     ) -> None:
-        """Average many rays in each of some pixels, which may show some of the solids.
+        """Average many rays in each of some pixels, with the solids that each may show.
 
         ``behind`` is the depth before painting.
         """
@@ -311,32 +313,36 @@ class Painter:
         X, Y = self.rays.within(pixels, S)
         X, Y = X.ravel(), Y.ravel()
         Z = np.repeat(behind, S)
-        who = np.zeros(n * S, dtype=np.uint16)
+        solid_of_ray = np.zeros(n * S, dtype=np.uint16)
         faces = np.zeros(n * S, dtype=np.int32)
         one_pixel = np.arange(S)
         touched = []
         for i in np.flatnonzero(shown.any(axis=1)).tolist():
-            here = (np.flatnonzero(shown[i])[:, None] * S + one_pixel).ravel()
-            depth, face = intersect(solids[i], X.take(here), Y.take(here))
-            closer = np.flatnonzero(depth < Z.take(here) * np.float32(_TIE))
+            rays = (np.flatnonzero(shown[i])[:, None] * S + one_pixel).ravel()
+            depth, face = intersect(solids[i], X.take(rays), Y.take(rays))
+            closer = np.flatnonzero(depth < Z.take(rays) * np.float32(_TIE))
             if len(closer):
-                at = here.take(closer)
-                Z[at], who[at], faces[at] = depth.take(closer), i + 1, face.take(closer)
-                touched.append((i, here))
-        uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
+                hit_rays = rays.take(closer)
+                Z[hit_rays], solid_of_ray[hit_rays], faces[hit_rays] = (
+                    depth.take(closer),
+                    i + 1,
+                    face.take(closer),
+                )
+                touched.append((i, rays))
+        uncovered = np.count_nonzero(solid_of_ray.reshape(n, S) == 0, axis=1) / S
         total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
         parts, weights = [], []
-        for i, here in touched:
-            at = here[who.take(here) == i + 1]
-            if len(at):
-                at, first, weight = _some_of_each(at, at // S)
-                x, y, face = X.take(at), Y.take(at), faces.take(at)
+        for i, rays in touched:
+            hit_rays = rays[solid_of_ray.take(rays) == i + 1]
+            if len(hit_rays):
+                hit_rays, first, weight = _some_of_each(hit_rays, hit_rays // S)
+                x, y, face = X.take(hit_rays), Y.take(hit_rays), faces.take(hit_rays)
                 ink = printed(solids[i], x, y, face)
-                shaded = shade(solids[i], x, y, Z.take(at), face, self.light, ink)
-                parts.append(VisibleSolid(i, at[first] // S, shaded, first))
+                shaded = shade(solids[i], x, y, Z.take(hit_rays), face, self.light, ink)
+                parts.append(VisibleSolid(i, hit_rays[first] // S, shaded, first))
                 weights.append(weight)
-        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
-        for part, shares, weight in zip(parts, seen, weights, strict=True):
+        lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares, weight in zip(parts, lamp_shares, weights, strict=True):
             light = part.radiance(shares, len(canvas.terms))
             total[:, :, part.pixels] += light * (weight / np.float32(S))
         canvas.terms[:, :, pixels] = total
@@ -345,9 +351,9 @@ class Painter:
 def _some_of_each(
     rays: IntArray, pixel: NDArray[np.intp]
 ) -> tuple[IntArray, NDArray[np.intp], Single]:
-    """Return every third ray of each pixel, where each pixel's rays start, and what they weigh.
+    """Return every third ray of each pixel, the start of each pixel's rays, and their weights.
 
-    A surface's light varies little inside a pixel; that its rays are many matters for its edge.
+    A surface's light varies little inside a pixel; many rays are needed for its edge only.
     """
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     count = np.diff(first, append=len(rays))
@@ -376,8 +382,8 @@ class RenderedView:
     appearance: Appearance
     painter: Painter  # paints with the camera and the light
     canvas: FrameBuffer  # the surroundings, their light apart by lamp
-    bystanders: tuple[SolidInView, ...]  # what stands around and casts shadows on the machine
-    foreground: tuple[SolidInView, ...]  # what hangs in front of it
+    bystanders: tuple[SolidInView, ...]  # objects around that cast shadows on the machine
+    foreground: tuple[SolidInView, ...]  # objects in front of it
     fineness: int  # parts of a pixel along rows and columns that are painted
 
     def render(self, placed: Sequence[PlacedSolid], rng: np.random.Generator) -> Image:
@@ -451,10 +457,10 @@ def _lighting(
         distance = light.distance * radius
         if light.with_camera:
             direction = T_camera_base.rotation.inv().apply(direction * [1.0, -1.0, -1.0])
-        where: Array = centre + distance * direction
+        position: Array = centre + distance * direction
         lamps.append(
             Lamp(
-                position=np.asarray(T_camera_base.apply(where)),
+                position=np.asarray(T_camera_base.apply(position)),
                 power=light.strength * distance**2,
                 radius=light.radius * radius,
                 shadows=light.shadows and appearance.shadows,
@@ -474,7 +480,7 @@ def _lighting(
 def _empty(
     rays: PixelRays, light: Lighting, appearance: Appearance, rng: np.random.Generator
 ) -> FrameBuffer:
-    """Return the background alone."""
+    """Return a frame buffer with the background only."""
     n = rays.width * rays.height
     terms = np.zeros((1 + len(light.lamps), light.n_channels, n), dtype=np.float32)
     terms[0] = appearance.background
