@@ -124,7 +124,7 @@ def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
         found = fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed, smooth=0.06, sheet=SHEET))
         off = intrinsic_values(found.adjusted.camera) - intrinsic_values(CAMERAS["plumb_bob"])
         squares.append(off @ np.linalg.solve(found.covariance, off) / len(off))
-        assert np.median(found.seen.sigma_px) < 0.1
+        assert np.median(found.corners.sigma_px) < 0.1
     assert 0.4 < np.mean(squares) < 1.8
 
 
@@ -186,7 +186,10 @@ def corrected(seen: BoardImages) -> BoardImages:
     thinned(
         [
             (seen_corners(ZOOMED, 5, 8, sheet=SHEET), "focal length about 4 % longer"),
-            (seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])), "bent otherwise"),
+            (
+                seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])),
+                "bent differently",
+            ),
             (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved while its rows were read out"),
             (turned(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "turned by half a turn"),
             (mirrored(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "mirrored"),
@@ -225,7 +228,7 @@ def test_images_choose_the_lens_model() -> None:
     chosen = chosen_lens(seen, SIZE)
     assert chosen is not None
     assert chosen.fit.adjusted.camera.model == "equidistant"
-    assert "plumb_bob" in chosen.why
+    assert "plumb_bob" in chosen.reason
     assert chosen.fit.left_out == {}
     assert np.abs(pulls(chosen.fit, "equidistant")).max() < 3.0
     assert chosen.validated_px is not None
@@ -243,7 +246,7 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     ripple = replace(seen, px=seen.px + 0.02 * bulge * np.cos(18.0 * far) * far)
     given = given_lens(ripple, SIZE, "plumb_bob")
     assert given is not None
-    assert "as given" in given.why
+    assert "as given" in given.reason
     assert "leave out --model" in " ".join(given.warnings)
 
 

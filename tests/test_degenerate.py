@@ -124,7 +124,7 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
         legcal.forward_kinematics(short, near)
     dataset = replace(legcal.load_dataset(made_set.folder), machine=short)
     calibration = calibrate(dataset, output=tmp_path / "out")
-    assert "The nominal model does not reach the readings of view c1, p10: its" in " ".join(
+    assert "The nominal model cannot reach the readings of view c1, p10: residuals" in " ".join(
         calibration.notes
     )
     assert calibration.verdict.trustworthy

@@ -143,7 +143,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     assert run(monkeypatch, "doctor", folder) == 2
     shown = capsys.readouterr().out
     assert shown.index("error:") < shown.index("Columns a and b look exchanged")
-    assert "things to mend before calibrating" in shown
+    assert "errors to fix before calibrating" in shown
 
 
 def test_datasets_without_photographs_are_judged_by_what_they_have(
@@ -152,7 +152,7 @@ def test_datasets_without_photographs_are_judged_by_what_they_have(
     simulated(tmp_path / "axes", "hexapod", level=Level.AXES, views=3, poses=6)
     assert run(monkeypatch, "doctor", tmp_path / "axes") == 0
     shown = capsys.readouterr().out
-    assert "Nothing stands against calibrating" in shown
+    assert "Ready to calibrate" in shown
     assert "legcal calibrate" in shown
     simulated(tmp_path / "outlines", "hexapod", views=1)
     assert [one.name for one in doctor(tmp_path / "outlines").checks][-1] == "mistakes"

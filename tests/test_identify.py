@@ -165,7 +165,7 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     verdict = legcal.identifiability(loaded(name), chosen, 6)
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
-    assert ("smallest sets of views" in out) == (not views)
+    assert ("smallest sufficient sets of views" in out) == (not views)
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:

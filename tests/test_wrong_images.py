@@ -374,7 +374,7 @@ def _with_rejected(outlines: Outlines, rejected: BoolArray) -> Outlines:
             {0: 5e-3, 2: -4e-3, 4: 6e-3},
             r"another pose than .*leg1_prismatic, leg3_prismatic, leg5_prismatic ",
         ),
-        ({}, r"its readings suit it, so check that nobody moved the camera"),
+        ({}, r"its readings are consistent, so the camera may have moved"),
         ("other", r"it shows the reading given for image image4\.png; check which image"),
     ],
 )

@@ -1,9 +1,9 @@
-"""The calibration boards of a dataset: how they tie cameras to each other before any fit.
+"""The calibration boards of a dataset: relative camera poses before any fit.
 
-A board on the base stands still: each camera that shows it is placed against it, so that one rough
-camera pose, or a rough pose of the board, places all of them, and the four steps may take all views
-that show it for one camera. A board on the platform goes where nominal kinematics say, from and to
-places that are not known: as a hand-eye calibration, that places cameras without any rough pose.
+A board on the base is fixed: each camera that sees it is placed relative to it, so that one rough
+camera pose, or a rough pose of the board, places all of them, and the four steps may treat all
+views of it as one camera. A board on the platform moves by the nominal kinematics: hand-eye
+calibration places cameras without any rough pose.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from legcal.perception.photographs import nominal_placement
 from legcal.perception.placement import Placement
 from legcal.vision.board import FixedBoard
 
-Poses = Sequence[RigidTransform | None]  # one a view
-# Between two places of a board by rough poses: part of the mean leg length, angle
+Poses = Sequence[RigidTransform | None]  # by view
+# Largest distance of two rough poses of a board that agree [mean leg lengths, rad]
 _MAX_DISTANCE, _MAX_ANGLE = 0.15, np.deg2rad(6.0)
-_FEWEST = 4  # images of a board on the platform that place a camera
+_FEWEST = 4  # smallest number of images of a board on the platform that place a camera
 
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """The boards and how each camera stands to them."""
+    """The boards, their corners and the poses of cameras relative to them."""
 
     boards: tuple[FixedBoard, ...]
-    corners: Corners  # of all images
-    # To the board on the base, None where a view does not show it
+    corners: Corners  # corners in all images
+    # by view: pose relative to the board on the base; None if the view does not show it
     T_board_camera: tuple[RigidTransform | None, ...]
-    T_camera_board: Mapping[int, RigidTransform]  # of the board on the platform, by image row
+    T_camera_board: Mapping[int, RigidTransform]  # board on the platform, by image row
     view_of_row: tuple[str, ...]
     size: float  # mean leg length of the machine [m]
 
     def at(self, rows: IntArray) -> BoardCorners:
-        """Return the boards in some of the images."""
+        """Return the boards with their corners in selected images."""
         return BoardCorners(self.boards, self.corners.at(rows))
 
     def reject_outliers(self, solution: Solution, fitted: OrderedDataset) -> Corners:
-        """Return the corners of all images, those that a fit of some images left out rejected."""
+        """Return the corners of all images, with the outliers of a fit rejected."""
         left_out = set(solution.rejected_corners)
         if not left_out:
             return self.corners
@@ -65,7 +65,7 @@ class BoardViews:
         poses = fitted.measurements.pose.tolist()
         pose_of_row = dict(zip(fitted.rows.tolist(), poses, strict=True))
         places = zip(corners.row.tolist(), corners.corner.tolist(), strict=True)
-        wrong = np.array(
+        is_wrong = np.array(
             [
                 any((self.view_of_row[row], p, corner) in left_out
                     for p in (-1, pose_of_row.get(row, -1)))
@@ -73,10 +73,10 @@ class BoardViews:
             ],
             dtype=np.bool_,
         )  # fmt: skip
-        return corners.reject(wrong & corners.used, Reason.DISAGREES)
+        return corners.reject(is_wrong & corners.used, Reason.DISAGREES)
 
     def poses_by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
-        """Return T_x_board of the base's by each camera that shows it, x any frame."""
+        """Return T_x_board of the board on the base by view, for any frame x."""
         return {
             v: camera * T.inv()
             for v, (camera, T) in enumerate(zip(T_x_camera, self.T_board_camera, strict=True))
@@ -84,18 +84,18 @@ class BoardViews:
         }
 
     def pose_by_cameras(self, T_x_camera: Poses) -> RigidTransform | None:
-        """Return T_x_board of the base's on which most cameras agree; None if none shows it.
+        """Return T_x_board of the board on the base by majority of the cameras; None without any.
 
-        Outliers are left out: one wrong camera pose must not turn all others.
+        Outliers are left out, so that one wrong camera pose does not affect the others.
         """
         return _agreed(list(self.poses_by_view(T_x_camera).values()), self.size)
 
     def pose_on_platform(
         self, data: OrderedDataset, T_x_camera: Poses, T_x_platform: Sequence[RigidTransform]
     ) -> RigidTransform | None:
-        """Return T_platform_board of the platform's on which most of some images agree.
+        """Return T_platform_board of the board on the platform by majority of the images.
 
-        *T_x_platform* is that of every pose, x any frame; None if no image shows the board.
+        *T_x_platform* is by pose, for any frame x. None if no image shows the board.
         """
         place = zip(data.rows.tolist(), data.measurements.view.tolist(),
                     data.measurements.pose.tolist(), strict=True)  # fmt: skip
@@ -111,38 +111,38 @@ class BoardViews:
     def cameras(
         self, T_x_board: RigidTransform, others: Poses
     ) -> tuple[RigidTransform | None, ...]:
-        """Return T_x_camera of every view: by the base's board, *others* where it is not shown."""
+        """Return T_x_camera of every view: by the board on the base, else from *others*."""
         return tuple(
             other if T is None else T_x_board * T
             for T, other in zip(self.T_board_camera, others, strict=True)
         )
 
-    def cameras_by_platform(self, data: OrderedDataset, known: Poses) -> Poses:
-        """Return T_base_camera of every view, known ones as they are, others by the platform's.
+    def cameras_by_platform(self, data: OrderedDataset, T_base_camera: Poses) -> Poses:
+        """Return T_base_camera of every view, with missing ones from the board on the platform.
 
-        The board on the platform goes where the nominal kinematics carry it. Where it is fixed to
-        the platform is found with the cameras; views that show the base's board too stand together.
+        The board moves by the nominal kinematics. Its pose on the platform is estimated with the
+        cameras; views that also show the board on the base are treated as one camera.
         """
         view, pose = data.measurements.view, data.measurements.pose
-        frames: dict[int, list[int]] = {}  # the rows of views that stand together, by one of these
+        frames: dict[int, list[int]] = {}  # rows of views with known relative poses, by first view
         tied = [v for v, T in enumerate(self.T_board_camera) if T is not None]
         for row in sorted(self.T_camera_board):
             v = int(view[row])
             frames.setdefault(tied[0] if v in tied else v, []).append(row)
         T_base_platform = data.T_base_platform
-        given = next((b.T_link_board for b in self.boards if b.link == "platform"), None)
-        T_platform_board = given
+        stated = next((b.T_link_board for b in self.boards if b.link == "platform"), None)
+        T_platform_board = stated
         if T_platform_board is None:
-            T_platform_board = self.pose_on_platform(data, known, T_base_platform)
+            T_platform_board = self.pose_on_platform(data, T_base_camera, T_base_platform)
         if T_platform_board is None and frames:
-            most = max(frames.values(), key=len)
-            if len(np.unique(pose[most])) >= _FEWEST:
+            largest = max(frames.values(), key=len)
+            if len(np.unique(pose[largest])) >= _FEWEST:
                 T_platform_board = _hand_eye(
-                    [T_base_platform[pose[row]] for row in most],
-                    [self._in_frame(row, view) for row in most],
+                    [T_base_platform[pose[row]] for row in largest],
+                    [self._in_frame(row, view) for row in largest],
                 )
         if T_platform_board is None:
-            return known
+            return T_base_camera
         T_base_frame = {
             v: _agreed(
                 [
@@ -153,25 +153,25 @@ class BoardViews:
             )
             for v, rows in frames.items()
         }
-        found = list(known)
-        for v, T in enumerate(known):
+        cameras = list(T_base_camera)
+        for v, T in enumerate(T_base_camera):
             frame = T_base_frame.get(tied[0] if v in tied else v)
             if T is None and frame is not None:
-                own = self.T_board_camera[v]
-                found[v] = frame if own is None else frame * own
-        return tuple(found)
+                T_board_camera = self.T_board_camera[v]
+                cameras[v] = frame if T_board_camera is None else frame * T_board_camera
+        return tuple(cameras)
 
     def _in_frame(self, row: int, view: IntArray) -> RigidTransform:
         """Return the pose of the platform's board in the base's board, or else in the camera."""
         T_board_camera = self.T_board_camera[view[row]]
-        seen = self.T_camera_board[row]
-        return seen if T_board_camera is None else T_board_camera * seen
+        T_camera_board = self.T_camera_board[row]
+        return T_camera_board if T_board_camera is None else T_board_camera * T_camera_board
 
 
 def _hand_eye(
     T_base_platform: Sequence[RigidTransform], T_frame_board: Sequence[RigidTransform]
 ) -> RigidTransform:
-    """Return T_platform_board by which T_frame_base T_base_platform T_platform_board is as seen."""
+    """Return T_platform_board from poses of platform and board, by hand-eye calibration."""
     R, t = components(T_base_platform)
     M, p = components(T_frame_board)
     length = float(np.linalg.norm(np.ptp(t, axis=0))) + float(np.linalg.norm(p, axis=1).mean())
@@ -179,64 +179,78 @@ def _hand_eye(
     return transforms(search(pairs, _FEWEST).frames[0])[1]
 
 
-def _agreed(found: Sequence[RigidTransform], size: float) -> RigidTransform | None:
-    """Return the middle of those poses that most agree on; None of none."""
-    if not found:
+def _agreed(poses: Sequence[RigidTransform], size: float) -> RigidTransform | None:
+    """Return the mean of the largest set of agreeing poses; None without poses."""
+    if not poses:
         return None
-    agreeing = [[other for other in found if _agree(one, other, size, reach=2.0)] for one in found]
+    agreeing = [
+        [other for other in poses if _agree(pose, other, size, reach=2.0)] for pose in poses
+    ]
     together = RigidTransform.concatenate(max(agreeing, key=len))
     middle = np.median(together.translation, axis=0)
     return RigidTransform.from_components(middle, together.rotation.mean())
 
 
 def observe_board(data: OrderedDataset) -> BoardViews | None:
-    """Return what the images of a dataset show of its boards, None if it has none.
+    """Return the boards of a dataset as seen in its images; None without boards.
 
     Raises
     ------
     NotVisible
-        If no image shows a board, or most of the hand-held views do not show the base's; the legs
-        place the others, or they are left out.
+        If no image shows a board, or most of the hand-held views do not show the board on the base;
+        other views are placed by the legs or left out.
     DatasetError
-        If what is shown cannot be the board that the dataset describes, or it has moved.
+        If the images contradict the description of the board, or it has moved.
     """
     dataset, measurements = data.dataset, data.measurements
     if not dataset.boards:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     hand_held = {view.name for view in used if view.hand_held}
-    given = None if dataset.corners is None else data.order.reorder(dataset.corners)
+    corners_in_table = None if dataset.corners is None else data.order.reorder(dataset.corners)
     T_board_camera: tuple[RigidTransform | None, ...] = (None,) * len(measurements.views)
     T_camera_board: dict[int, RigidTransform] = {}
     tables = []
     for fixed in dataset.boards:
         on_base = fixed.link == "base"
-        if given is not None:
-            own = given.choose(fixed.has(given.corner))
-            own = replace(own, corner=own.corner - fixed.first)
+        if corners_in_table is not None:
+            corners_of_board = corners_in_table.choose(fixed.has(corners_in_table.corner))
+            corners_of_board = replace(
+                corners_of_board, corner=corners_of_board.corner - fixed.first
+            )
         else:
             rows = [row for row, image in enumerate(measurements.image) if image]
-            own = detect_corners(fixed.board, data.photographs.load, rows, data.pool, data.progress)
-        shown_in = {measurements.views[v].name for v in measurements.view[own.row].tolist()}
-        few = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
-        needed = hand_held if few else set[str]()
-        if given is None:
-            asked = needed if len(own) else {view.name for view in used}
-            require_board(fixed.board, own, data.photographs.load, measurements, asked)
+            corners_of_board = detect_corners(
+                fixed.board, data.photographs.load, rows, data.pool, data.progress
+            )
+        shown_in = {
+            measurements.views[v].name for v in measurements.view[corners_of_board.row].tolist()
+        }
+        is_rarely_shown = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
+        needed = hand_held if is_rarely_shown else set[str]()
+        if corners_in_table is None:
+            required = needed if len(corners_of_board) else {view.name for view in used}
+            require_board(
+                fixed.board, corners_of_board, data.photographs.load, measurements, required
+            )
         if on_base:
-            T_board_camera, own = camera_poses_by_board(own, fixed.board, measurements, needed)
-            found = any(T is not None for T in T_board_camera)
+            T_board_camera, corners_of_board = camera_poses_by_board(
+                corners_of_board, fixed.board, measurements, needed
+            )
+            is_shown = any(T is not None for T in T_board_camera)
         else:
-            T_camera_board, own = board_poses_in_images(own, fixed.board, measurements)
-            found = bool(T_camera_board)
-        if not found:
-            which = "" if on_base else " on the platform"
+            T_camera_board, corners_of_board = board_poses_in_images(
+                corners_of_board, fixed.board, measurements
+            )
+            is_shown = bool(T_camera_board)
+        if not is_shown:
+            where_fixed = "" if on_base else " on the platform"
             raise NotVisible(
-                f"{dataset.yaml_path}: the calibration board{which} could not be used: found no "
-                f"image with {MIN_CORNERS} of its corners or more, needed one; add corners to "
+                f"{dataset.yaml_path}: the calibration board{where_fixed} could not be used: found "
+                f"no image with {MIN_CORNERS} of its corners or more, needed one; add corners to "
                 f"{CORNERS_NAME}, or remove that table or the block board."
             )
-        tables.append(replace(own, corner=own.corner + fixed.first))
+        tables.append(replace(corners_of_board, corner=corners_of_board.corner + fixed.first))
     corners = join_corners(tables).sort()
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())
     size = dataset.machine.size
@@ -244,43 +258,45 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
 
 
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
-    """Return a rough T_base_board: as the dataset has it, or by the rough T_base_camera of views.
+    """Return a rough T_base_board: as stated, or from the rough T_base_camera of views.
 
     Raises
     ------
     DatasetError
-        If the dataset has the board where none of these cameras sees it.
+        If none of these cameras agrees with the stated pose of the board.
     """
     fixed, by_cameras = dataset.board_on("base"), board.pose_by_cameras(hints)
-    given = None if fixed is None else fixed.T_link_board
-    if given is None or by_cameras is None:
-        return by_cameras if given is None else given
-    # Wrong poses beside a right one are named when the images have placed their cameras.
+    stated = None if fixed is None else fixed.T_link_board
+    if stated is None or by_cameras is None:
+        return by_cameras if stated is None else stated
+    # Single wrong camera poses are reported later, when the images have placed the cameras.
     places = board.poses_by_view(hints).values()
-    if not any(_agree(given, place, board.size) for place in places):
-        far, turned = pose_distance(given, by_cameras)
+    if not any(_agree(stated, place, board.size) for place in places):
+        distance, turned = pose_distance(stated, by_cameras)
         raise DatasetError(
             f"{dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
-            f"could not be used together: found the board {1e3 * far:.0f} mm and "
+            f"could not be used together: found the board {1e3 * distance:.0f} mm and "
             f"{np.degrees(turned):.1f} deg from where these cameras see it, needed "
             f"{1e3 * _MAX_DISTANCE * board.size:.0f} mm and {np.degrees(_MAX_ANGLE):.0f} deg; "
             "correct the pose of the board, those of the cameras, or the dimensions of the board."
         )
-    return given
+    return stated
 
 
 def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> list[str]:
-    """Return notes on views that do not show the base's board, and on wrong poses of boards."""
+    """Return notes on views without the board on the base, and on wrong poses of boards."""
     if corners is None:
         return []
     measurements, notes = dataset.measurements, []
     fixed = dataset.board_on("base")
     if fixed is None:
         return _misplaced(dataset, solution)
-    own = corners.used & fixed.has(corners.corner)
-    shown = set(measurements.view[corners.row[own]].tolist())
+    on_base = corners.used & fixed.has(corners.corner)
+    shown_views = set(measurements.view[corners.row[on_base]].tolist())
     without = [
-        measurements.views[v].name for v in np.unique(measurements.view).tolist() if v not in shown
+        measurements.views[v].name
+        for v in np.unique(measurements.view).tolist()
+        if v not in shown_views
     ]
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
@@ -292,18 +308,21 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
 
 
 def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return notes on boards that are far from where the dataset has them."""
+    """Return notes on boards that are far from their stated pose."""
     notes = []
     for fixed in dataset.boards:
-        given, found = fixed.T_link_board, solution.T_frame_board.get(fixed.link)
-        if given is None or found is None:
+        stated, fitted = fixed.T_link_board, solution.T_frame_board.get(fixed.link)
+        if stated is None or fitted is None:
             continue
-        place = dataset.machine.T_link_frame(fixed.link) * found
-        if not _agree(given, place, dataset.machine.size):
-            far, turned = pose_distance(given, place)
-            key, which = f"T_{fixed.link}_board", "" if fixed.link == "base" else " on the platform"
+        place = dataset.machine.T_link_frame(fixed.link) * fitted
+        if not _agree(stated, place, dataset.machine.size):
+            distance, turned = pose_distance(stated, place)
+            key, where_fixed = (
+                f"T_{fixed.link}_board",
+                "" if fixed.link == "base" else " on the platform",
+            )
             notes.append(
-                f"The calibration board{which} stands {1e3 * far:.0f} mm and "
+                f"The calibration board{where_fixed} stands {1e3 * distance:.0f} mm and "
                 f"{np.degrees(turned):.1f} deg from where {key} of the dataset has it, far more "
                 f"than joints can be off; the result does not depend on it; correct {key}."
             )
@@ -313,24 +332,24 @@ def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
 def in_one_camera(
     axes: LegAxes, measurements: Measurements, T_board_camera: Poses
 ) -> tuple[LegAxes, Measurements, tuple[RigidTransform | None, ...], IntArray]:
-    """Return axes of all views that show the board as those of one view, the first of these.
+    """Merge all views with the board into the first of them.
 
-    Returns the axes and measurements, T_first_camera of each original view (None where it does not
-    show the board), and which of the new views each original one is.
+    Returns the axes and measurements, T_first_camera of each original view (None if it does not
+    show the board), and the new number of each original view.
     """
-    shown = np.array([T is not None for T in T_board_camera], dtype=np.bool_)
-    first, others = int(np.argmax(shown)), np.flatnonzero(~shown).tolist()
+    is_shown = np.array([T is not None for T in T_board_camera], dtype=np.bool_)
+    first, others = int(np.argmax(is_shown)), np.flatnonzero(~is_shown).tolist()
     from_board = next(T.inv() for T in T_board_camera if T is not None)
     T_first_camera = tuple(None if T is None else from_board * T for T in T_board_camera)
-    new_view = np.zeros(len(shown), dtype=np.intp)
+    new_view = np.zeros(len(is_shown), dtype=np.intp)
     new_view[others] = 1 + np.arange(len(others))
     u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
     view = measurements.view[axes.row]
     for v, T in enumerate(T_first_camera):
-        here = view == v
-        if T is not None and here.any():
-            u[here], M[here] = T.rotation.apply(u[here]), T.apply(M[here])
-            basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
+        of_view = view == v
+        if T is not None and of_view.any():
+            u[of_view], M[of_view] = T.rotation.apply(u[of_view]), T.apply(M[of_view])
+            basis[of_view] = T.rotation.apply(basis[of_view].reshape(-1, 3)).reshape(-1, 2, 3)
     views = [replace(measurements.views[first], legs=None)]
     views += [measurements.views[v] for v in others]
     return (
@@ -341,14 +360,14 @@ def in_one_camera(
     )
 
 
-def _agree(one: RigidTransform, other: RigidTransform, size: float, reach: float = 1.0) -> bool:
-    """Say whether two places of the board are as near as hints are good."""
-    far, turned = pose_distance(one, other)
-    return far <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE
+def _agree(pose: RigidTransform, other: RigidTransform, size: float, reach: float = 1.0) -> bool:
+    """Return whether two rough poses of a board agree."""
+    distance, turned = pose_distance(pose, other)
+    return distance <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE
 
 
 def needs_rough_cameras(data: OrderedDataset) -> bool:
-    """Say whether images can be searched only near rough camera poses."""
+    """Return whether the search of images needs rough camera poses."""
     hints = [view.T_base_camera for view in data.measurements.views]
     on_base = data.dataset.board_on("base")
     by_board = on_base is not None and (
@@ -358,15 +377,15 @@ def needs_rough_cameras(data: OrderedDataset) -> bool:
 
 
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
-    """Return where the nominal model has the legs, with rough cameras, and what shows the board.
+    """Return the placement by the nominal model and rough cameras, and the boards in the images.
 
     Raises
     ------
     NotIdentifiable
-        If readings do not give the poses of images that are to be searched, and a view of these has
-        no rough camera pose or joints at A move; nothing is searched then.
+        If images are to be searched whose pose the readings do not determine, and a view of them
+        has no rough camera pose or joints at A move.
     NotVisible
-        If they are to be searched for legs none of which is visible.
+        If images are to be searched and no leg is visible.
     """
     if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
         raise NotVisible(

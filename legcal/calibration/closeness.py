@@ -1,4 +1,4 @@
-"""How close a calibration came to what `legcal plan` expected of its session."""
+"""Comparison of a calibration with the error expected by the plan of its session."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy
 from legcal.errors import DatasetError
 from legcal.files.reading import read_json
 
-PLAN_NAME = "plan.json"  # what a session that was planned says of itself
-AS_PLANNED = 1.3  # times the error that was expected: no more needs no remark on light
+PLAN_NAME = "plan.json"  # plan in the folder of a planned session
+AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
 
 def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) -> tuple[str, ...]:
-    """Return a sentence on a planned session; nothing where a dataset was not planned."""
+    """Return a sentence on the error of a planned session; () without a plan."""
     file = folder / PLAN_NAME
     try:
         plan = read_json(file)
@@ -23,28 +23,28 @@ def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) ->
         return ()
     except (OSError, ValueError, DatasetError):
         return (
-            f"{file} cannot be read: how close the session came to its plan is not known; copy the "
+            f"{file} cannot be read, so that the result cannot be compared with its plan; copy the "
             "file from the planned session.",
         )
     try:
         planned, expected = int(plan["images"]), plan["expected"]
         dX, dE = float(expected["dX_m"]), float(expected["dE_rad"])
-        beside = plan.get("given")
+        added_to = plan.get("given")
     except (ValueError, KeyError, TypeError, AttributeError):
         return ()
     if platform is None or platform.workspace is None or not dX > 0.0:
         return ()
-    if beside:
+    if added_to:
         return (
-            f"The session was planned to add to {beside}, whose images the plan counts on: put its "
-            "views and rows there, and calibrate both together.",
+            f"The session was planned to add to {added_to}, whose images the plan counts on: put "
+            "its views and rows there, and calibrate both together.",
         )
-    found = platform.workspace
-    ratio = found.mean_displacement / dX
+    predicted = platform.workspace
+    ratio = predicted.mean_displacement / dX
     sentence = (
-        f"Predicted error over the workspace: {1e3 * found.mean_displacement:.3f} mm / "
-        f"{np.degrees(found.mean_rotation):.4f} deg with {n_images} images, {ratio:.2f} times the "
-        f"plan ({1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg with {planned} images)."
+        f"Predicted error over the workspace: {1e3 * predicted.mean_displacement:.3f} mm / "
+        f"{np.degrees(predicted.mean_rotation):.4f} deg with {n_images} images, {ratio:.2f} times "
+        f"the plan ({1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg with {planned} images)."
     )
     if ratio > AS_PLANNED:
         sentence += (

@@ -1,6 +1,6 @@
-"""What the images of a dataset show, before any fit.
+"""Detection of the legs in the images of a dataset, before any fit.
 
-The cameras are placed and the outlines measured as :func:`legcal.calibrate` does first.
+Cameras are placed and outlines measured as in the first stage of :func:`legcal.calibrate`.
 """
 
 from __future__ import annotations
@@ -59,40 +59,40 @@ from legcal.perception.placement import (
 from legcal.vision.visibility import PredictedLeg
 
 OVERLAYS, PHOTOGRAPHS = "overlays", "photographs"  # the subfolders of pictures
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in names of files
-_MAX_NAME = 80  # letters of such a name
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # characters not allowed in file names
+_MAX_NAME = 80  # largest length of a file name
 
 
 @brief
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What the images of a dataset show of the legs, in the order of the files.
+    """Legs detected in the images of a dataset, in the order of the files.
 
     Attributes
     ----------
     dataset : Dataset
-        What was searched.
+        The searched dataset.
     outlines : Outlines
         All outlines: detected, given and edited.
     A_base, B_base : (n_rows, n_legs, 3) array
-        Joint centres at every row, where each view sees them, in the base link [m].
+        Joint centres at every row as used for the view, in the base link [m].
     cylinders : sequence, for each leg a sequence of Cylinder
-        What can be seen of the legs, with the radii that outlines were searched by.
+        Visible parts of the legs, with the radii used in the search.
     T_base_camera : tuple of RigidTransform or None
-        The camera of every view; None where nothing is known of it.
+        The camera of every view; None if it is unknown.
     rows : (n,) array of int
         The rows that have an image.
     unplaced : dict
-        Why the cameras of some views could not be placed, by name of the view; they are left where
-        they were expected, and no outline of theirs is here but those that were given.
+        Reasons why cameras could not be placed, by name of the view; these cameras keep their
+        expected pose, and only given outlines of their views are included.
     image_notes : tuple of str
-        What is odd about images, views and radii.
+        Warnings about images, views and radii.
     leg_notes : tuple of str
-        What else a reader should know of the search for the legs.
+        Remarks on the search for the legs.
     corners : Corners or None
         The corners of calibration boards in all images; None without a board.
     arms : mapping
-        Where arms that are cylinders are expected, by the legs that have them as parts.
+        Expected arms with visible cylinders, by the leg that has them as parts.
     """
 
     dataset: Dataset
@@ -110,7 +110,7 @@ class Detection:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader should know, also of the dataset."""
+        """All warnings and remarks, including those on the dataset."""
         return (*self.dataset.notes, *self.image_notes, *self.leg_notes)
 
     def view_of(self, row: int) -> str:
@@ -119,9 +119,9 @@ class Detection:
         return measurements.views[int(measurements.view[row])].name
 
     def predicted(self, row: int) -> list[PredictedLeg]:
-        """Return where the legs of a row should be seen; none where the camera is not known.
+        """Return the predicted legs in the image of a row; none if the camera is unknown.
 
-        Arms come after them, each as another one of the leg that has it as a part.
+        Arms follow as further entries of the legs that have them as parts.
         """
         measurements, legs = self.dataset.measurements, self.dataset.machine.legs
         view = measurements.views[measurements.view[row]]
@@ -129,13 +129,13 @@ class Detection:
         if T is None:
             return []
         ends, owner = (self.A_base, self.B_base), [*range(len(legs)), *self.arms]
-        found = predict_legs_and_arms(view.camera, T, ends, self.cylinders, self.arms, row)
-        every = [replace(leg, leg=owner[leg.leg]) for leg in found]
-        return [leg for leg in every if view.uses(legs[leg.leg].name)]
+        legs_and_arms = predict_legs_and_arms(view.camera, T, ends, self.cylinders, self.arms, row)
+        with_owner = [replace(leg, leg=owner[leg.leg]) for leg in legs_and_arms]
+        return [leg for leg in with_owner if view.uses(legs[leg.leg].name)]
 
     @cached_property
     def left_out(self) -> dict[int, Rejection]:
-        """Why no outline of images is used that should show some, by row."""
+        """Reasons why images with expected outlines have no used one, by row."""
         of_views = [row for row in self.rows.tolist() if self.view_of(row) in self.unplaced]
         return images_left_out(self.outlines) | dict.fromkeys(
             of_views, Rejection(Reason.NOT_PLACED)
@@ -143,7 +143,7 @@ class Detection:
 
     @cached_property
     def overlay_files(self) -> dict[int, str]:
-        """The file of each row's overlay, relative to the folder: by view and image."""
+        """The overlay of each row, relative to the folder: by view and image."""
         measurements = self.dataset.measurements
         folders = unique_names(view.name for view in measurements.views)
         files: dict[int, str] = {}
@@ -159,15 +159,15 @@ class Detection:
 
     @property
     def photograph_files(self) -> dict[int, str]:
-        """The file of each row's photograph as it was searched, relative to the folder."""
+        """The photograph of each row as searched, relative to the folder."""
         return {
             row: file.replace(OVERLAYS, PHOTOGRAPHS, 1) for row, file in self.overlay_files.items()
         }
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
-    """Return names of files that are distinct on every file system."""
-    found: list[str] = []
+    """Return file names that are distinct on every file system."""
+    unique: list[str] = []
     taken: set[str] = set()
     for name in names:
         plain = _UNSAFE.sub("_", name).lstrip(".")[:_MAX_NAME] or "_"
@@ -176,8 +176,8 @@ def unique_names(names: Iterable[str]) -> list[str]:
             k += 1
             chosen = f"{plain}-{k}"
         taken.add(chosen.lower())
-        found.append(chosen)
-    return found
+        unique.append(chosen)
+    return unique
 
 
 def rows_with_image(dataset: Dataset) -> IntArray:
@@ -185,16 +185,16 @@ def rows_with_image(dataset: Dataset) -> IntArray:
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
     if dataset.axes is not None or not rows:
-        found = "a table of axes" if dataset.axes is not None else "no image"
+        content = "a table of axes" if dataset.axes is not None else "no image"
         raise DatasetError(
-            f"{dataset.table_path}: the images could not be searched: found {found}, needed images "
-            "of the legs; name them in the table of measurements."
+            f"{dataset.table_path}: the images could not be searched: found {content}, needed "
+            "images of the legs; name them in the table of measurements."
         )
     return np.array(rows, dtype=np.intp)
 
 
 def detected(data: OrderedDataset, images: IntArray) -> Detection:
-    """Recognise and measure, and return what was found in the order of the files."""
+    """Recognise and measure the legs; return the detection in the order of the files."""
     dataset, order, photographs = data.dataset, data.order, data.photographs
     scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
@@ -202,25 +202,25 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
     image_notes, notes = list[str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
-        seen = place_and_measure(photographs, scene, data.progress, T_board_camera)
-        cameras, cylinders = seen.placement.T_base_camera, seen.photographs.cylinders
+        measured = place_and_measure(photographs, scene, data.progress, T_board_camera)
+        cameras, cylinders = measured.placement.T_base_camera, measured.photographs.cylinders
         placed = np.array([T is not None for T in cameras])
-        row = seen.outlines.row
-        kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
-        outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
+        row = measured.outlines.row
+        is_kept = placed[data.measurements.view[row]] | ~np.isin(row, photographs.detect)
+        outlines, unplaced = measured.outlines.choose(is_kept), measured.placement.unplaced
         arms = _nominal_arms(data)
         if arms:
-            outlines = join_outlines([outlines, _of_arms(data, seen, arms)])
-        image_notes, notes = _image_notes(data, seen.placement), _gamma_notes(data)
-        if wrong := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
-            said = wrong_arms_in_words(wrong, data.machine.legs)
-            notes.append(f"Arms do not look as the model draws them: {said}")
-        # Legs of a view that could not be placed are drawn where its rough pose has them.
+            outlines = join_outlines([outlines, _of_arms(data, measured, arms)])
+        image_notes, notes = _image_notes(data, measured.placement), _gamma_notes(data)
+        if wrong_arms := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
+            description = wrong_arms_in_words(wrong_arms, data.machine.legs)
+            notes.append(f"Arms do not look as the model draws them: {description}")
+        # Legs of a view that could not be placed are drawn by its rough pose.
         drawn = tuple(
             T if T is not None else rough
             for T, rough in zip(cameras, scene.T_base_camera, strict=True)
         )
-        scene = replace(seen.placement, T_base_camera=drawn, arms=_nominal_arms(data))
+        scene = replace(measured.placement, T_base_camera=drawn, arms=_nominal_arms(data))
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
     names = dataset.machine.leg_names
     return Detection(
@@ -243,7 +243,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
 
 
 def views_to_click(data: OrderedDataset) -> list[str]:
-    """Return the views that cannot be searched before clicks, or other rough poses, place them."""
+    """Return the views that need clicks or rough poses before they can be searched."""
     if not needs_rough_cameras(data):
         return []
     m, rows = data.measurements, data.photographs.detect.tolist()
@@ -251,15 +251,15 @@ def views_to_click(data: OrderedDataset) -> list[str]:
 
 
 def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> Detection:
-    """Return the images of a dataset that cannot be searched, to be clicked, in file order."""
+    """Return a detection without outlines, for clicking, in file order."""
     nominal = nominal_placement(data.machine, data.measurements, data.T_base_platform)
     rows, legs = inverse(data.order.rows), inverse(data.order.legs)
-    why = Cause(
+    no_pose = Cause(
         "its images could not be searched: found no rough camera pose, needed one, since the "
         "motors do not determine the pose of the platform; click its joints at the base "
         f"({LANDMARKS_NAME})."
     )
-    others = Cause(
+    no_other_pose = Cause(
         "its images could not be searched: found a rough camera pose here and none of other views, "
         "needed one of every view."
     )
@@ -273,7 +273,7 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
         T_base_camera=tuple(view.T_base_camera for view in dataset.measurements.views),
         rows=images,
         unplaced={
-            view.name: NotPlaced(view.name, why if view.name in views else others)
+            view.name: NotPlaced(view.name, no_pose if view.name in views else no_other_pose)
             for view in dataset.measurements.views
         },
         image_notes=(),
@@ -282,7 +282,7 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
 
 
 def _nominal_arms(data: OrderedDataset) -> dict[int, PlacedArm]:
-    """Return the arms that are cylinders, where the model has them at the readings of each row."""
+    """Return the arms with cylinders by the nominal model at the readings of each row."""
     legs, m = data.machine.legs, data.measurements
     if not data.machine.is_determined or not any(leg.arm is not None for leg in legs):
         return {}
@@ -290,23 +290,29 @@ def _nominal_arms(data: OrderedDataset) -> dict[int, PlacedArm]:
     return placed_arms(legs, q, m.pose)
 
 
-def _of_arms(data: OrderedDataset, seen: MeasuredImages, arms: Mapping[int, PlacedArm]) -> Outlines:
-    """Return the outlines of arms in images that show the legs, before cameras that are placed."""
-    photographs, cameras = seen.photographs, seen.placement.T_base_camera
+def _of_arms(
+    data: OrderedDataset, measured: MeasuredImages, arms: Mapping[int, PlacedArm]
+) -> Outlines:
+    """Return the outlines of arms in images with recognised legs and placed cameras."""
+    photographs, cameras = measured.photographs, measured.placement.T_base_camera
     rows = [
         row
         for row in photographs.detect.tolist()
-        if row not in seen.left_out and cameras[data.measurements.view[row]] is not None
+        if row not in measured.left_out and cameras[data.measurements.view[row]] is not None
     ]
-    some = replace(photographs, detect=np.array(rows, dtype=np.intp), keep=no_outlines())
-    placement = replace(seen.placement, arms=arms, window=None)
-    found = measure_photographs(some, placement, data.progress, stage="Measuring arms")
-    of_arms = found.choose(are_of_arms(found, data.machine.legs))
+    photographs_of_arms = replace(
+        photographs, detect=np.array(rows, dtype=np.intp), keep=no_outlines()
+    )
+    placement = replace(measured.placement, arms=arms, window=None)
+    outlines = measure_photographs(
+        photographs_of_arms, placement, data.progress, stage="Measuring arms"
+    )
+    of_arms = outlines.choose(are_of_arms(outlines, data.machine.legs))
     return merge_edited(of_arms, photographs.keep)
 
 
 def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
-    """Return what is to be said of the cameras and the images."""
+    """Return notes on the cameras and the images."""
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes(
@@ -320,7 +326,7 @@ def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
 
 
 def _gamma_notes(data: OrderedDataset) -> list[str]:
-    """Return a note on cameras whose gamma nobody states."""
+    """Return a note on cameras without a stated gamma."""
     views = data.measurements.views
     without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
     if not without_gamma:

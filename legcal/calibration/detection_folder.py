@@ -39,10 +39,9 @@ JPEG_QUALITY = 88  # percent
 
 
 def check_detection_destination(destination: Path, dataset: Path | None) -> None:
-    """Refuse an output folder that holds something else, or a table that was corrected.
+    """Refuse an output folder of another kind, or with an edited table.
 
-    A corrected table is safe where it was copied into the dataset folder. Raises UsageError with
-    what is there instead.
+    An edited table may be replaced if a copy is in the dataset folder. Raises UsageError.
     """
     check_destination(destination, DETECTION)
     table = destination / OBSERVATIONS_NAME
@@ -63,9 +62,9 @@ def check_detection_destination(destination: Path, dataset: Path | None) -> None
 
 
 def write_detection(
-    found: Examination, detection: Detection, destination: Path, run: Run, progress: Report
+    examination: Examination, detection: Detection, destination: Path, run: Run, progress: Report
 ) -> None:
-    """Write the folder of an examination and its detection, all of it or nothing.
+    """Write the folder of an examination and its detection atomically.
 
     Raises UsageError as :func:`check_detection_destination` does, and OutOfResources if the files
     cannot be written.
@@ -81,12 +80,12 @@ def write_detection(
             write_corners(folder / CORNERS_NAME, detection.corners, dataset.measurements)
         draw_images(detection, folder, run, progress, photographs=True)
         (folder / DETECTION_PAGE).write_text(
-            examination_page(found, detection), encoding="utf-8", newline="\n"
+            examination_page(examination, detection), encoding="utf-8", newline="\n"
         )
         files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
         record = {
             "legcal_detection": 1,
-            **found.document(),
+            **examination.document(),
             "table": hashlib.sha256(read_bytes(table, MAX_IMAGE)).hexdigest(),
             "files": [*files, DETECTION.marker],
         }
@@ -95,7 +94,7 @@ def write_detection(
 
 @dataclass(frozen=True)
 class _Drawings:
-    """What is drawn over each image, and the name of its file; it travels to worker processes."""
+    """The overlays of all images with their file names, as sent to worker processes."""
 
     load: ImageReader
     marks: tuple[tuple[PartMarks, ...], ...]
@@ -103,13 +102,13 @@ class _Drawings:
     captions: tuple[str, ...]
     unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     names: tuple[str, ...]
-    photographs: bool  # whether the images are wanted with nothing drawn over them
+    photographs: bool  # whether the images are also written without marks
 
 
 def draw_images(
     detection: Detection, folder: Path, run: Run, progress: Report, *, photographs: bool = False
 ) -> None:
-    """Write the overlay of every row that has an image, and the photograph by itself if asked."""
+    """Write the overlay of every row with an image, and optionally the plain photograph."""
     rows = list(detection.overlay_files)
     files, bare = (
         tuple(folder / file for file in named.values())
@@ -136,12 +135,12 @@ def draw_images(
 
 
 def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
-    """Return the files of overlay k and of the photograph without it."""
+    """Return the encoded overlay k, and optionally the plain photograph."""
     image, camera = drawings.load(k), drawings.unplaced[k]
     marks = [] if camera is None else [marks_of_pairs(camera, image)]
     picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    found = []
+    files = []
     for pixels in (picture, grey)[: 1 + drawings.photographs]:
         ok, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
@@ -149,12 +148,12 @@ def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
                 f"{drawings.names[k]}: the picture could not be written: found that it cannot be "
                 "encoded, needed enough memory; try again with fewer workers."
             )
-        found.append(content.tobytes())
-    return found
+        files.append(content.tobytes())
+    return files
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:
-    """Return what is drawn over the image of a row."""
+    """Return the marks of the parts in the image of a row."""
     measurements, outlines = detection.dataset.measurements, detection.outlines
     camera = measurements.views[int(measurements.view[row])].camera
     return marks_of_image(
@@ -172,22 +171,22 @@ def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
 
 
 def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
-    """Return what is drawn of the boards over the image of a row."""
+    """Return the marks of the board corners in the image of a row."""
     corners = detection.corners
     return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
 
 
 def _caption(detection: Detection, row: int) -> str:
-    """Return what stands below the overlay of a row."""
+    """Return the caption of the overlay of a row."""
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
-    here = outlines.used[outlines.row == row]
-    found = f"{np.count_nonzero(here)} of {len(here)} outlines used"
+    used = outlines.used[outlines.row == row]
+    state = f"{np.count_nonzero(used)} of {len(used)} outlines used"
     if view in detection.unplaced:
-        found = "the camera could not be placed: edge pairs that were found"
+        state = "the camera could not be placed: edge pairs that were found"
         if detection.T_base_camera[int(measurements.view[row])] is not None:
-            found += ", and legs where it was expected"
-    text = f"{view}  {measurements.image[row]}  {found}"
+            state += ", and legs where it was expected"
+    text = f"{view}  {measurements.image[row]}  {state}"
     return text.encode("ascii", "replace").decode()
 
 
@@ -195,8 +194,8 @@ def _earlier(destination: Path) -> dict[str, Any]:
     """Return the document of an earlier detection in a folder; empty if there is none."""
     if not DETECTION.is_in(destination):
         return {}
-    found: dict[str, Any] = read_json(destination / DETECTION.marker)
-    return found
+    document: dict[str, Any] = read_json(destination / DETECTION.marker)
+    return document
 
 
 def _own_files(destination: Path) -> list[Path]:
@@ -211,18 +210,18 @@ def _own_files(destination: Path) -> list[Path]:
 
 
 def _is_place(name: Path) -> bool:
-    """Say whether a path is one where a detection is written."""
+    """Return whether a detection may contain a file of this relative path."""
     if ".." in name.parts:
         return False
-    own = {
+    tables = {
         Path(OBSERVATIONS_NAME),
         Path(CORNERS_NAME),
         Path(DETECTION_PAGE),
         Path(DETECTION.marker),
     }
-    return name in own or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
+    return name in tables or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
 
 
 def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
-    """Say whether a path is one at which overlays, or other pictures of images, are written."""
+    """Return whether a relative path is that of an overlay, or another picture of an image."""
     return ".." not in name.parts and name.parts[:1] == (folder,) and name.suffix == ".jpg"

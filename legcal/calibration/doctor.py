@@ -1,9 +1,9 @@
-"""A look at a dataset before it is calibrated: ``legcal doctor`` and ``legcal detect``.
+"""Checks of a dataset before it is calibrated: ``legcal doctor`` and ``legcal detect``.
 
-Files, readings, cameras, photographs, what these show of the legs, what they can determine, and
-common mistakes are looked at one after the other, by what other jobs compute. What is found is one
-sentence each, with the remedy. Nothing is fitted. ``detect`` writes the outlines as well, and shows
-them over the photographs.
+Files, readings, cameras, photographs, legs in the photographs, identifiability and common mistakes
+are checked one after the other with the functions of other jobs. Each finding is one sentence with
+its remedy. Nothing is fitted. ``detect`` also writes the outlines and draws them over the
+photographs.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ from legcal.perception.placement import unplaced_notes
 from legcal.progress import Progress, Report, shown_progress
 from legcal.workers import Run, Workers, worker_pool
 
-LITTLE_USED = 0.1  # of the travel: poses that differ by less determine little
-SOFT = 3.0  # usual blur of a view [px], from which on outlines lose much of their precision
-CLIPPED = 0.1  # of the pixels of a view
-FEW_LEGS = 0.5  # of those that a view should show
-MIN_READINGS = 6  # that have the same last digit by more than chance
-MAX_DIGITS = 10  # of readings in metres
-LOOKING = "Looking at light and sharpness"  # a stage of progress
+LITTLE_USED = 0.1  # smallest range of readings without a warning, relative to the travel
+SOFT = 3.0  # largest median blur of a view without a warning [px]
+CLIPPED = 0.1  # largest share of clipped pixels of a view without a note
+FEW_LEGS = 0.5  # smallest share of the visible legs of a view found without a warning
+MIN_READINGS = 6  # smallest number of readings with a last digit
+MAX_DIGITS = 10  # largest number of decimals of readings in metres
+LOOKING = "Looking at light and sharpness"  # stage of progress
 
 
 def doctor(
@@ -84,19 +84,19 @@ def doctor(
     progress: Progress = False,
     workers: Workers = 1,
 ) -> Examination:
-    """Look for all that can stand in the way of calibrating a dataset; nothing is fitted.
+    """Check a dataset for all that may prevent its calibration; nothing is fitted.
 
     Parameters
     ----------
     source : path or Dataset
-        The dataset folder, or what :func:`legcal.load_dataset` returned.
+        The dataset folder, or a dataset of :func:`legcal.load_dataset`.
     output : path, optional
         Write a folder there, as ``legcal detect`` does: ``observations.csv``, ``index.html`` and
-        each image with what was found in it. Photographs that cannot be searched are refused then.
+        an overlay of each image. Photographs that cannot be searched are then refused.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
     workers : int, str or executor
-        Look at the images there, as :func:`legcal.calibrate` does.
+        Inspect the images there, as :func:`legcal.calibrate` does.
 
     Returns
     -------
@@ -106,12 +106,13 @@ def doctor(
     ------
     DatasetError, ModelError, OutOfClass
         If the dataset file, its table, a camera or the model cannot be read. Without an output,
-        photographs that cannot be used are findings.
+        unusable photographs are findings.
     NotVisible, NotIdentifiable, DidNotConverge
-        With an output, if images could not be searched: they do not show the calibration board that
-        they should, or the motors do not determine where the legs are.
+        With an output, if images could not be searched because the calibration board is not
+        visible or the motors do not determine the pose.
     UsageError
-        If the output holds something else, or a table of an earlier detection that was corrected.
+        If the output is another kind of folder, or contains an edited table of an earlier
+        detection.
     """
     if output is not None:
         folder = source.folder if isinstance(source, Dataset) else _folder(Path(source))
@@ -121,39 +122,39 @@ def doctor(
     if writes:
         rows_with_image(dataset)
     dataset, problems = inspect_files(dataset)
-    found, choices = _Found(dataset, writes), chosen_parameters(dataset, ())
-    usable = _look_at_files(found, problems)
-    _look_at_readings(found, dataset.table_notes)
-    _look_at_cameras(found, choices)
+    checklist, choices = _Checklist(dataset, writes), chosen_parameters(dataset, ())
+    usable = _look_at_files(checklist, problems)
+    _look_at_readings(checklist, dataset.table_notes)
+    _look_at_cameras(checklist, choices)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
-        exposures = _look_at_photographs(found, usable, pool, report)
-        _look_at_parameters(found, usable, choices)
-        seen = None
+        exposures = _look_at_photographs(checklist, usable, pool, report)
+        _look_at_parameters(checklist, usable, choices)
+        detection = None
         if exposures or (usable and dataset.observations is not None):
             data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
-            _diagnose(found, data)
-            seen = _searched(found, data) if exposures else None
-        views = _conditions(dataset, exposures, seen)
-        if seen is not None:
-            _look_at_legs(found, seen, views, choices)
+            _diagnose(checklist, data)
+            detection = _searched(checklist, data) if exposures else None
+        views = _conditions(dataset, exposures, detection)
+        if detection is not None:
+            _look_at_legs(checklist, detection, views, choices)
         examination = Examination(
             dataset=str(dataset.folder),
             mechanism=dataset.machine.name,
             checks=tuple(
-                CheckState(name=name, state=found.state(name), found=found.checks[name])
+                CheckState(name=name, state=checklist.state(name), found=checklist.checks[name])
                 for name in CHECKS
-                if name in found.checks
+                if name in checklist.checks
             ),
-            findings=tuple(sorted(found.findings, key=_severest_first)),
-            encoders=tuple(found.encoders),
+            findings=tuple(sorted(checklist.findings, key=_by_severity)),
+            encoders=tuple(checklist.encoders),
             views=tuple(views),
-            diagnosis=found.diagnosis,
+            diagnosis=checklist.diagnosis,
             is_usable=len(usable) == dataset.measurements.n_rows,
-            detection=seen,
+            detection=detection,
             is_written=writes,
         )
-        if output is not None and seen is not None:
-            write_detection(examination, seen, Path(output), pool, report)
+        if output is not None and detection is not None:
+            write_detection(examination, detection, Path(output), pool, report)
     return examination
 
 
@@ -166,9 +167,8 @@ def detect(
 ) -> Detection:
     """Find and measure the outlines of the legs in all images, without a fit.
 
-    Outlines that were given or edited are taken as they are; those that an earlier run left beside
-    the dataset are not. With an output this is :func:`legcal.doctor`, of which it returns the
-    outlines.
+    Given or edited outlines are kept; outlines stored by an earlier run are ignored. With an output
+    this is :func:`legcal.doctor`, and returns its outlines.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def detect(
     Returns
     -------
     Detection
-        With views in ``unplaced`` whose images do not show the legs where they should be.
+        Views without recognised legs are in ``unplaced``.
 
     Raises
     ------
@@ -196,43 +196,43 @@ def detect(
 
 
 def _folder(path: Path) -> Path:
-    """Return the folder of a dataset that is named by it or by its ``dataset.yaml``."""
+    """Return the folder of a dataset, given the folder or its ``dataset.yaml``."""
     return path if path.is_dir() else path.parent
 
 
 @dataclass
-class _Found:
-    """What was found so far."""
+class _Checklist:
+    """The checks of a dataset with their findings so far."""
 
     dataset: Dataset
-    refuses: bool  # what cannot be searched; else it is a finding
+    refuses: bool  # whether unusable photographs are errors rather than findings
     checks: dict[str, str] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
     encoders: list[EncoderUse] = field(default_factory=list)
     diagnosis: tuple[Diagnosis, ...] = ()
 
-    def add(self, check: str, severity: Severity, what: str, rows: Sequence[int] = ()) -> None:
-        """Add a finding; rows are those of the dataset's files."""
+    def add(self, check: str, severity: Severity, message: str, rows: Sequence[int] = ()) -> None:
+        """Add a finding; rows are in the order of the dataset's files."""
         names = row_names(self.dataset.measurements)
         images = tuple(names[row] for row in rows)
-        self.findings.append(Finding(check=check, severity=severity, what=what, images=images))
+        self.findings.append(Finding(check=check, severity=severity, what=message, images=images))
 
     def state(self, check: str) -> Severity | Literal["ok"]:
         """Return the severity of the worst finding of a check."""
-        of_check = {one.severity for one in self.findings if one.check == check}
-        return next((one for one in SEVERITIES if one in of_check), "ok")
+        severities = {finding.severity for finding in self.findings if finding.check == check}
+        return next((finding for finding in SEVERITIES if finding in severities), "ok")
 
 
-def _severest_first(one: Finding) -> tuple[int, bool, bool]:
-    """Return what findings are sorted by: mistakes explain others, files are needed for all."""
-    return SEVERITIES.index(one.severity), one.check != "files", one.check != "mistakes"
+def _by_severity(finding: Finding) -> tuple[int, bool, bool]:
+    """Return the sorting key of findings: by severity, then files and mistakes first."""
+    return SEVERITIES.index(finding.severity), finding.check != "files", finding.check != "mistakes"
 
 
-def _look_at_files(found: _Found, problems: Sequence[tuple[int, Problem]]) -> list[int]:
-    """Look for photographs that are not there or cannot be used; return the rows that can."""
-    dataset, m = found.dataset, found.dataset.measurements
+def _look_at_files(checklist: _Checklist, problems: Sequence[tuple[int, Problem]]) -> list[int]:
+    """Look for missing and unreadable photographs; return the usable rows."""
+    dataset, m = checklist.dataset, checklist.dataset.measurements
     n, views = sum(map(bool, m.image)), len(np.unique(m.view))
-    found.checks["files"] = (
+    checklist.checks["files"] = (
         f"{n} photograph{'s' * (n != 1)} of {views} view{'s' * (views != 1)}, {m.n_poses} "
         f"pose{'s' * (m.n_poses != 1)}, model {dataset.machine.name}"
     )
@@ -240,7 +240,7 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, Problem]]) -> li
     paths = {row: dataset.image_path(row) for row in bad}
     missing = [row for row, path in paths.items() if path is not None and not path.exists()]
     if missing:
-        found.add(
+        checklist.add(
             "files",
             "error",
             f"{dataset.table_path}: found no file of {images_in_words(m, missing)} in "
@@ -249,41 +249,45 @@ def _look_at_files(found: _Found, problems: Sequence[tuple[int, Problem]]) -> li
             missing,
         )
     of_files = {row: problem for row, problem in problems if row not in missing}
-    unread = {row: problem for row, problem in of_files.items() if problem.name}  # of an image
-    causes = {row: Cause("{} {}", (one.found, one.needed)) for row, one in unread.items()}
-    for cause, alike in by_cause(causes):
-        if len(alike) > 1:
-            what = f"{images_in_words(m, alike)} could not be read"
-            one = replace(unread[alike[0]], what=what, found=str(cause.values[0]), row=None)
-            found.add("files", "error", str(one), alike)
-            of_files = {row: problem for row, problem in of_files.items() if row not in alike}
+    unread = {row: problem for row, problem in of_files.items() if problem.name}
+    causes = {row: Cause("{} {}", (error.found, error.needed)) for row, error in unread.items()}
+    for cause, rows in by_cause(causes):
+        if len(rows) > 1:
+            problem_text = f"{images_in_words(m, rows)} could not be read"
+            error = replace(
+                unread[rows[0]], what=problem_text, found=str(cause.values[0]), row=None
+            )
+            checklist.add("files", "error", str(error), rows)
+            of_files = {row: problem for row, problem in of_files.items() if row not in rows}
     for row, problem in of_files.items():
-        found.add("files", "error", str(problem), [row])
+        checklist.add("files", "error", str(problem), [row])
     return [row for row in range(m.n_rows) if row not in bad]
 
 
-def _look_at_readings(found: _Found, notes: Sequence[str]) -> None:
-    """Compare readings with each other, with travel, and their digits with their stated noise."""
-    dataset = found.dataset
+def _look_at_readings(checklist: _Checklist, notes: Sequence[str]) -> None:
+    """Check readings against each other and the travel, and their digits against the noise."""
+    dataset = checklist.dataset
     for note in notes:
-        found.add("readings", "warning", note)
+        checklist.add("readings", "warning", note)
     contradicting = contradicting_readings(dataset.machine, dataset.measurements)
-    for what, rows in by_cause(contradicting):
-        found.add(
+    for contradiction, rows in by_cause(contradicting):
+        checklist.add(
             "readings",
             "warning",
             f"The readings of {images_in_words(dataset.measurements, rows)} contradict each other: "
-            f"found {what}; check them, or leave it to the images to show which is wrong.",
+            f"found {contradiction}; check them, or leave it to the images to show which is wrong.",
             rows,
         )
-    found.encoders = _encoder_uses(dataset)
-    shares = {one.column: one.used for one in found.encoders if one.used is not None}
-    found.checks["readings"] = f"{len(found.encoders)} encoders"
+    checklist.encoders = _encoder_uses(dataset)
+    shares = {
+        encoder.column: encoder.used for encoder in checklist.encoders if encoder.used is not None
+    }
+    checklist.checks["readings"] = f"{len(checklist.encoders)} encoders"
     if shares:
         used = _range([100.0 * share for share in shares.values()])
-        found.checks["readings"] += f", {used} % of their travel used"
-    _look_for_still_encoders(found, shares)
-    _look_for_rounded_readings(found)
+        checklist.checks["readings"] += f", {used} % of their travel used"
+    _look_for_still_encoders(checklist, shares)
+    _look_for_rounded_readings(checklist)
 
 
 def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
@@ -292,36 +296,38 @@ def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
     for j, column in zip(dataset.machine.motors, reading_columns(legs), strict=True):
         lower, upper = map(float, legs[j].travel)
         has_travel = bool(np.isfinite(upper - lower)) and upper > lower
-        least, greatest = float(q[:, j].min()), float(q[:, j].max())
+        smallest, largest = float(q[:, j].min()), float(q[:, j].max())
         uses.append(
             EncoderUse(
                 column=column.name,
                 unit=legs[j].reading_unit,
-                least=least,
-                greatest=greatest,
+                least=smallest,
+                greatest=largest,
                 travel=(lower, upper) if has_travel else None,
-                used=(greatest - least) / (upper - lower) if has_travel else None,
+                used=(largest - smallest) / (upper - lower) if has_travel else None,
             )
         )
     return uses
 
 
-def _look_for_still_encoders(found: _Found, shares: Mapping[str, float]) -> None:
-    """Look for encoders that read the same in all rows, or use little of their travel."""
-    constant = [one.column for one in found.encoders if one.least == one.greatest]
-    if 0 < len(constant) < len(found.encoders):
-        found.add(
+def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float]) -> None:
+    """Look for encoders with constant readings, or with a small part of their travel."""
+    constant = [
+        encoder.column for encoder in checklist.encoders if encoder.least == encoder.greatest
+    ]
+    if 0 < len(constant) < len(checklist.encoders):
+        checklist.add(
             "readings",
             "warning",
-            f"{found.dataset.table_path}: found the same reading in all rows of {few(constant)}, "
-            "while other encoders move; check that these were recorded, and move these legs as "
-            "well.",
+            f"{checklist.dataset.table_path}: found the same reading in all rows of "
+            f"{few(constant)}, while other encoders move; check that these were recorded, and move "
+            "these legs as well.",
         )
         shares = {name: share for name, share in shares.items() if name not in constant}
     still = [name for name, share in shares.items() if share < LITTLE_USED]
     if still:
         percent = _range([100.0 * shares[name] for name in still])
-        found.add(
+        checklist.add(
             "readings",
             "warning",
             f"The readings hardly move: found {few(still)} in {percent} % of the travel, needed "
@@ -330,9 +336,9 @@ def _look_for_still_encoders(found: _Found, shares: Mapping[str, float]) -> None
         )
 
 
-def _look_for_rounded_readings(found: _Found) -> None:
-    """Look for readings whose last digit is coarser than the noise that is stated for them."""
-    dataset, legs = found.dataset, found.dataset.machine.legs
+def _look_for_rounded_readings(checklist: _Checklist) -> None:
+    """Look for readings rounded more coarsely than their stated noise."""
+    dataset, legs = checklist.dataset, checklist.dataset.machine.legs
     sigma = dataset.measurements.sigma_of(legs)
     for unit in ("m", "rad"):
         of_unit = [j for j in dataset.machine.motors if legs[j].reading_unit == unit]
@@ -340,7 +346,7 @@ def _look_for_rounded_readings(found: _Found) -> None:
         if digit is None or digit / np.sqrt(12.0) <= (stated := float(sigma[of_unit].min())):
             continue
         step = f"{1e3 * digit:g} mm" if unit == "m" else f"{digit:g} rad"
-        found.add(
+        checklist.add(
             "readings",
             "warning",
             f"{dataset.table_path}: found readings in steps of {step}, whose rounding alone has a "
@@ -351,7 +357,7 @@ def _look_for_rounded_readings(found: _Found) -> None:
 
 
 def _last_digit(q: Array) -> float | None:
-    """Return the size of the last digit that readings have; None where they are too few."""
+    """Return the size of the last digit of readings; None if they are too few."""
     values = q[np.isfinite(q)]
     if len(values) < MIN_READINGS:
         return None
@@ -362,44 +368,44 @@ def _last_digit(q: Array) -> float | None:
     return None
 
 
-def _look_at_cameras(found: _Found, choices: Choices) -> None:
-    """Look at what photographs say of how they were made, against camera files and each other."""
-    dataset, m = found.dataset, found.dataset.measurements
-    shown = sorted({int(v) for v in m.view})
-    files = {dataset.camera_paths[v]: m.views[v].camera for v in shown}
-    found.checks["camera"] = ", ".join(
+def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:
+    """Check the metadata of photographs against the camera files and each other."""
+    dataset, m = checklist.dataset, checklist.dataset.measurements
+    shown_views = sorted({int(v) for v in m.view})
+    files = {dataset.camera_paths[v]: m.views[v].camera for v in shown_views}
+    checklist.checks["camera"] = ", ".join(
         f"{path.name}: {camera.width} x {camera.height} px" for path, camera in files.items()
     )
     for note in notes_on_photographs(m, dataset.camera_paths, dataset.facts):
-        found.add("camera", "error" if note.is_certain else "warning", note.what)
-    for what in exact_cameras(dataset, choices):
-        found.add("camera", "note", what)
+        checklist.add("camera", "error" if note.is_certain else "warning", note.what)
+    for message in exact_cameras(dataset, choices):
+        checklist.add("camera", "note", message)
 
 
-def _look_at_parameters(found: _Found, rows: Sequence[int], choices: Choices) -> None:
-    """Say whether some images can determine all that is planned to be estimated."""
+def _look_at_parameters(checklist: _Checklist, rows: Sequence[int], choices: Choices) -> None:
+    """Check whether the given images can determine all parameters to be estimated."""
     if not rows:
         return
     try:
-        notes = check_identifiable(dataset_at(found.dataset, np.array(rows)), choices)
+        notes = check_identifiable(dataset_at(checklist.dataset, np.array(rows)), choices)
     except (NotIdentifiable, DidNotConverge) as error:
-        found.checks["parameters"] = "not all of them can be identified"
-        for what in error.problems:
-            found.add("parameters", "error", what)
+        checklist.checks["parameters"] = "not all of them can be identified"
+        for message in error.problems:
+            checklist.add("parameters", "error", message)
         return
-    found.checks["parameters"] = "identifiable, if every view shows its legs"
-    for what in notes:
-        found.add("parameters", "note", what)
+    checklist.checks["parameters"] = "identifiable, if every view shows its legs"
+    for message in notes:
+        checklist.add("parameters", "note", message)
 
 
 def _look_at_photographs(
-    found: _Found, usable: list[int], pool: Run, report: Report
+    checklist: _Checklist, usable: list[int], pool: Run, report: Report
 ) -> dict[int, Exposure]:
-    """Look at light, sharpness and equal pixels of photographs; return the first two by row.
+    """Check exposure, sharpness and duplicates of photographs; return the exposures by row.
 
-    Those that cannot be decoded are taken out of the usable rows.
+    Photographs that cannot be decoded are removed from the usable rows.
     """
-    dataset, m = found.dataset, found.dataset.measurements
+    dataset, m = checklist.dataset, checklist.dataset.measurements
     rows = [row for row in usable if m.image[row] in dataset.facts]
     exposures, pixels = dict[int, Exposure](), dict[str, list[int]]()
     if not rows:
@@ -407,10 +413,10 @@ def _look_at_photographs(
     report(LOOKING, 0, len(rows))
     look = partial(_look, dataset.image_reader(range(m.n_rows)))
     for k, (row, (exposure, digest)) in enumerate(zip(rows, pool(look, rows), strict=True)):
-        if exposure is None and found.refuses:
+        if exposure is None and checklist.refuses:
             raise DatasetError(digest)
         if exposure is None:
-            found.add("files", "error", digest, [row])
+            checklist.add("files", "error", digest, [row])
             usable.remove(row)
         else:
             exposures[row] = exposure
@@ -418,34 +424,40 @@ def _look_at_photographs(
                 pixels.setdefault(digest, []).append(row)
         report(LOOKING, k + 1, len(rows))
     defects = defects_of(m, exposures)
-    blurs = [one.blur for row, one in exposures.items() if row not in defects]
-    found.checks["photographs"] = f"{len(exposures) - len(defects)} of {len(rows)} show something"
+    blurs = [light.blur for row, light in exposures.items() if row not in defects]
+    checklist.checks["photographs"] = (
+        f"{len(exposures) - len(defects)} of {len(rows)} show something"
+    )
     if blurs:
-        found.checks["photographs"] += f", blurred by {float(np.median(blurs)):.1f} px"
-    for what in defect_notes(m, defects):
-        found.add("photographs", "warning", what)
-    for same in (own for own in pixels.values() if len(own) > 1):
-        several = len({int(m.pose[row]) for row in same}) > 1
-        found.add(
+        checklist.checks["photographs"] += f", blurred by {float(np.median(blurs)):.1f} px"
+    for message in defect_notes(m, defects):
+        checklist.add("photographs", "warning", message)
+    for duplicates in (
+        rows_of_digest for rows_of_digest in pixels.values() if len(rows_of_digest) > 1
+    ):
+        several = len({int(m.pose[row]) for row in duplicates}) > 1
+        checklist.add(
             "files",
             "error" if several else "warning",
-            f"{_sentence(images_in_words(m, same))} are the same photograph, "
+            f"{_sentence(images_in_words(m, duplicates))} are the same photograph, "
             + (
                 "with different readings: only one of them can be right"
                 if several
                 else "which would count more than once"
             )
             + "; remove the other rows, or name the photographs that belong to them.",
-            same,
+            duplicates,
         )
-    _look_at_views(found, {row: one for row, one in exposures.items() if row not in defects})
-    for what in compression_notes(m, dataset.facts):
-        found.add("photographs", "note", what)
+    _look_at_views(
+        checklist, {row: light for row, light in exposures.items() if row not in defects}
+    )
+    for message in compression_notes(m, dataset.facts):
+        checklist.add("photographs", "note", message)
     return exposures
 
 
 def _look(load: ImageReader, row: int) -> tuple[Exposure | None, str]:
-    """Return how an image was exposed and a digest of its pixels, or None and why it has none."""
+    """Return the exposure of an image and a digest of its pixels, or None and the error."""
     try:
         grey = load(row)
     except DatasetError as error:
@@ -453,20 +465,24 @@ def _look(load: ImageReader, row: int) -> tuple[Exposure | None, str]:
     return measure_exposure(grey), hashlib.sha256(grey.tobytes()).hexdigest()
 
 
-def _look_at_views(found: _Found, exposures: Mapping[int, Exposure]) -> None:
-    """Look for views whose photographs are all blurred, or too bright."""
-    m = found.dataset.measurements
+def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> None:
+    """Look for blurred or overexposed views."""
+    m = checklist.dataset.measurements
     of_views = {
-        view.name: own
+        view.name: of_view
         for v, view in enumerate(m.views)
-        if (own := [one for row, one in exposures.items() if m.view[row] == v])
+        if (of_view := [exposure for row, exposure in exposures.items() if m.view[row] == v])
     }
-    blur = {name: float(np.median([one.blur for one in own])) for name, own in of_views.items()}
+    blur = {
+        name: float(np.median([exposure.blur for exposure in of_view]))
+        for name, of_view in of_views.items()
+    }
     clipped = {
-        name: float(np.median([one.clipped for one in own])) for name, own in of_views.items()
+        name: float(np.median([exposure.clipped for exposure in of_view]))
+        for name, of_view in of_views.items()
     }
     if soft := [name for name in blur if blur[name] > SOFT]:
-        found.add(
+        checklist.add(
             "photographs",
             "warning",
             f"The photographs of {few_views(soft)} are blurred by "
@@ -475,7 +491,7 @@ def _look_at_views(found: _Found, exposures: Mapping[int, Exposure]) -> None:
             "stand still.",
         )
     if bright := [name for name in clipped if clipped[name] > CLIPPED]:
-        found.add(
+        checklist.add(
             "photographs",
             "note",
             f"In photographs of {few_views(bright)} "
@@ -485,106 +501,113 @@ def _look_at_views(found: _Found, exposures: Mapping[int, Exposure]) -> None:
         )
 
 
-def _diagnose(found: _Found, data: OrderedDataset) -> None:
-    """Try common mistakes where images contradict the session."""
-    found.diagnosis = diagnose(data)
-    found.checks["mistakes"] = (
-        "one explains the images better" if found.diagnosis else "none explains the images better"
+def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
+    """Try common mistakes if images contradict the session."""
+    checklist.diagnosis = diagnose(data)
+    checklist.checks["mistakes"] = (
+        "one explains the images better"
+        if checklist.diagnosis
+        else "none explains the images better"
     )
-    most = int(np.bincount(data.measurements.view).max())
-    if most < MIN_IMAGES and not found.diagnosis and data.dataset.board_on("base") is None:
-        found.checks["mistakes"] = "not tried: too few images of each view"
-        found.add(
+    most_images = int(np.bincount(data.measurements.view).max())
+    if (
+        most_images < MIN_IMAGES
+        and not checklist.diagnosis
+        and data.dataset.board_on("base") is None
+    ):
+        checklist.checks["mistakes"] = "not tried: too few images of each view"
+        checklist.add(
             "mistakes",
             "note",
-            f"Mistakes in readings, model and images could not be looked for: found at most {most} "
-            f"image{'s' * (most > 1)} of a view, needed {MIN_IMAGES} or more, since some camera "
-            "pose suits fewer whatever is wrong; photograph more poses from one place.",
+            "Mistakes in readings, model and images could not be looked for: found at most "
+            f"{most_images} image{'s' * (most_images > 1)} of a view, needed {MIN_IMAGES} or more, "
+            "since some camera pose fits fewer images in any case; photograph more poses from one "
+            "position.",
         )
-    for one in found.diagnosis:
-        found.add("mistakes", "error", one.sentence)
+    for diagnosis in checklist.diagnosis:
+        checklist.add("mistakes", "error", diagnosis.sentence)
 
 
-def _searched(found: _Found, data: OrderedDataset) -> Detection | None:
-    """Search the images for the legs; None if that is refused."""
+def _searched(checklist: _Checklist, data: OrderedDataset) -> Detection | None:
+    """Search the images for the legs; None if that fails."""
     m = data.dataset.measurements
     rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
-    if found.refuses and (views := views_to_click(data)):  # on the page that is written
+    if checklist.refuses and (views := views_to_click(data)):  # on the written page
         return unsearched(data, rows, views)
     try:
         return detected(data, rows)
     except (DatasetError, NotIdentifiable, NotVisible, DidNotConverge) as error:
-        if found.refuses:
+        if checklist.refuses:
             raise
-        found.checks["legs"] = "they could not be looked for"
-        for what in error.problems:
-            found.add("legs", "error", what)
+        checklist.checks["legs"] = "they could not be looked for"
+        for problem in error.problems:
+            checklist.add("legs", "error", problem)
         return None
 
 
 def _look_at_legs(
-    found: _Found, seen: Detection, views: Sequence[ViewCondition], choices: Choices
+    checklist: _Checklist, detection: Detection, views: Sequence[ViewCondition], choices: Choices
 ) -> None:
-    """Judge what the images show of the legs, and what that determines."""
-    outlines = seen.outlines
-    found.checks["legs"] = (
+    """Check the legs found in the images, and identifiability by them."""
+    outlines = detection.outlines
+    checklist.checks["legs"] = (
         f"{sum(view.legs_found or 0 for view in views)} of "
         f"{sum(view.legs_visible or 0 for view in views)} found, "
         f"{np.count_nonzero(outlines.used)} of {len(outlines)} outlines can be used"
     )
-    for what in unplaced_notes(seen.unplaced):
-        found.add("legs", "error", what)
-    told = {one.what for one in found.findings}
-    odd = [one for one in seen.image_notes if one not in told]
-    for what in notes_beside(found.diagnosis, odd, "legcal doctor"):
-        found.add("legs", "note" if found.diagnosis else "warning", what)
-    for what in seen.leg_notes:
-        found.add("legs", "note", what)
+    for message in unplaced_notes(detection.unplaced):
+        checklist.add("legs", "error", message)
+    texts = {text.what for text in checklist.findings}
+    new_notes = [text for text in detection.image_notes if text not in texts]
+    for message in notes_beside(checklist.diagnosis, new_notes, "legcal doctor"):
+        checklist.add("legs", "note" if checklist.diagnosis else "warning", message)
+    for message in detection.leg_notes:
+        checklist.add("legs", "note", message)
     for view in views:
         n_found, n_visible = view.legs_found or 0, view.legs_visible or 0
         if not view.problem and n_found < FEW_LEGS * n_visible:
-            why = reason_in_words(next(iter(view.rejected), Reason.OTHER))
-            found.add(
+            reason = reason_in_words(next(iter(view.rejected), Reason.OTHER))
+            checklist.add(
                 "legs",
                 "warning",
                 f"The photographs of view {view.view} show {n_found} of {n_visible} legs that they "
-                f"should, needed most of them (the others mostly because {why}); look at legcal "
+                f"should, needed most of them (the others mostly because {reason}); look at legcal "
                 "detect, and improve light and background.",
             )
-    _judge_what_is_left(found, seen, choices)
+    _check_remaining_images(checklist, detection, choices)
 
 
-def _judge_what_is_left(found: _Found, seen: Detection, choices: Choices) -> None:
-    """Say whether the images and legs that were found determine the parameters."""
-    dataset, m = seen.dataset, seen.dataset.measurements
+def _check_remaining_images(checklist: _Checklist, detection: Detection, choices: Choices) -> None:
+    """Check whether the images with recognised legs determine the parameters."""
+    dataset, m = detection.dataset, detection.dataset.measurements
     names = np.array([view.name for view in m.views])
-    out = np.isin(np.arange(m.n_rows), list(seen.left_out)) | np.isin(
-        names[m.view], list(seen.unplaced)
+    out = np.isin(np.arange(m.n_rows), list(detection.left_out)) | np.isin(
+        names[m.view], list(detection.unplaced)
     )
-    unseen = unseen_legs(dataset.machine, m, seen.outlines)
+    unseen = unseen_legs(dataset.machine, m, detection.outlines)
     if unseen and not out.all():
-        found.add(
+        checklist.add(
             "legs",
             "error",
             f"No photograph shows {few(unseen)} so that an outline can be used, needed some of "
             "every leg; add images that show it, or name the legs of each view in dataset.yaml to "
             "leave it to the readings.",
         )
-    if out.any() and not out.all() and found.state("parameters") != "error":
+    if out.any() and not out.all() and checklist.state("parameters") != "error":
         try:
             check_identifiable(dataset_at(dataset, np.flatnonzero(~out)), choices)
         except (NotIdentifiable, DidNotConverge) as error:
-            found.checks["parameters"] = "the images that are left cannot determine all of them"
-            for what in error.problems:
-                found.add("parameters", "error", what)
+            checklist.checks["parameters"] = "the images that are left cannot determine all of them"
+            for problem in error.problems:
+                checklist.add("parameters", "error", problem)
 
 
 def _conditions(
-    dataset: Dataset, exposures: Mapping[int, Exposure], seen: Detection | None
+    dataset: Dataset, exposures: Mapping[int, Exposure], detection: Detection | None
 ) -> list[ViewCondition]:
-    """Return what the photographs of each view are like, and what they show."""
+    """Return figures of the photographs and outlines of each view."""
     m = dataset.measurements
-    found = []
+    conditions = []
     for v in np.unique(m.view).tolist():
         rows = [row for row in np.flatnonzero(m.view == v).tolist() if row in exposures]
         blurs = [exposures[row].blur for row in rows if not exposures[row].defect]
@@ -601,20 +624,20 @@ def _conditions(
             clipped=_median([exposures[row].clipped for row in rows]),
             jpeg_quality=min(qualities, default=None),
         )
-        if seen is not None:
-            condition = condition.model_copy(update=_outline_figures(seen, condition.view))
-        found.append(condition)
-    return found
+        if detection is not None:
+            condition = condition.model_copy(update=_outline_figures(detection, condition.view))
+        conditions.append(condition)
+    return conditions
 
 
-def _outline_figures(seen: Detection, view: str) -> dict[str, Any]:
+def _outline_figures(detection: Detection, view: str) -> dict[str, Any]:
     """Return the figures of the outlines of a view, by the names of their fields."""
-    m = seen.dataset.measurements
-    names = np.array([one.name for one in m.views])
-    outlines = seen.outlines.choose(names[m.view[seen.outlines.row]] == view)
-    used, rods = outlines.used, along_legs(outlines, seen.dataset.machine.legs)
+    m = detection.dataset.measurements
+    names = np.array([view_of_dataset.name for view_of_dataset in m.views])
+    outlines = detection.outlines.choose(names[m.view[detection.outlines.row]] == view)
+    used, rods = outlines.used, along_legs(outlines, detection.dataset.machine.legs)
     rejected = Counter(
-        str(why.reason) for why, ok in zip(outlines.reason, used, strict=True) if not ok
+        str(rejection.reason) for rejection, ok in zip(outlines.reason, used, strict=True) if not ok
     )
     return {
         "legs_visible": _count_legs(rods, ~is_out_of_sight(rods) | rods.used),
@@ -626,23 +649,23 @@ def _outline_figures(seen: Detection, view: str) -> dict[str, Any]:
         "length": _median(outlines.length[used]),
         "residual": _median(outlines.residual[used]),
         "rejected": dict(rejected.most_common()),
-        "problem": str(seen.unplaced[view]) if view in seen.unplaced else None,
+        "problem": str(detection.unplaced[view]) if view in detection.unplaced else None,
     }
 
 
 def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
-    """Return how many legs in images have one of the chosen outlines."""
+    """Return the number of legs in images with one of the chosen outlines."""
     return len(set(zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)))
 
 
 def _median(values: Sequence[float] | Array) -> float | None:
-    """Return the median of the values that are finite; None without any."""
+    """Return the median of the finite values; None without any."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.median(finite)) if finite else None
 
 
 def _range(values: Sequence[float]) -> str:
-    """Return values from the least to the greatest, in words."""
+    """Return the range of values in words."""
     least, greatest = (f"{float(f'{end(values):.2g}'):g}" for end in (min, max))
     return least if least == greatest else f"{least} to {greatest}"
 

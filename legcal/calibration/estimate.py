@@ -1,6 +1,6 @@
 """From outlines to parameters: the four steps, then the joint fit that starts from them.
 
-In: a dataset in canonical order, outlines of all of its images and where the legs were looked for.
+In: a dataset in canonical order, outlines of all of its images and their placement.
 Out: an :class:`Estimate`.
 """
 
@@ -28,37 +28,37 @@ from legcal.errors import NotVisible
 from legcal.machine.model import Machine
 from legcal.perception.placement import Placement
 
-# Of all outlines that are measured in photographs: light at the limb that no model of shading
-# predicts looks like other radii, so that residuals never show it [px].
+# Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
+# a change of the radii, so that residuals never show it.
 LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
-# Of a session that looks wrong: neither other starts nor patience would mend it, and what it
-# contradicts is not to blame.
+# Settings for a session with a suspected mistake: other starts and more iterations would not help,
+# and contradictions to stated values are expected.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the images show and what was fitted to it, in canonical order."""
+    """Measured outlines and the parameters fitted to them, in canonical order."""
 
-    fitted: OrderedDataset  # the images that were fitted
-    outlines: Outlines  # of all images
+    fitted: OrderedDataset  # the fitted images
+    outlines: Outlines  # outlines in all images
     steps: Steps
     solution: Solution
-    corners: Corners | None  # of the calibration board in all images; None without a board
-    image_notes: tuple[str, ...] = ()  # on the images by themselves
-    fit_notes: tuple[str, ...] = ()  # on the images by the fit
+    corners: Corners | None  # board corners in all images; None without a board
+    image_notes: tuple[str, ...] = ()  # notes on the images, before the fit
+    fit_notes: tuple[str, ...] = ()  # notes on the images, by the fit
     other_radii: bool = False  # whether the images show other radii than the model has
-    diagnosis: tuple[Diagnosis, ...] = ()  # what looks wrong where many images were left out
+    diagnosis: tuple[Diagnosis, ...] = ()  # suspected mistakes if many images were left out
 
     @cached_property
     def outliers(self) -> dict[int, Cause]:
-        """What is said of images that contradict the fit, by their row."""
+        """Causes for images that contradict the fit, by row."""
         return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
 
     def in_file_order(self) -> Estimate:
-        """Return the same with legs, views and images in the order of the files."""
+        """Return a copy with legs, views and images in the order of the files."""
         dataset, order = self.fitted.in_file_order()
-        restore = self.fitted.order.restore  # of tables of all images
+        restore = self.fitted.order.restore
         return replace(
             self,
             outlines=restore(self.outlines),
@@ -80,30 +80,32 @@ def fit_outlines(
 ) -> Estimate:
     """Run the four steps, then the joint fit, with the outlines of all images.
 
-    ``steps`` are what the four steps gave from an earlier measurement; they are not run again.
+    ``steps`` is the result of the four steps from an earlier measurement; it is not recomputed.
 
     Raises
     ------
     NotVisible
-        If no image shows a leg that its view says it does.
+        If no image shows a leg that its view should show.
     NotIdentifiable, DidNotConverge
         As the joint fit.
     """
-    seen = outlines.at(fitted.rows)
-    seen = reject_unused_legs(seen, fitted.measurements, fitted.machine.leg_names)
+    fitted_outlines = outlines.at(fitted.rows)
+    fitted_outlines = reject_unused_legs(
+        fitted_outlines, fitted.measurements, fitted.machine.leg_names
+    )
     if options.every_leg:
-        _refuse_unseen_legs(fitted, seen)
+        _refuse_unseen_legs(fitted, fitted_outlines)
     if steps is None:
-        steps = four_steps(fitted, seen, board, options)
+        steps = four_steps(fitted, fitted_outlines, board, options)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
-    if any(fitted.measurements.image) and "detected" in seen.source:
+    if any(fitted.measurements.image) and "detected" in fitted_outlines.source:
         choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
     solution = refine(
         fitted.fitted_legs,
         fitted.measurements,
-        seen,
-        starts(fitted, seen, placement, steps, board),
+        fitted_outlines,
+        starts(fitted, fitted_outlines, placement, steps, board),
         settings,
         axes=fitted.axes,
         board=None if board is None else board.at(fitted.rows),
@@ -115,7 +117,7 @@ def fit_outlines(
 
 
 def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
-    """Raise NotVisible if no image shows a leg that its view says it does."""
+    """Raise NotVisible if no image shows a leg that its view should show."""
     if fitted.axes is not None:
         return
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
@@ -128,7 +130,7 @@ def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
 
 
 def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:
-    """Return the legs that views should show, and of which no outline is used."""
+    """Return the legs that views should show and that have no used outline."""
     along = along_legs(outlines, machine.legs)
     shown = set(along.leg[along.used].tolist())
     views = [measurements.views[v] for v in np.unique(measurements.view).tolist()]

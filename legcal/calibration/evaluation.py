@@ -1,8 +1,8 @@
-"""How far apart two models are: platform errors of eq (20), and every parameter.
+"""Comparison of two models: platform errors of eq (20), and every parameter.
 
-Both models are given the same encoder readings. Each answers with the pose of R_e in R_b;
-the difference is the displacement of the platform joint of the first frame leg (the origin of
-R_e) and the angle of the rotation between the two orientations.
+Both models are evaluated at the same encoder readings. The difference of the poses of R_e in R_b is
+the displacement of the platform joint of the first frame leg (the origin of R_e) and the angle of
+the rotation between the two orientations.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ from legcal.machine.redundancy import reading_residuals
 from legcal.vision.board import Link
 
 WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
-MAX_DRAWS = 20  # of poses in place of those that the reference does not reach
-FIRST_POSES = 10  # of the first draw: if the reference reaches none of them, there is no other
+MAX_DRAWS = 20  # largest number of draws to replace poses that the reference does not reach
+FIRST_POSES = 10  # poses of the first draw; the only one if the reference reaches none of them
 
 
 @brief
@@ -56,17 +56,17 @@ class Evaluation:
         The parameters of the model and of the reference. Axes are turns of the reference's axis,
         so that the reference has zero there.
     links : dict
-        By ``base`` and ``platform`` the joint centres in the links of the model, R_b and R_e of the
-        reference laid on its own [m], and how far the frames are apart without that.
+        By ``base`` and ``platform`` the joint centres in the links of the model, with R_b and R_e
+        of both models aligned [m], and the original distance of the frames.
     n_left_out : int
-        Poses of the dataset that are not compared, since one of the models does not reach them.
+        Number of poses of the dataset left out, since one of the models does not reach them.
     unreached : tuple of UnreachedRow
-        The rows of the dataset with these poses, and who does not reach them.
+        The rows of the dataset with these poses, and the models that do not reach them.
     redundant_readings : dict or None
-        By ``model`` and ``reference`` how the readings of the dataset agree at the poses that are
-        compared; None without a dataset and where readings cannot disagree.
+        By ``model`` and ``reference`` the residuals of redundant readings at the compared poses;
+        None without a dataset or without redundant readings.
     joints_move : bool
-        Whether motors move joints of the base, which are compared where these read 0.
+        Whether motors move joints of the base; these are compared at zero readings.
     """
 
     displacement: Array
@@ -114,8 +114,8 @@ def evaluate(
     model, reference : path, name or Machine
         The two mechanisms; they must have the same legs and frames.
     dataset : path, optional
-        Take the readings of this dataset, without those that one of the models does not reach;
-        else those of 100 poses of the workspace, which are the same at every call.
+        Compare at the readings of this dataset that both models reach; by default at 100 poses of
+        the workspace, the same in every call.
 
     Returns
     -------
@@ -130,8 +130,8 @@ def evaluate(
 
     Notes
     -----
-    Where the motors do not determine the pose only parameters are compared: both arrays of
-    platform errors are empty then.
+    If the motors do not determine the pose, only parameters are compared and both arrays of
+    platform errors are empty.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     truth = reference if isinstance(reference, Machine) else load_mechanism(reference)
@@ -142,26 +142,30 @@ def evaluate(
     unreached: tuple[UnreachedRow, ...] = ()
     redundant: dict[Literal["model", "reference"], ReadingResiduals] | None = None
     if not (machine.is_determined and truth.is_determined):
-        pass  # no reading says where the platform is
+        pass  # readings do not determine the platform
     elif dataset is None:
         poses, reference_poses = _random_poses(machine, truth)
     else:
-        given = load_dataset(dataset, check_images=False)
-        q = _readings_of(given, machine)
-        both = [_poses_at(model, q) for model in (machine, truth)]
-        missed = [[T is None for T in found] for found in both]
-        unreached = _unreached(given, missed)
+        session = load_dataset(dataset, check_images=False)
+        q = _readings_of(session, machine)
+        poses_of_models = [_poses_at(model, q) for model in (machine, truth)]
+        missed = [[T is None for T in poses_of_model] for poses_of_model in poses_of_models]
+        unreached = _unreached(session, missed)
         n_left_out = sum(map(max, zip(*missed, strict=True)))
         if n_left_out == len(q):
-            raise DidNotConverge(_why_none(given, unreached))
+            raise DidNotConverge(_why_none(session, unreached))
         poses, reference_poses = (
-            [T for T, *off in zip(found, *missed, strict=True) if T is not None and not any(off)]
-            for found in both
+            [
+                T
+                for T, *off in zip(poses_of_model, *missed, strict=True)
+                if T is not None and not any(off)
+            ]
+            for poses_of_model in poses_of_models
         )
         if machine.is_redundant:
             reached = np.flatnonzero(~np.any(missed, axis=0))
             models = zip(WHO, (machine, truth), (poses, reference_poses), strict=True)
-            redundant = {who: _residuals(given, model, T, q[reached]) for who, model, T in models}
+            redundant = {who: _residuals(session, model, T, q[reached]) for who, model, T in models}
     displacement, rotation = pose_differences(
         platforms_in_base(machine, poses),
         platforms_in_base(truth, reference_poses),
@@ -194,23 +198,23 @@ def _in_the_order_of(reference: Machine, model: Machine) -> Machine:
         )
     reference = reference.with_leg_order(model.leg_names)
     if reference.frame_legs != model.frame_legs:
-        found = " and ".join(
+        differences = " and ".join(
             ", ".join(m.leg_names[leg] for leg in m.frame_legs) for m in (model, reference)
         )
         raise ModelError(
-            f"The models could not be compared: their base_frame legs differ ({found}); "
+            f"The models could not be compared: their base_frame legs differ ({differences}); "
             "coordinates mean the same only in the same frame; give both the same base_frame."
         )
     different = [
-        f"{one.name} is {one.kind} {one.type} and {other.kind} {other.type}"
-        for one, other in zip(model.legs, reference.legs, strict=True)
-        if (one.type, one.kind) != (other.type, other.kind)
+        f"{leg.name} is {leg.kind} {leg.type} and {other.kind} {other.type}"
+        for leg, other in zip(model.legs, reference.legs, strict=True)
+        if (leg.type, leg.kind) != (other.type, other.kind)
     ]
     if different or model.spatial != reference.spatial:
-        found = "; ".join(different) or "one is spatial and the other planar"
+        differences = "; ".join(different) or "one is spatial and the other planar"
         raise ModelError(
-            f"The models could not be compared: {found}; both must describe the same machine; "
-            "check the two paths."
+            f"The models could not be compared: {differences}; both must describe the same "
+            "machine; check the two paths."
         )
     return reference
 
@@ -231,20 +235,20 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
 def _residuals(
     dataset: Dataset, machine: Machine, poses: Sequence[RigidTransform], q: Array
 ) -> ReadingResiduals:
-    """Return how readings (n_poses, n_legs) of redundant motors agree at poses T_base_platform."""
+    """Return the residuals of redundant readings (n_poses, n_legs) at poses T_base_platform."""
     motors = list(machine.motors)
     legs = [machine.legs[j] for j in motors]
     rows = zip(poses, q, strict=True)
-    off = np.array([reading_residuals(machine, T, row)[motors] for T, row in rows])
+    residuals = np.array([reading_residuals(machine, T, row)[motors] for T, row in rows])
     sigma = dataset.measurements.sigma_of(legs)
-    moved = off / [leg.reading_of(1.0) for leg in legs]
-    rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (off / sigma, moved))
+    moved = residuals / [leg.reading_of(1.0) for leg in legs]
+    rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (residuals / sigma, moved))
     expected = float(np.sqrt(1.0 - machine.mobility / len(motors)))
     return ReadingResiduals(rms=rms, rms_expected=expected, rms_m=rms_m)
 
 
 def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
-    """Return T_base_platform at rows of readings, None where the machine does not reach them."""
+    """Return T_base_platform at rows of readings; None for rows that the machine cannot reach."""
     lengths = machine.lengths_at(q[:, list(machine.motors)], machine.motors)
     possible = np.flatnonzero(np.all(lengths > 0.0, axis=1)).tolist()
     poses: list[RigidTransform | None] = [None] * len(q)
@@ -255,7 +259,7 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
 
 
 def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
-    """Return the rows whose poses the model or the reference misses, in the order of the file."""
+    """Return the rows that the model or the reference cannot reach, in the order of the file."""
     m = dataset.measurements
     names = row_names(m)
     return tuple(
@@ -266,7 +270,7 @@ def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[Unre
 
 
 def _why_none(dataset: Dataset, unreached: Sequence[UnreachedRow]) -> str:
-    """Return why two models could not be compared at any reading of a dataset."""
+    """Return the error of two models that share no reachable reading of a dataset."""
     by = [
         f"the {who} does not reach row{'s' * (len(rows) > 1)} {few(rows)}"
         for who in WHO
@@ -288,13 +292,13 @@ def _random_poses(
     rng = np.random.default_rng(WORKSPACE_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
-    for turn in range(MAX_DRAWS):
-        if turn > 0 and not poses:
+    for draw in range(MAX_DRAWS):
+        if draw > 0 and not poses:
             break
-        count = WORKSPACE_POSES - len(poses) if turn > 0 else FIRST_POSES
+        count = WORKSPACE_POSES - len(poses) if draw > 0 else FIRST_POSES
         q, drawn = random_poses(machine, count, rng)
-        there = followed_poses(reference, q, on_the_chain=False)
-        for T, (reference_T, failure) in zip(drawn, there, strict=True):
+        reference_poses_drawn = followed_poses(reference, q, on_the_chain=False)
+        for T, (reference_T, failure) in zip(drawn, reference_poses_drawn, strict=True):
             if failure is None:  # else the reference cannot have these lengths at the same time
                 poses.append(T)
                 reference_poses.append(reference_T)

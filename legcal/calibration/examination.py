@@ -22,52 +22,52 @@ CHECKS = ("files", "readings", "camera", "photographs", "legs", "parameters", "m
 
 
 class Finding(Document):
-    """Something that a reader should know before calibrating."""
+    """A problem or remark about the dataset."""
 
     check: str  # one of CHECKS
-    severity: Severity  # an error stands against calibrating, a warning makes the result worse
+    severity: Severity  # an error prevents calibration, a warning makes the result worse
     what: str  # one sentence, with the remedy
-    images: tuple[str, ...] = ()  # that it is about, if it is about some
+    images: tuple[str, ...] = ()  # affected images
 
 
 class EncoderUse(Document):
-    """What the readings of an encoder are."""
+    """The range of the readings of an encoder."""
 
     column: str
-    unit: Literal["m", "rad"]  # of what follows
+    unit: Literal["m", "rad"]  # unit of the following values
     least: float
     greatest: float
-    travel: tuple[float, float] | None  # None where the model has no limits
+    travel: tuple[float, float] | None  # None if the model has no limits
     used: float | None  # share of the travel
 
 
 class ViewCondition(Document):
-    """What the photographs of a view are like, and what they show.
+    """Condition of the photographs of a view, and the outlines in them.
 
-    Legs are counted in each image that should show them: neither outside nor hidden. They are found
-    where one of their outlines is used. Nothing is known of outlines where none were searched.
+    Legs are counted in each image in which they are visible: neither outside nor hidden. A leg is
+    found if one of its outlines is used. Fields of outlines are None if none were searched.
     """
 
     view: str
     images: int
-    camera: str  # the file
-    blur_px: float | None  # usual one of sharp edges; None where nothing can be seen
-    clipped: float | None  # usual share of pixels that are as bright as a file can say
-    jpeg_quality: int | None  # the least; None where nothing is lost
-    legs_found: int | None = None  # in all images together
+    camera: str  # camera file
+    blur_px: float | None  # median blur of sharp edges; None without any
+    clipped: float | None  # median share of saturated pixels
+    jpeg_quality: int | None  # lowest quality; None for lossless files
+    legs_found: int | None = None  # number in all images
     legs_visible: int | None = None
     outlines: int | None = None
     outlines_used: int | None = None
     edited: int | None = None
-    contrast: float | None = None  # median of the used outlines, as the next ones [grey levels]
-    length: float | None = None  # [px]
-    residual: float | None = None  # [px]
+    contrast: float | None = None  # median of the used outlines [grey levels]
+    length: float | None = None  # median of the used outlines [px]
+    residual: float | None = None  # median of the used outlines [px]
     rejected: dict[str, int] = Field(default_factory=dict)  # by code of the reason, most first
-    problem: str | None = None  # why its camera could not be placed
+    problem: str | None = None  # reason why the camera could not be placed
 
 
 class CheckState(Document):
-    """What one of the checks looked at, and the severity of its worst finding."""
+    """Summary of a check and the severity of its worst finding."""
 
     name: str
     state: Severity | Literal["ok"]
@@ -75,7 +75,7 @@ class CheckState(Document):
 
 
 class ExaminationDocument(Document):
-    """What ``legcal doctor --json`` and ``legcal detect --json`` print."""
+    """The output of ``legcal doctor --json`` and ``legcal detect --json``."""
 
     legcal_doctor: int
     dataset: str
@@ -90,7 +90,7 @@ class ExaminationDocument(Document):
     outlines: int
     used: int
     left_out: list[LeftOut]
-    overlays: list[Overlay]  # files relative to the folder that was written
+    overlays: list[Overlay]  # files relative to the output folder
     diagnosis: list[DiagnosisBlock]
 
 
@@ -102,21 +102,21 @@ class Examination:
     Attributes
     ----------
     dataset, mechanism : str
-        What was looked at.
+        Folder of the dataset and name of the machine.
     checks : tuple of CheckState
-        What each check looked at; those that could not be made are not there.
+        Summaries of the checks that could be made.
     findings : tuple of Finding
-        The most severe first.
+        Findings, the most severe first.
     encoders : tuple of EncoderUse
-        Readings against travel.
+        Range of the readings of each encoder.
     views : tuple of ViewCondition
-        The photographs of each view.
+        Condition of the photographs of each view.
     diagnosis : tuple of Diagnosis
-        What explains images that contradict the session, the likeliest first.
+        Mistakes that explain contradicting images, the likeliest first.
     is_usable : bool
         Whether all files can be used.
     detection : Detection or None
-        The outlines of the legs in the images; None where these could not be searched.
+        The outlines of the legs in the images; None if the images could not be searched.
     is_written : bool
         Whether the outlines were written with pictures and a page.
     """
@@ -133,38 +133,38 @@ class Examination:
     is_written: bool = False
 
     def count(self, severity: Severity) -> int:
-        """Return how many findings are of a severity."""
-        return sum(one.severity == severity for one in self.findings)
+        """Return the number of findings of a severity."""
+        return sum(finding.severity == severity for finding in self.findings)
 
     @property
     def n_used(self) -> int:
-        """How many outlines can be used."""
+        """Number of usable outlines."""
         return sum(view.outlines_used or 0 for view in self.views)
 
     @property
     def is_ready(self) -> bool:
-        """Whether nothing stands against calibrating."""
+        """Whether there are no errors."""
         return not self.count("error")
 
     @property
     def sentence(self) -> str:
-        """Whether to go on, and with what."""
-        wrong, odd = self.count("error"), self.count("warning")
-        look = f", {odd} thing{'s' * (odd != 1)} to look at" * (odd > 0)
-        if wrong:
-            return f"{wrong} thing{'s' * (wrong != 1)} to mend before calibrating{look}."
+        """The verdict with the next command."""
+        n_errors, n_warnings = self.count("error"), self.count("warning")
+        warnings = f", {n_warnings} warning{'s' * (n_warnings != 1)}" * (n_warnings > 0)
+        if n_errors:
+            return f"{n_errors} error{'s' * (n_errors != 1)} to fix before calibrating{warnings}."
         folder = shlex.quote(printable(self.dataset))
-        return f"Nothing stands against calibrating{look}: legcal calibrate {folder} -o OUT"
+        return f"Ready to calibrate{warnings}: legcal calibrate {folder} -o OUT"
 
     def document(self) -> dict[str, Any]:
-        """Return what ``legcal doctor --json`` prints."""
-        seen, overlays, left_out = self.detection, list[Overlay](), list[LeftOut]()
-        if seen is not None:
-            m = seen.dataset.measurements
-            names, left_out = row_names(m), left_out_blocks(m, seen.left_out)
-            files = seen.overlay_files if self.is_written else {}
+        """Return the output of ``legcal doctor --json``."""
+        detection, overlays, left_out = self.detection, list[Overlay](), list[LeftOut]()
+        if detection is not None:
+            m = detection.dataset.measurements
+            names, left_out = row_names(m), left_out_blocks(m, detection.left_out)
+            files = detection.overlay_files if self.is_written else {}
             overlays = [
-                Overlay(view=seen.view_of(row), image=names[row], file=file)
+                Overlay(view=detection.view_of(row), image=names[row], file=file)
                 for row, file in files.items()
             ]
         return ExaminationDocument(
@@ -182,5 +182,5 @@ class Examination:
             used=self.n_used,
             left_out=left_out,
             overlays=overlays,
-            diagnosis=[one.document() for one in self.diagnosis],
+            diagnosis=[diagnosis.document() for diagnosis in self.diagnosis],
         ).document()

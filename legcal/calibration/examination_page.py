@@ -1,8 +1,8 @@
-"""What people read of an examination: tables of its figures, and its page with the photographs.
+"""The report of an examination: tables of its figures, and its page with the photographs.
 
-On the page people correct outlines over the photographs. It holds the table as it was written,
-cameras without what it does not need of them, and where outlines were expected that were not found:
-such a one is placed there and dragged onto its edge.
+On the page outlines are corrected over the photographs. It contains the written table, the
+intrinsics of the cameras, and the expected positions of missing outlines: such an outline is placed
+there and dragged onto its edge.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from legcal.vision.camera import Camera
 from legcal.vision.visibility import PredictedLeg
 
 DETECTION_PAGE = "index.html"
-# Of an end that a person places over an enlarged photograph: edges are blurred over a pixel or two,
-# and where in that width their middle is the eye says to about half a pixel.
-SIGMA_BY_HAND = 0.5  # [px]
-MAX_BYTES = 8_300_000  # of the table and what is said of its images, in a page
-_ALONG = 12  # points of an edge, which lenses bend
+# Standard deviation of an end placed by hand over an enlarged photograph [px]: the eye finds the
+# centre of an edge that is blurred over a pixel or two to about half a pixel.
+SIGMA_BY_HAND = 0.5
+MAX_BYTES = 8_300_000  # largest size of the outline editor in a page
+_ALONG = 12  # points along an edge, which lenses bend
 _OF_IMAGE = 250  # bytes in the page for each image
 _STATES = {"ok": "ok", "note": "ok", "warning": "look", "error": "wrong"}
 _HOW_TO_CORRECT = (
@@ -72,12 +72,12 @@ _TOO_MANY = (
 )
 
 
-def tables_of(found: Examination) -> list[Table]:
+def tables_of(examination: Examination) -> list[Table]:
     """Return the figures of an examination: a line for each check, view and encoder."""
     tables = [
         Table(
             ("check", "", "found"),
-            [(one.name, _STATES[one.state], one.found) for one in found.checks],
+            [(check.name, _STATES[check.state], check.found) for check in examination.checks],
             sortable=False,
         ),
         Table(
@@ -90,18 +90,18 @@ def tables_of(found: Examination) -> list[Table]:
                     number(None if view.clipped is None else 100.0 * view.clipped, 0),
                     number(view.jpeg_quality, 0),
                 )
-                for view in found.views
+                for view in examination.views
             ],
         ),
         Table(
             ("view", ">legs", ">outlines used", ">contrast", ">length [px]", ">residual [px]",
              "not used"),
-            [_outline_cells(view) for view in found.views if view.outlines is not None],
+            [_outline_cells(view) for view in examination.views if view.outlines is not None],
         ),
     ]  # fmt: skip
-    units = dict.fromkeys(UNITS[one.unit][1] for one in found.encoders)
+    units = dict.fromkeys(UNITS[check.unit][1] for check in examination.encoders)
     rows = list[list[Cell]]()
-    for encoder in found.encoders:
+    for encoder in examination.encoders:
         scale = UNITS[encoder.unit][0]
         low_high = None if encoder.travel is None else [scale * end for end in encoder.travel]
         rows.append(
@@ -120,7 +120,7 @@ def tables_of(found: Examination) -> list[Table]:
 
 def _outline_cells(view: ViewCondition) -> list[Cell]:
     """Return the figures of the outlines of a view."""
-    rejected = ", ".join(f"{n} {reason_in_words(why)}" for why, n in view.rejected.items())
+    rejected = ", ".join(f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items())
     return [
         view.view,
         _share(view.legs_found, view.legs_visible),
@@ -136,14 +136,14 @@ def _share(part: int | None, whole: int | None) -> Cell:
     return Number(part, f"{part}/{whole}")
 
 
-def examination_page(found: Examination, detection: Detection, token: str = "") -> str:
-    """Return the text of ``index.html``; one that is served is known by a token."""
+def examination_page(examination: Examination, detection: Detection, token: str = "") -> str:
+    """Return the text of ``index.html``; *token* identifies a page that is served."""
     files, names = detection.overlay_files, row_names(detection.dataset.measurements)
-    anchors = unique_names(f"view-{view.view}" for view in found.views)
+    anchors = unique_names(f"view-{view.view}" for view in examination.views)
     editor = _outline_editor(detection)
     correct = [Text([_TOO_MANY])] if editor is None else [Text([_HOW_TO_CORRECT]), editor]
-    checks, *tables = tables_of(found)
-    findings = Items([f"{one.severity}: {one.what}" for one in found.findings])
+    checks, *tables = tables_of(examination)
+    findings = Items([f"{finding.severity}: {finding.what}" for finding in examination.findings])
     blocks: list[Any] = [checks, findings, *tables]
     sections = [
         Section("found", "What was found", blocks),
@@ -163,7 +163,7 @@ def examination_page(found: Examination, detection: Detection, token: str = "") 
     if len(shown) < len(files):
         few = f"The {len(shown)} of {len(files)} images with the fewest used outlines are shown."
         blocks.append(Text([few]))
-    for view, anchor in zip(found.views, anchors, strict=True):
+    for view, anchor in zip(examination.views, anchors, strict=True):
         rows = [row for row in files if row in shown and detection.view_of(row) == view.view]
         pictures = [
             Picture(
@@ -176,20 +176,20 @@ def examination_page(found: Examination, detection: Detection, token: str = "") 
         ]
         problem = [Text([view.problem])] if view.problem else []
         sections.append(Section(anchor, view.view, [*problem, Row(pictures)]))
-    title = f"Outlines of {found.mechanism}"
-    return page_html(Page(title, found.dataset, _verdict(found), sections))
+    title = f"Outlines of {examination.mechanism}"
+    return page_html(Page(title, examination.dataset, _verdict(examination), sections))
 
 
-def _verdict(found: Examination) -> Verdict:
-    if found.count("error"):
-        return Verdict("bad", "To be mended", found.sentence, [])
-    if found.count("warning"):
-        return Verdict("doubtful", "To be looked at", found.sentence, [])
-    return Verdict("good", "Ready", found.sentence, [])
+def _verdict(examination: Examination) -> Verdict:
+    if examination.count("error"):
+        return Verdict("bad", "Errors", examination.sentence, [])
+    if examination.count("warning"):
+        return Verdict("doubtful", "Warnings", examination.sentence, [])
+    return Verdict("good", "Ready", examination.sentence, [])
 
 
 def _worst(detection: Detection) -> set[int]:
-    """Return the rows whose images a page shows: all, or those with the fewest used outlines."""
+    """Return the rows of the images on the page: all, or a number with the fewest used outlines."""
     rows = list(detection.overlay_files)
     used = np.bincount(detection.outlines.row[detection.outlines.used], minlength=max(rows) + 1)
     order = np.argsort(used[rows], kind="stable")[:MAX_ROWS].tolist()
@@ -197,24 +197,24 @@ def _worst(detection: Detection) -> set[int]:
 
 
 def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str, str]:
-    """Return what was found in the image of a row, and why legs are rejected."""
+    """Return the number of used outlines of an image and the reasons for rejecting legs."""
     outlines, legs = detection.outlines, detection.dataset.machine.leg_names
-    here = np.flatnonzero(outlines.row == row).tolist()
-    used = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
+    indices = np.flatnonzero(outlines.row == row).tolist()
+    used = f"{np.count_nonzero(outlines.used[indices])} of {len(indices)} used"
     rejected: dict[str, list[str]] = {}
-    for i in here:
-        why = outlines.reason[i]
-        if not outlines.used[i] and why.reason is not Reason.OUTSIDE:
+    for i in indices:
+        rejection = outlines.reason[i]
+        if not outlines.used[i] and rejection.reason is not Reason.OUTSIDE:
             name = legs[outlines.leg[i]]
-            of_reason = rejected.setdefault(why.summary, [])
-            if name not in of_reason:
-                of_reason.append(name)
-    reasons = "; ".join(f"{', '.join(legs)}: {why}" for why, legs in rejected.items())
+            legs_of_reason = rejected.setdefault(rejection.summary, [])
+            if name not in legs_of_reason:
+                legs_of_reason.append(name)
+    reasons = "; ".join(f"{', '.join(legs)}: {rejection}" for rejection, legs in rejected.items())
     return f"{names[row]}: {used}", f"({reasons})" if reasons else ""
 
 
 def _outline_editor(detection: Detection) -> OutlineEditor | None:
-    """Return the editor of outlines; None where the table is more than a page should hold."""
+    """Return the editor of outlines; None if the table is too large for a page."""
     measurements, machine = detection.dataset.measurements, detection.dataset.machine
     images = [
         image | {"camera": int(measurements.view[row]), "expected": _expected(detection, row)}
@@ -229,13 +229,13 @@ def _outline_editor(detection: Detection) -> OutlineEditor | None:
         for view in measurements.views
     ]
     table = format_observations(detection.outlines, measurements, machine.leg_names)
-    found = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, WORDS_BY_CODE)
-    size = len(found.packed) + _OF_IMAGE * len(images)
-    return found if size <= MAX_BYTES else None
+    editor = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, WORDS_BY_CODE)
+    size = len(editor.packed) + _OF_IMAGE * len(images)
+    return editor if size <= MAX_BYTES else None
 
 
 def _images(detection: Detection) -> dict[int, dict[str, Any]]:
-    """Return what editors need to know of the photographs, by row."""
+    """Return the photographs for the editors, by row."""
     measurements = detection.dataset.measurements
     names, images = row_names(measurements), dict[int, dict[str, Any]]()
     for row, file in detection.photograph_files.items():
@@ -252,7 +252,7 @@ def _images(detection: Detection) -> dict[int, dict[str, Any]]:
 
 
 def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
-    """Return the editor of clicks on joints, with those that the dataset has."""
+    """Return the editor of clicks on joints, with the clicks of the dataset."""
     dataset, machine = detection.dataset, detection.dataset.machine
     joints = joint_names(machine.leg_names)
     number_of = {row: k for k, row in enumerate(detection.photograph_files)}
@@ -283,18 +283,20 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
 
 
 def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
-    """Return both ends [px] of the outlines of an image that were expected and not found."""
+    """Return both ends [px] of the missing outlines of an image."""
     measurements, names = detection.dataset.measurements, detection.dataset.machine.leg_names
     outlines = detection.outlines
     here = np.flatnonzero(outlines.row == row)
-    found = np.isfinite(outlines.h[here]).all(axis=1) & np.isfinite(outlines.ends[here]).all((1, 2))
-    lost = here[~found].tolist()
-    if not lost:
+    is_measured = np.isfinite(outlines.h[here]).all(axis=1) & np.isfinite(outlines.ends[here]).all(
+        (1, 2)
+    )
+    missing = here[~is_measured].tolist()
+    if not missing:
         return {}
     camera = measurements.views[int(measurements.view[row])].camera
     legs = {(leg.leg, part.link): leg for leg in detection.predicted(row) for part in leg.segments}
     expected = {}
-    for i in lost:
+    for i in missing:
         j, part, edge = int(outlines.leg[i]), outlines.part[i], int(outlines.edge[i])
         leg = legs.get((j, part))
         ends = None if leg is None else _ends(camera, leg, part, edge)
@@ -318,12 +320,12 @@ def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int, n: int = 2) -
 def edges_seen_from(
     detection: Detection, row: int, T_base_camera: RigidTransform
 ) -> list[dict[str, Any]]:
-    """Return where the edges of the legs of an image would be seen by a camera: points [px]."""
+    """Return the edges of the legs of an image for a given camera pose: points [px]."""
     measurements, names = detection.dataset.measurements, detection.dataset.machine.leg_names
     v = int(measurements.view[row])
     cameras = list(detection.T_base_camera)
     cameras[v] = T_base_camera
-    camera, found = measurements.views[v].camera, []
+    camera, edges_of_legs = measurements.views[v].camera, []
     for leg in replace(detection, T_base_camera=tuple(cameras)).predicted(row):
         edges = [
             _ends(camera, leg, segment.link, edge, _ALONG)
@@ -331,5 +333,5 @@ def edges_seen_from(
             for edge in (1, 2)
         ]
         shown = [np.round(edge, 2).tolist() for edge in edges if edge is not None]
-        found.append({"leg": names[leg.leg], "edges": shown})
-    return found
+        edges_of_legs.append({"leg": names[leg.leg], "edges": shown})
+    return edges_of_legs

@@ -1,6 +1,6 @@
-"""Overlays of a calibration: its photographs with the outlines that were fitted, beside the result.
+"""Overlays of a calibration: its photographs with the fitted outlines, in the result folder.
 
-They are drawn as those of a detection, with the machine and the cameras of the fit.
+They are drawn like the overlays of a detection, with the machine and the cameras of the fit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from legcal.workers import Run
 
 
 def with_overlays(calibration: Calibration) -> Calibration:
-    """Return a calibration whose overlays are to be drawn: it has their files, by row."""
+    """Return the calibration with the files of its overlays, by row; nothing is drawn."""
     files = _as_detection(calibration.dataset, calibration.solution).overlay_files
     return replace(calibration, overlays=files)
 
@@ -39,13 +39,13 @@ def draw_overlays(calibration: Calibration, folder: Path, run: Run, progress: Re
 
     Raises DatasetError if a photograph cannot be read, and OutOfResources if one cannot be drawn.
     """
-    found = _as_detection(calibration.dataset, calibration.solution)
+    detection = _as_detection(calibration.dataset, calibration.solution)
     rows = np.array(list(calibration.overlays), dtype=np.intp)
-    draw_images(replace(found, rows=rows, corners=calibration.corners), folder, run, progress)
+    draw_images(replace(detection, rows=rows, corners=calibration.corners), folder, run, progress)
 
 
 def check_overlays(dataset: Dataset, destination: Path | None) -> None:
-    """Refuse, before any work, overlays without photographs, or where files of others stand."""
+    """Refuse overlays without photographs, or over files of another program, before any work."""
     start = f"{dataset.table_path}: the overlays could not be drawn: found"
     if destination is None:
         raise UsageError(f"{start} no output folder, needed one to write them into; give one.")
@@ -64,10 +64,10 @@ def earlier_overlays(destination: Path) -> list[Path]:
     if not RESULT.is_in(destination):
         return []
     listed = read_json(destination / RESULT.marker).get("overlays")
-    named = [one.get("file") for one in listed or () if isinstance(one, Mapping)]
+    names = [overlay.get("file") for overlay in listed or () if isinstance(overlay, Mapping)]
     return [
         Path(name)
-        for name in named
+        for name in names
         if isinstance(name, str)
         and path_problem(destination, name) is None
         and is_overlay(Path(name))
@@ -80,7 +80,7 @@ def _rows_with_image(dataset: Dataset) -> list[int]:
 
 
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
-    """Return the outlines of a fit, and where it has the legs and cameras, as a detection."""
+    """Return the outlines, legs and cameras of a fit as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
     poses = components(solution.T_Rb_Re)
     q = measured_readings(solution.legs, *poses, measurements.q_of_poses)

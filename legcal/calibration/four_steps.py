@@ -27,15 +27,15 @@ from legcal.perception.placement import Placement
 @brief
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What the four steps give by themselves."""
+    """The result of the four steps."""
 
-    legs: tuple[Leg, ...] | None  # in R_b and R_e; None if they did not reach the end
-    T_Rb_camera: tuple[RigidTransform | None, ...] | None  # of step 2; None if that failed
-    failure: str  # why they failed; "" if they did not
-    diagnostics: tuple[str, ...] = ()  # what they left out or at nominal, and why
+    legs: tuple[Leg, ...] | None  # in R_b and R_e; None if a step failed
+    T_Rb_camera: tuple[RigidTransform | None, ...] | None  # result of step 2; None if it failed
+    failure: str  # reason of the failure; "" without one
+    diagnostics: tuple[str, ...] = ()  # parts left out or kept at nominal, with the reason
 
     def in_file_order(self, order: Order) -> Steps:
-        """Return the same with legs and views in the order of the files."""
+        """Return a copy with legs and views in the order of the files."""
         legs, cameras = self.legs, self.T_Rb_camera
         return replace(
             self,
@@ -47,9 +47,9 @@ class Steps:
 def four_steps(
     data: OrderedDataset, outlines: Outlines, board: BoardViews | None, options: Options
 ) -> Steps:
-    """Return what the four steps give, or why they give nothing: the joint fit may do without.
+    """Run the four steps; a failure is returned, since the joint fit may not need them.
 
-    Cameras alone where only the later steps fail.
+    If only the later steps fail, the result contains the cameras alone.
     """
     if options.criteria is None:
         return Steps(None, None, "They were left out.")
@@ -70,9 +70,11 @@ def four_steps(
         cameras = tuple(base.T_Rb_camera)
         if joined:
             moved = zip([cameras[v] for v in new_view.tolist()], T_first_camera, strict=True)
-            cameras = tuple(T if T is None or own is None else T * own for T, own in moved)
+            cameras = tuple(
+                T if T is None or T_first is None else T * T_first for T, T_first in moved
+            )
         try:
-            found = run_platform_steps(
+            platform = run_platform_steps(
                 base,
                 measurements,
                 criteria=options.criteria,
@@ -80,13 +82,15 @@ def four_steps(
             )
         except (NotIdentifiable, DidNotConverge) as failure:
             return Steps(None, cameras, str(failure))
-        frame_legs, known = data.machine.frame_legs, parametrization_of(data.machine)
-        ties, unit = machine_ties(data.machine), np.ones(len(known))
-        legs = on_ties(reframed(found.legs, frame_legs), nominal.legs, ties, known.place, unit)
-        # B of legs that are fixed to the platform where models put it
+        frame_legs, parametrization = data.machine.frame_legs, parametrization_of(data.machine)
+        ties, unit = machine_ties(data.machine), np.ones(len(parametrization))
+        legs = on_ties(
+            reframed(platform.legs, frame_legs), nominal.legs, ties, parametrization.place, unit
+        )
+        # legs fixed to the platform have B at the origin of its link
         origin = np.asarray(data.machine.T_platform_Re.inv().translation)
         legs = reframed(legs, frame_legs, origin)
-        return Steps(legs, cameras, "", found.diagnostics)
+        return Steps(legs, cameras, "", platform.diagnostics)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:
@@ -100,7 +104,7 @@ def starts(
     steps: Steps,
     board: BoardViews | None,
 ) -> list[Start]:
-    """Return the starts of the joint fit: nominal, and the steps where they gave a result.
+    """Return the starts of the joint fit: nominal, and the result of the four steps if any.
 
     Raises
     ------
@@ -113,7 +117,7 @@ def starts(
     by_label = {"nominal": (geometries(machine), rough, staged)}
     if steps.legs is not None:
         by_label["staged"] = (steps.legs, staged, rough)
-    found = []
+    start_list = []
     for label, (legs, first, second) in by_label.items():
         cameras = _start_cameras(data, outlines, first, second, steps, board)
         start = start_from(legs, data.measurements, data.fitted_legs, cameras, data.T_Rb_Re, label)
@@ -123,8 +127,8 @@ def starts(
             start = start if T_Rb_board is None else replace(start, T_Rb_board=T_Rb_board)
             T_Re_board = board.pose_on_platform(data, T_Rb_camera, start.T_Rb_Re)
             start = start if T_Re_board is None else replace(start, T_Re_board=T_Re_board)
-        found.append(start)
-    return found
+        start_list.append(start)
+    return start_list
 
 
 def _start_cameras(
@@ -135,7 +139,7 @@ def _start_cameras(
     steps: Steps,
     board: BoardViews | None,
 ) -> list[RigidTransform]:
-    """Return a camera pose for every view, the first choice where there is one."""
+    """Return a camera pose for every view, from *first* if it has one, else from *second*."""
     cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
     shown = outlines.row[outlines.used] if data.axes is None else data.axes.row
     needed = set(data.measurements.view[shown].tolist())

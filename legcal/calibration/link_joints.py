@@ -1,10 +1,10 @@
-"""Joint centres in the links of the model, as its URDF has them, with what is known of them there.
+"""Joint centres in the links of the model, as in its URDF, with their covariance.
 
-Results are computed in R_b and R_e, which the joints of the ``base_frame`` legs define: an owner
-knows the links. The calibrated R_b is laid on the nominal one in the base link and R_e likewise on
-the platform, as in ``calibrated.urdf``: p_link = T_link_frame p_frame, and a covariance is turned
-with it, R C R^T. What a frame defines has no uncertainty there: coordinates and directions in which
-its joints cannot move have the variance zero, and are marked.
+Results are computed in R_b and R_e, defined by the joints of the ``base_frame`` legs; users know
+the links. The calibrated R_b is aligned with the nominal one in the base link and R_e likewise in
+the platform link, as in ``calibrated.urdf``: p_link = T_link_frame p_frame, with the covariance
+R C R^T. Coordinates that define a frame have no uncertainty there: their variance is zero, and they
+are marked.
 """
 
 from __future__ import annotations
@@ -42,45 +42,45 @@ from legcal.vision.board import LINKS, Link
 FRAMES: dict[Link, str] = {"base": "R_b", "platform": "R_e"}
 _MARKS: tuple[FrameMark, ...] = ("origin", "x axis", "xy plane")
 _STATUSES: tuple[CoordinateStatus, ...] = ("weak", "estimated", "fixed", "frame")
-_ROUNDING = 1e-9  # of the components of unit vectors
+_ROUNDING = 1e-9  # rounding of the components of unit vectors
 
 
 @dataclass(frozen=True, eq=False)
 class _LinkFrame:
-    """R_b in the base link, or R_e in the platform link, and what it makes of coordinates."""
+    """R_b in the base link, or R_e in the platform link, with the joints of that side."""
 
     side: Link
     link: str
     T_link_frame: RigidTransform
-    points: Array  # (n_legs, 3) joint centres in the frame [m]
-    place: IntArray  # (n_legs, 3) of their coordinates among all kinematic parameters, or -1
-    names: tuple[str, ...]  # of these parameters
+    points: Array  # (n_legs, 3): joint centres in the frame [m]
+    place: IntArray  # (n_legs, 3): indices of the coordinates among kinematic parameters, or -1
+    names: tuple[str, ...]  # names of the kinematic parameters
     legs: tuple[str, ...]
     frame_legs: tuple[int, ...]
-    zero: BoolArray  # (n_legs, 3) zero by the definition of the frame
-    axes: tuple[Array | None, ...]  # of the joints of the legs in the frame, where they have one
-    turns: IntArray  # (n_legs, 2) of the turns of these axes among all kinematic parameters, or -1
+    zero: BoolArray  # (n_legs, 3): whether the definition of the frame makes a coordinate zero
+    axes: tuple[Array | None, ...]  # joint axes of the legs in the frame; None without one
+    turns: IntArray  # (n_legs, 2): indices of the axis rotations among kinematic parameters, or -1
 
     @classmethod
     def of(cls, machine: Machine, side: Link) -> _LinkFrame:
-        """Return that of a machine."""
-        found, legs = parametrization_of(machine, twists=True), geometries(machine)
+        """Return the frame of one side of a machine."""
+        parametrization, legs = parametrization_of(machine, twists=True), geometries(machine)
         is_base = side == "base"
         n_d = len(machine.frame_legs)
         zero = ~free_coordinates(machine.n_legs, machine.frame_legs)
-        zero[:, n_d:] = False  # heights in a plane are kept, and define nothing
+        zero[:, n_d:] = False  # heights of planar machines are fixed, and define nothing
         return cls(
             side,
             machine.base if is_base else machine.platform,
             machine.T_link_frame(side),
             np.array([leg.A if is_base else leg.B for leg in legs]),
-            found.place[:, LegColumns.A if is_base else LegColumns.B],
-            found.names,
+            parametrization.place[:, LegColumns.A if is_base else LegColumns.B],
+            parametrization.names,
             machine.leg_names,
             machine.frame_legs,
             zero,
             tuple(leg.base_axis if is_base else leg.platform_axis for leg in legs),
-            found.place[:, LegColumns.BASE_AXIS if is_base else LegColumns.PLATFORM_AXIS],
+            parametrization.place[:, LegColumns.BASE_AXIS if is_base else LegColumns.PLATFORM_AXIS],
         )
 
     @property
@@ -89,20 +89,20 @@ class _LinkFrame:
         return np.asarray(self.T_link_frame.rotation.as_matrix())
 
     def points_with(self, values: Mapping[str, float]) -> Array:
-        """Return the joint centres (n_legs, 3) with these values of parameters, in the link [m]."""
+        """Return the joint centres (n_legs, 3) in the link at given parameter values [m]."""
         points = self.points.copy()
-        for at in np.argwhere(self.place >= 0).tolist():
-            name = self.names[self.place[tuple(at)]]
-            points[tuple(at)] = values.get(name, points[tuple(at)])
+        for index in np.argwhere(self.place >= 0).tolist():
+            name = self.names[self.place[tuple(index)]]
+            points[tuple(index)] = values.get(name, points[tuple(index)])
         return np.asarray(self.T_link_frame.apply(points))
 
     def defines(self, leg: int) -> FrameMark | None:
-        """Return what of the frame a joint defines."""
+        """Return the part of the frame that a joint defines."""
         return _MARKS[self.frame_legs.index(leg)] if leg in self.frame_legs else None
 
-    def named(self, of: IntArray) -> list[str]:
-        """Return the names of parameters, "" where there is none."""
-        return [self.names[k] if k >= 0 else "" for k in of.tolist()]
+    def named(self, indices: IntArray) -> list[str]:
+        """Return the names of parameters by index; "" for -1."""
+        return [self.names[k] if k >= 0 else "" for k in indices.tolist()]
 
     def turned(self, leg: int, w: Array) -> Array:
         """Return two turns of an axis (2,) as a rotation vector in the link [rad]."""
@@ -110,20 +110,20 @@ class _LinkFrame:
         return np.zeros(3) if axis is None else np.asarray(self.R @ (w @ normal_basis(axis)))
 
     def statuses(self, leg: int, status: Mapping[str, str]) -> list[CoordinateStatus]:
-        """Return what each coordinate of a joint in the link is, by that of its parameters."""
-        found: list[CoordinateStatus] = []
+        """Return the status of each coordinate of a joint in the link, by its parameters."""
+        statuses: list[CoordinateStatus] = []
         for row in self.R:
             parts = {
                 "frame" if is_zero else "fixed" if k < 0 else status.get(self.names[k], "fixed")
                 for k, is_zero, part in zip(self.place[leg], self.zero[leg], row, strict=True)
                 if abs(part) > _ROUNDING
             }
-            found.append(next(one for one in _STATUSES if one in parts))
-        return found
+            statuses.append(next(possible for possible in _STATUSES if possible in parts))
+        return statuses
 
 
 def joints_title(side: str, link: str, joints_move: bool) -> str:
-    """Return the title of a table of joints, of which those at A may move with readings."""
+    """Return the title of a table of joints; *joints_move* if motors move the joints at A."""
     return (
         f"Joints of the {side} in the link {link}{AT_ZERO * (joints_move and side == 'base')} [mm]"
     )
@@ -140,13 +140,13 @@ def joints_in_links(
     Parameters
     ----------
     machine : Machine
-        The nominal or the calibrated model: R_b and R_e stand where they stood in the links.
+        The nominal or the calibrated model; R_b and R_e in the links are the same.
     parameters : sequence of ParameterRow
-        Those of ``result.json``, in R_b and R_e [m].
+        Parameters of ``result.json``, in R_b and R_e [m].
     kinematic : Kinematic
-        The covariance of all kinematic parameters by name, zero where they are fixed or held.
+        The covariance of all kinematic parameters by name, zero for fixed or held ones.
     axes : mapping, optional
-        The nominal axes by side and leg, in R_b and R_e; without them none are returned.
+        The nominal axes by side and leg, in R_b and R_e; axes are returned only if given.
 
     Returns
     -------
@@ -165,10 +165,10 @@ def joints_in_links(
         joints = []
         for j, leg in enumerate(frame.legs):
             names = frame.named(frame.place[j])
-            known = [i for i, name in enumerate(names) if name in number]
-            at = [number[names[i]] for i in known]
+            numbered = [i for i, name in enumerate(names) if name in number]
+            indices = [number[names[i]] for i in numbered]
             C = np.zeros((3, 3))
-            C[np.ix_(known, known)] = everything[np.ix_(at, at)]
+            C[np.ix_(numbered, numbered)] = everything[np.ix_(indices, indices)]
             C = frame.R @ C @ frame.R.T
             statuses = frame.statuses(j, status)
             sigma = np.sqrt(np.maximum(np.diagonal(C), 0.0)).tolist()
@@ -178,8 +178,8 @@ def joints_in_links(
                     xyz=calibrated[j].tolist(),
                     nominal=nominal[j].tolist(),
                     sigma=[
-                        s if one == "estimated" else None
-                        for s, one in zip(sigma, statuses, strict=True)
+                        s if coordinate_status == "estimated" else None
+                        for s, coordinate_status in zip(sigma, statuses, strict=True)
                     ],
                     covariance=(0.5 * (C + C.T)).tolist(),
                     status=statuses,
@@ -203,7 +203,7 @@ def _axes_in_link(
     C: Array,
 ) -> list[AxisInLink]:
     """Return the axes of joints, with C the covariance of the numbered parameters."""
-    found = []
+    axes = []
     for j, leg in enumerate(frame.legs):
         names = frame.named(frame.turns[j])
         if leg not in nominal or not all(names):
@@ -213,10 +213,10 @@ def _axes_in_link(
         w = np.array([rows[name].value if name in rows else 0.0 for name in names])
         sigma = None
         if all(name in rows and rows[name].status == "estimated" for name in names):
-            at = [number[name] for name in names]
-            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(at, at)], turns)
+            indices = [number[name] for name in names]
+            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(indices, indices)], turns)
             sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
-        found.append(
+        axes.append(
             AxisInLink(
                 leg=leg,
                 direction=(frame.R @ turned_axis(axis, w)).tolist(),
@@ -225,15 +225,15 @@ def _axes_in_link(
                 sigma=sigma,
             )
         )
-    return found
+    return axes
 
 
 def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakInLinks:
-    """Return a combination of parameters with joints and axes along the axes of their links.
+    """Return a combination of parameters with joints and axes in link coordinates.
 
-    ``parts`` are names and components of a vector in R_b and R_e; what is no joint or axis stays.
+    ``parts`` are names and components of a vector in R_b and R_e; other parameters stay.
     """
-    component, found = dict(parts), dict[str, float]()
+    component, named_parts = dict(parts), dict[str, float]()
     for side in LINKS:
         frame = _LinkFrame.of(machine, side)
         for j, leg in enumerate(frame.legs):
@@ -241,38 +241,38 @@ def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakI
                 (side, frame.named(frame.place[j])),
                 (f"{side}_axis", frame.named(frame.turns[j])),
             ):
-                own = np.array([component.pop(name, 0.0) for name in names])
-                v = frame.R @ own if kind == side else frame.turned(j, own)
-                found |= {
+                in_frame = np.array([component.pop(name, 0.0) for name in names])
+                v = frame.R @ in_frame if kind == side else frame.turned(j, in_frame)
+                named_parts |= {
                     f"{leg}.{kind}.{axis}": float(x) for axis, x in zip("xyz", v, strict=True)
                 }
-    found |= component
-    largest = max(map(abs, found.values()), default=0.0)
-    shown = {name: x for name, x in found.items() if abs(x) > SHOWN * largest}
+    named_parts |= component
+    largest = max(map(abs, named_parts.values()), default=0.0)
+    significant = {name: x for name, x in named_parts.items() if abs(x) > SHOWN * largest}
     return WeakInLinks(
-        direction=describe_direction(list(shown), machine.leg_names),
-        parameters=list(shown),
-        components=list(shown.values()),
+        direction=describe_direction(list(significant), machine.leg_names),
+        parameters=list(significant),
+        components=list(significant.values()),
     )
 
 
 def compared_joints(machine: Machine, reference: Machine) -> dict[Link, ComparedLink]:
     """Return the joints of two models of a machine in the links of the first [m].
 
-    R_b and R_e of the reference are laid on those of the model, as in eq (20): where they stand in
-    the links cannot be seen.
+    R_b and R_e of both models are aligned, as in eq (20), since their poses in the links cannot be
+    observed.
     """
-    found: dict[Link, ComparedLink] = {}
+    links: dict[Link, ComparedLink] = {}
     for side in LINKS:
         frame, other = _LinkFrame.of(machine, side), _LinkFrame.of(reference, side)
         ours = np.asarray(frame.T_link_frame.apply(frame.points))
         theirs = np.asarray(frame.T_link_frame.apply(other.points))
-        apart = frame.T_link_frame.inv() * other.T_link_frame
+        T_apart = frame.T_link_frame.inv() * other.T_link_frame
         shift = frame.T_link_frame.translation - other.T_link_frame.translation
-        found[side] = ComparedLink(
+        links[side] = ComparedLink(
             link=frame.link,
             frames_apart=Distance(
-                dX_m=float(np.linalg.norm(shift)), dE_rad=float(apart.rotation.magnitude())
+                dX_m=float(np.linalg.norm(shift)), dE_rad=float(T_apart.rotation.magnitude())
             ),
             joints=[
                 ComparedJoint(
@@ -280,17 +280,19 @@ def compared_joints(machine: Machine, reference: Machine) -> dict[Link, Compared
                     xyz=ours[j].tolist(),
                     reference=theirs[j].tolist(),
                     difference=((frame.points[j] - other.points[j]) @ frame.R.T).tolist(),
-                    defined=[one == "frame" for one in frame.statuses(j, {})],
+                    defined=[
+                        coordinate_status == "frame" for coordinate_status in frame.statuses(j, {})
+                    ],
                     defines=frame.defines(j),
                 )
                 for j, leg in enumerate(frame.legs)
             ],
         )
-    return found
+    return links
 
 
 def mark_in_words(side: Link, status: CoordinateStatus, defines: FrameMark | None) -> str:
-    """Return what a coordinate is where it is not simply estimated: ``defines R_b``."""
+    """Return the remark on a coordinate that is not simply estimated: ``defines R_b``."""
     if status == "frame":
         return f"defines {FRAMES[side]}"
     if status == "estimated":

@@ -1,4 +1,4 @@
-"""What a reader of a result should know, with what it is about."""
+"""Notes on a result, with their topics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Topic(StrEnum):
-    """What a note is about, as its heading has it."""
+    """The topic of a note, as in its heading."""
 
     DIAGNOSIS = "Diagnosis"
     DATASET = "Dataset"
@@ -20,21 +20,21 @@ class Topic(StrEnum):
 
 
 class Note(str):
-    """A sentence with its topic; one without is about the fit."""
+    """A sentence with a topic; the default topic is the fit."""
 
     topic: Topic = Topic.FIT
 
     @classmethod
     def about(cls, topic: Topic, sentences: Iterable[str]) -> list[Note]:
-        """Return sentences as notes on a topic; notes keep theirs."""
-        found = []
+        """Return sentences as notes on a topic; notes keep their own topic."""
+        notes = []
         for sentence in sentences:
             note = cls(sentence)
             note.topic = topic_of(sentence, topic)
-            found.append(note)
-        return found
+            notes.append(note)
+        return notes
 
 
 def topic_of(note: str, otherwise: Topic = Topic.FIT) -> Topic:
-    """Return what a note is about."""
+    """Return the topic of a note, or *otherwise* for a plain sentence."""
     return note.topic if isinstance(note, Note) else otherwise

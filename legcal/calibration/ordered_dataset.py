@@ -1,7 +1,7 @@
-"""A dataset in canonical order: images and readings as every job takes them.
+"""A dataset in canonical order: the images and readings that all jobs use.
 
 Rows, views and legs are sorted once, here, so that no result depends on the order of the files, and
-never reordered after. A job puts its result back into the order of the files where it ends.
+never reordered later. A job restores the order of the files at its end.
 """
 
 from __future__ import annotations
@@ -45,16 +45,17 @@ from legcal.perception.photographs import Photographs
 from legcal.progress import Report
 from legcal.workers import Run
 
-MAX_NOMINAL_RESIDUAL = 0.03  # of the mean leg length: errors of a nominal model, not of readings
+# largest leg residual that errors of a nominal model explain, relative to the mean leg length
+MAX_NOMINAL_RESIDUAL = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What is estimated, and how."""
+    """Options of an estimate."""
 
-    choices: Choices  # of the parameters
-    criteria: Criteria | None = None  # of the four steps; None leaves them out
-    every_leg: bool = True  # whether every leg must be seen that views say they show
+    choices: Choices  # fixed, estimated and prior parameters
+    criteria: Criteria | None = None  # criteria of the four steps; None leaves them out
+    every_leg: bool = True  # whether a leg that no image shows is an error
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,21 +64,24 @@ class OrderedDataset:
 
     dataset: Dataset  # all images, in the order of its files
     order: Order  # from the files to the canonical order
-    plan: DetectionPlan  # which images are to be searched, by their rows in the files
+    plan: DetectionPlan  # images to be searched, by their rows in the files
     pool: Run
     progress: Report
-    machine: Machine  # from here on in canonical order
+    machine: Machine  # in canonical order, as all following fields
     measurements: Measurements
     axes: LegAxes | None
-    rows: IntArray  # the images that are here, among all of them
-    # T_base_platform that images showed, by row among all images, where readings do not give it
+    rows: IntArray  # indices of these images among all images
+    # T_base_platform estimated from images, by row among all images, if readings do not give it
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
-    # Edge pairs of images that were searched, by row among all images
+    # edge pairs of searched images, by row among all images
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
 
     @cached_property
     def photographs(self) -> Photographs:
-        """All images, what to search in them and what to keep; none of views that name no leg."""
+        """All images, with those to be searched and the outlines to keep.
+
+        Views that name no leg are not searched.
+        """
         detect, m = inverse(self.order.rows)[self.plan.detect], self.measurements
         shows = np.array([m.views[v].legs != () for v in m.view[detect].tolist()], dtype=np.bool_)
         return Photographs(
@@ -92,7 +96,7 @@ class OrderedDataset:
         )
 
     def _clicked_poses(self) -> dict[int, tuple[RigidTransform, ...]]:
-        """Return T_base_platform by clicks, by pose, where readings do not give it."""
+        """Return T_base_platform from clicks, by pose, if readings do not give it."""
         if self.machine.is_determined or self.dataset.landmarks is None:
             return {}
         landmarks = self.order.reorder(self.dataset.landmarks)
@@ -100,7 +104,7 @@ class OrderedDataset:
 
     @cached_property
     def fitted_legs(self) -> FittedLegs:
-        """The legs as the joint fit sees them."""
+        """The legs for the joint fit."""
         return fitted_legs(self.machine)
 
     @cached_property
@@ -110,8 +114,10 @@ class OrderedDataset:
             return T, residual
         rows = self.rows[self.measurements.first_rows].tolist()
         seen = [
-            platform_in_base(self.machine, self.seen_poses[row]) if row in self.seen_poses else own
-            for row, own in zip(rows, T, strict=True)
+            platform_in_base(self.machine, self.seen_poses[row])
+            if row in self.seen_poses
+            else nominal
+            for row, nominal in zip(rows, T, strict=True)
         ]
         return tuple(seen), residual
 
@@ -122,21 +128,21 @@ class OrderedDataset:
 
     @property
     def T_base_platform(self) -> list[RigidTransform]:
-        """The same between the links."""
+        """T_base_platform at every pose by the nominal model."""
         back = self.machine.T_platform_Re.inv()
         return [product(self.machine.T_base_Rb, T, back) for T in self.T_Rb_Re]
 
     def unreached_notes(self) -> list[str]:
-        """Return a note on the poses that the nominal model does not reach, if there are any."""
+        """Return a note on the poses that the nominal model cannot reach, if any."""
         residual = self._nominal[1]
-        off = np.flatnonzero(residual > 0.0).tolist()
-        if not off:
+        unreached = np.flatnonzero(residual > 0.0).tolist()
+        if not unreached:
             return []
-        names = few([_image_of(self.measurements, pose) for pose in off])
+        names = few([_image_of(self.measurements, pose) for pose in unreached])
         return [
-            f"The nominal model does not reach the readings of {names}: its legs "
-            f"miss them by up to {1e3 * float(residual.max()):.2f} mm at the nearest pose, from "
-            "which the fit started."
+            f"The nominal model cannot reach the readings of {names}: residuals of up to "
+            f"{1e3 * float(residual.max()):.2f} mm remain at the nearest pose, from which the fit "
+            "started."
         ]
 
     def poses_by(self, legs: Sequence[Leg]) -> tuple[RigidTransform, ...]:
@@ -144,21 +150,21 @@ class OrderedDataset:
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 
     def rows_of(self, file_rows: IntArray) -> IntArray:
-        """Return the rows here of images that are given by their rows in the files."""
+        """Return the rows of images in canonical order, given their rows in the files."""
         return np.sort(inverse(self.order.rows)[file_rows])
 
     def with_poses(self, T_base_platform: Mapping[int, RigidTransform]) -> OrderedDataset:
-        """Return the dataset with poses that images show, by pose; as it is without any."""
+        """Return the dataset with platform poses estimated from images."""
         of_rows = {
             row: T_base_platform[pose]
             for row, pose in zip(self.rows.tolist(), self.measurements.pose.tolist(), strict=True)
             if pose in T_base_platform
         }
-        # A field changes, so that what was cached of the poses is made anew.
+        # A new object, so that cached poses are recomputed.
         return replace(self, seen_poses={**self.seen_poses, **of_rows}) if of_rows else self
 
     def with_fitted_poses(self, T_Rb_Re: Sequence[RigidTransform]) -> OrderedDataset:
-        """Return the dataset with the poses of a fit where readings do not give them."""
+        """Return the dataset with the poses of a fit, if readings do not give them."""
         if self.machine.is_determined:
             return self
         back = self.machine.T_platform_Re.inv()
@@ -167,7 +173,7 @@ class OrderedDataset:
         )
 
     def at(self, rows: IntArray) -> OrderedDataset:
-        """Return some of the images, by their rows here, rising."""
+        """Return the dataset with selected images, by ascending rows."""
         if len(rows) == len(self.rows):
             return self
         return replace(
@@ -178,7 +184,7 @@ class OrderedDataset:
         )
 
     def in_file_order(self) -> tuple[Dataset, Order]:
-        """Return the images that are here in the order of the files, and the order of these."""
+        """Return the dataset of these images in the order of the files, and that order."""
         file_rows = self.order.rows[self.rows]
         order = replace(self.order, rows=inverse(np.argsort(file_rows)))
         return dataset_at(self.dataset, np.sort(file_rows)), order
@@ -187,9 +193,9 @@ class OrderedDataset:
 def order_dataset(
     dataset: Dataset, pool: Run, progress: Report, *, fingerprint: str = ""
 ) -> OrderedDataset:
-    """Put a dataset into canonical order, and see which images are to be searched.
+    """Put a dataset into canonical order, and select the images to be searched.
 
-    Outlines that an earlier run stored are used if they have this fingerprint.
+    Outlines stored by an earlier run are used if they have this fingerprint.
     """
     names = dataset.machine.leg_names
     order = canonical_order(dataset.measurements, names)
@@ -211,15 +217,15 @@ def nominal_poses(
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return T_Rb_Re of a nominal model at the readings, and its largest residual (n_poses,) [m].
 
-    Errors of the model can put a pose out of its reach that the machine took, near a singular one
-    or where its legs are stretched out. The pose with the least squared residuals of leg lengths
-    stands for it. Where motors do not determine the pose, all are least-squares poses from home.
+    Errors of the model may make measured readings unreachable, near a singularity or with stretched
+    legs. The pose with the least squared residuals of leg lengths is used then. If motors do not
+    determine the pose, all poses are least-squares poses from home.
 
     Raises
     ------
     DatasetError
-        Naming the images whose residual is more than 3 % of the mean leg length, and those at which
-        readings of redundant motors contradict each other as much and do not tell which is wrong.
+        If residuals of images exceed 3 % of the mean leg length, or readings of redundant motors
+        contradict each other as much without showing which is wrong.
     """
     q = measurements.q_of_poses
     if not machine.is_determined:
@@ -227,51 +233,54 @@ def nominal_poses(
         return _least_squares(machine, q, home)[0], np.zeros(len(q))
     followed = list(followed_poses(machine, q, on_the_chain=False))
     T = list(platforms_in_base(machine, [pose for pose, _ in followed]))
-    off = [k for k, (_, failure) in enumerate(followed) if failure is not None]
+    unreached = [k for k, (_, failure) in enumerate(followed) if failure is not None]
     residual = np.zeros(len(q))
-    if off:
-        nearest, residual[off] = _least_squares(machine, q[off], [T[k] for k in off])
-        for k, pose in zip(off, nearest, strict=True):
+    if unreached:
+        nearest, residual[unreached] = _least_squares(
+            machine, q[unreached], [T[k] for k in unreached]
+        )
+        for k, pose in zip(unreached, nearest, strict=True):
             T[k] = pose
-    most, first = _largest_residual(machine), measurements.first_rows.tolist()
-    found = _contradictions(machine, measurements, T)
-    wrong = {
+    limit, first = _largest_residual(machine), measurements.first_rows.tolist()
+    contradicting = _contradictions(machine, measurements, T)
+    refused = {
         first[k]: Cause(
             "found {}; check this reading, its encoder and the offset of the leg, or take",
-            (one.cause(machine),),
+            (contradiction.cause(machine),),
         )
-        for k, one in found.items()
-        if _is_refused(one, machine)
+        for k, contradiction in contradicting.items()
+        if _is_refused(contradiction, machine)
     }
-    for k, one in found.items():
-        if len(one.legs) == 1:  # the fit says so with images; they are searched at the other ones
-            others = q[[k]]
-            others[:, np.equal(machine.reads, one.legs[0])] = np.nan
-            T[k] = _least_squares(machine, others, [T[k]])[0][0]
-    wrong |= {
+    for k, contradiction in contradicting.items():
+        # A single wrong reading is reported by the fit; search at the pose by the other readings.
+        if len(contradiction.legs) == 1:
+            consistent = q[[k]]
+            consistent[:, np.equal(machine.reads, contradiction.legs[0])] = np.nan
+            T[k] = _least_squares(machine, consistent, [T[k]])[0][0]
+    refused |= {
         first[k]: Cause(
-            "found that the legs of the nominal model miss them by {:.1f} mm at the nearest pose, "
-            "needed at most {:.1f} mm; check these readings and legcal.home, or take",
-            (1e3 * float(residual[k]), 1e3 * most),
+            "found that the nominal model cannot reach them, with a residual of {:.1f} mm at the "
+            "nearest pose, needed at most {:.1f} mm; check these readings and legcal.home, or take",
+            (1e3 * float(residual[k]), 1e3 * limit),
         )
-        for k in off
-        if not residual[k] <= most and k not in found
+        for k in unreached
+        if not residual[k] <= limit and k not in contradicting
     }
-    if wrong:
+    if refused:
         raise DatasetError(
             [
                 f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
                 f"the image{'s' * (len(rows) > 1)} out."
-                for cause, rows in by_cause(wrong)
+                for cause, rows in by_cause(refused)
             ]
         )
     return tuple(T), residual
 
 
 def contradicting_readings(machine: Machine, measurements: Measurements) -> dict[int, Cause]:
-    """Return what is found of readings of redundant motors that contradict each other, by row.
+    """Return the contradictions of redundant readings in words, by row.
 
-    They are those that :func:`nominal_poses` does not refuse.
+    Contradictions that :func:`nominal_poses` refuses are not included.
     """
     if not machine.is_redundant:
         return {}
@@ -279,9 +288,9 @@ def contradicting_readings(machine: Machine, measurements: Measurements) -> dict
     T = platforms_in_base(machine, [pose for pose, _ in followed])
     first = measurements.first_rows.tolist()
     return {
-        first[k]: one.cause(machine)
-        for k, one in _contradictions(machine, measurements, T).items()
-        if not _is_refused(one, machine)
+        first[k]: contradiction.cause(machine)
+        for k, contradiction in _contradictions(machine, measurements, T).items()
+        if not _is_refused(contradiction, machine)
     }
 
 
@@ -293,13 +302,13 @@ def _contradictions(
     return contradictions(machine, T_Rb_Re, measurements.q_of_poses[:, motors], sigma[motors])
 
 
-def _is_refused(found: Contradiction, machine: Machine) -> bool:
-    """Say whether images cannot be searched at readings that contradict each other."""
-    return len(found.legs) > 1 and found.distances[0] > _largest_residual(machine)
+def _is_refused(contradiction: Contradiction, machine: Machine) -> bool:
+    """Return whether a contradiction of readings prevents the search of the image."""
+    return len(contradiction.legs) > 1 and contradiction.distances[0] > _largest_residual(machine)
 
 
 def _largest_residual(machine: Machine) -> float:
-    """Return how far errors of a nominal model may put a leg from its reading [m]."""
+    """Return the largest leg residual that errors of a nominal model explain [m]."""
     at_home = vectors_A_to_B(machine, machine.home)
     return MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(at_home, axis=1).mean())
 
@@ -309,13 +318,13 @@ def _least_squares(
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return the least-squares poses, and the largest residual of a leg length of each [m]."""
     R, t = components(nearby)
-    found = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
-    poses = RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))
-    return tuple(poses), found.missed
+    solved = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
+    poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
+    return tuple(poses), solved.missed
 
 
 def _image_of(measurements: Measurements, pose: int) -> str:
-    """Return the first image of a pose as messages name it."""
+    """Return the name of the first image of a pose in messages."""
     row = int(measurements.first_rows[pose])
     view = measurements.views[measurements.view[row]]
     return f"view {view.name}, {row_names(measurements)[row]}"

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
     from legcal.calibration.joint_fit.held_out import Posterior
 
-_ARROW = 0.06  # of the width of an image: the arrow of an outline that is three rms off
-_WIDTH, _HEIGHT = 4.5, 3.8  # of a panel [inch]
-_COLUMNS = 3  # of views, at most
+_ARROW = 0.06  # length of the arrow of a residual of three rms, relative to the image width
+_WIDTH, _HEIGHT = 4.5, 3.8  # size of a panel [inch]
+_COLUMNS = 3  # largest number of columns
 _LINE = 0.16  # height of a bar [inch]
 
 
 def plot_residuals(posterior: Posterior) -> Figure:
-    """Return a figure of how far used outlines are from the fit, over the field of each view.
+    """Plot the residuals of used outlines over the field of each view.
 
-    An arrow at each end of an outline points from where the fit predicts it to where it was seen.
+    An arrow at each end of an outline points from its predicted to its measured position.
 
     Raises
     ------
     UsageError
-        If the fit has no outlines, being made from axes or corners.
+        If the fit is from axes or corners, without outlines.
     """
     outlines, cameras = posterior.problem.outlines, posterior.state.cameras
     if not len(outlines):
@@ -39,32 +39,32 @@ def plot_residuals(posterior: Posterior) -> Figure:
             "The residuals could not be drawn: found a fit without outlines, needed one from "
             "photographs or outlines; look at .summary() for how well it fits."
         )
-    off = posterior.problem.offsets(posterior.state)
+    offsets = posterior.problem.offsets(posterior.state)
     direction = _directions(posterior)
-    rms = float(np.sqrt(np.mean(off**2)))
+    rms = float(np.sqrt(np.mean(offsets**2)))
     views = np.unique(outlines.view).tolist()
     with new_figure(len(views), _COLUMNS, (_WIDTH, _HEIGHT)) as (figure, panels):
         for panel, view in zip(panels, views, strict=False):
-            seen = outlines.view == view
-            camera, here = cameras[view], off[seen]
+            of_view = outlines.view == view
+            camera, view_offsets = cameras[view], offsets[of_view]
             scale = _ARROW * camera.width / max(3.0 * rms, 1e-9)
             for end in range(2):
-                arrows = scale * here[:, end, None] * direction[seen]
+                arrows = scale * view_offsets[:, end, None] * direction[of_view]
                 panel.quiver(
-                    *outlines.pixels[seen, end].T, *arrows.T, outlines.leg[seen],
+                    *outlines.pixels[of_view, end].T, *arrows.T, outlines.leg[of_view],
                     angles="xy", scale_units="xy", scale=1.0, width=0.004, cmap="tab10",
                 )  # fmt: skip
             panel.set_xlim(-0.5, camera.width - 0.5)
             panel.set_ylim(camera.height - 0.5, -0.5)
             panel.set_aspect("equal")
-            name, size = plain(outlines.views[view]), float(np.sqrt(np.mean(here**2)))
+            name, size = plain(outlines.views[view]), float(np.sqrt(np.mean(view_offsets**2)))
             panel.set_title(f"{name}: {size:.3f} px rms", fontsize="medium")
         figure.suptitle(f"Outlines less the fit, a colour a leg; arrows {scale:.0f} times as long")
     return figure
 
 
 def _directions(posterior: Posterior) -> Array:
-    """Return across each outline the direction of positive offsets, unit vectors (n, 2).
+    """Return the direction of positive offsets of each outline, unit vectors (n, 2).
 
     By eq (3), h . M = epsilon R, the axis is on the positive side of edges of epsilon +1.
     """
@@ -88,11 +88,11 @@ def _directions(posterior: Posterior) -> Array:
 
 
 def plot_uncertainty(result: Result) -> Figure:
-    """Return a figure of standard deviations: of all parameters, and of the platform at poses."""
+    """Plot the standard deviations of all parameters, and of the platform at poses."""
     groups = [
         (rows, scale, unit)
-        for of, scale, unit in (("m", 1e3, "mm"), ("rad", float(np.degrees(1.0)), "deg"))
-        if (rows := [row for row in result.parameters if row.unit == of and row.sigma])
+        for unit_of_rows, scale, unit in (("m", 1e3, "mm"), ("rad", float(np.degrees(1.0)), "deg"))
+        if (rows := [row for row in result.parameters if row.unit == unit_of_rows and row.sigma])
     ]
     platform = result.platform
     n = len(groups) + (platform is not None)

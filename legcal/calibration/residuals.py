@@ -1,4 +1,4 @@
-"""How far each outline is from the fit, in the order of the files."""
+"""Residuals of each outline, in the order of the files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from legcal.geometry.types import Array, IntArray
 @brief
 @dataclass(frozen=True, eq=False)
 class OutlineResiduals:
-    """Residuals of the outlines that entered the fit, those that it rejected too."""
+    """Residuals of the outlines in the fit, including those it rejected."""
 
-    index: IntArray  # (n,) rows of the table of outlines
-    # (n, 2) distance of each end from the predicted outline, common-mode edge biases removed [px]
+    index: IntArray  # (n,): rows of the table of outlines
+    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
     offset: Array
-    whitened: Array  # (n, 2) the same, uncorrelated and over its standard deviation
+    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
 
     def __len__(self) -> int:
         return len(self.index)
@@ -31,7 +31,7 @@ class OutlineResiduals:
 def outline_residuals(
     posterior: Posterior, dataset: Dataset, outlines: Outlines
 ) -> OutlineResiduals:
-    """Return the residuals of a fit whose *outlines* are those of its *dataset*, in file order."""
+    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
     problem = posterior.problem
     offset = problem.offsets(posterior.state)
     covariance = posterior.noise.covariance(problem.outlines.covariance)

@@ -1,8 +1,8 @@
-"""The result folder: what a controller and a script read, written, and read back for other jobs.
+"""The result folder for controllers, scripts and other jobs: written and read back.
 
-It is written all of it or nothing: the calibrated model, that of the four steps, ``result.json``,
-and the tables of what was observed. A result that is read back must be complete and consistent: its
-covariance that of its parameters, and these the ones of the model beside it.
+It is written atomically: the calibrated model, the model of the four steps, ``result.json``, and
+the tables of outlines and corners. A result that is read back must be complete and consistent:
+covariance and parameters must match, and agree with the model in the folder.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ from legcal.workers import Run, in_turn
 
 Beside = Callable[[Calibration, Path], None]
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
-REPORT_NAME = "report.html"  # written beside a result, which an earlier one does not describe
+REPORT_NAME = "report.html"  # removed with an earlier result
 RELOAD_TOLERANCE = 2.5e-11  # mean leg lengths, [rad] between reloaded and written parameters
-MAX_HOME_RESIDUAL = 0.2  # of a leg length: of calibrated legs at the nominal home
-ROUNDING = 2.5e-9  # mean leg lengths, [rad]: of numbers in files
-SYMMETRY_TOLERANCE = 1e-6  # relative, of covariances
+MAX_HOME_RESIDUAL = 0.2  # residual of calibrated legs at the nominal home [leg lengths]
+ROUNDING = 2.5e-9  # rounding of numbers in files [mean leg lengths, rad]
+SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of covariances
 
 
 def write_result(
@@ -71,19 +71,19 @@ def write_result(
     progress: Report = no_progress,
     beside: Beside | None = None,
 ) -> Calibration:
-    """Write the result folder, all of it or nothing, and return what was written.
+    """Write the result folder atomically, and return the written calibration.
 
-    The calibrated model is loaded again from the files and must have the parameters that were
-    written and close at home, before the folder appears. So must the model of the four steps, or
-    it is left out, with a note that says why; and so are overlays that cannot be drawn. What
-    *beside* writes into the folder that it is given appears with the result.
+    Before the folder appears, the calibrated model is loaded again and must have the written
+    parameters and close at home. The model of the four steps is left out with a note if it fails
+    this test, and overlays if they cannot be drawn. *beside* may write further files into the
+    folder.
 
     Raises
     ------
     UsageError
-        If the destination holds something else than an earlier result.
+        If the destination is not an earlier result.
     DidNotConverge
-        If the written model does not load as what was computed.
+        If the written model does not load with the computed parameters.
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
@@ -96,11 +96,11 @@ def write_result(
             try:
                 _write_model(machine, steps.legs, folder / STAGED_NAME)
             except (DidNotConverge, ModelError, OutOfClass):
-                # The nominal model, of which the refusal speaks, is not the cause: the calibrated
-                # one was made from it in the same way.
+                # The nominal model, which the error names, is not the cause: the calibrated model
+                # was made from it in the same way.
                 note = (
-                    "There is no model of the four steps (staged.yaml): the joints that they found "
-                    "make none that loads and closes. The calibrated model does not depend on it."
+                    "There is no model of the four steps (staged.yaml): their joints make no model "
+                    "that loads and closes. The calibrated model does not depend on it."
                 )
                 calibration = replace(calibration, notes=(*calibration.notes, note))
                 for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
@@ -131,7 +131,7 @@ def _urdf_of(yaml: Path) -> Path:
 
 
 def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
-    """Write a mechanism with other legs; loaded again it must be what was computed, and close."""
+    """Write a machine with calibrated legs; check that it loads with these legs and closes."""
     start = f"{yaml}: the model could not be written: found"
     write_urdf(machine, legs, _urdf_of(yaml))
     home = home_of_legs(machine, legs, MAX_HOME_RESIDUAL)
@@ -143,13 +143,15 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     moved = None if home is machine.home else home
     write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved, legs)
     written = reload_and_check(yaml)
-    found = parametrization_of(written, twists=True)
-    apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)
-    unit = np.where([unit == "m" for unit in found.units], machine.size, 1.0)
-    off = float(np.abs(apart / unit).max())
-    if not off <= RELOAD_TOLERANCE:
+    parametrization = parametrization_of(written, twists=True)
+    difference = vector_of(parametrization, geometries(written), legs) - vector_of(
+        parametrization, legs, legs
+    )
+    unit = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
+    error = float(np.abs(difference / unit).max())
+    if not error <= RELOAD_TOLERANCE:
         raise DidNotConverge(
-            f"{start} that its parameters, loaded again, differ by {off:.1e} leg lengths or rad "
+            f"{start} that its parameters, loaded again, differ by {error:.1e} leg lengths or rad "
             f"from the computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
         )
 
@@ -161,10 +163,11 @@ class EarlierResult(Summarised):
     folder: Path
     document: Result
     machine: Machine  # the calibrated model
-    names: tuple[str, ...]  # kinematic parameters that were estimated, or weak
-    covariance: Array  # theirs, zero along what was held; axes count from the calibrated ones
-    held: Array  # (w, n) how they change along the directions that were held, by a metre
-    fixed: tuple[str, ...]  # kinematic parameters that were fixed
+    names: tuple[str, ...]  # estimated and weak kinematic parameters
+    # (n, n): their covariance, zero along held directions; axes are relative to the calibrated ones
+    covariance: Array
+    held: Array  # (w, n): change of the parameters by a metre along each held direction
+    fixed: tuple[str, ...]  # fixed kinematic parameters
 
     @property
     def result(self) -> Result:
@@ -175,21 +178,21 @@ class EarlierResult(Summarised):
         return few_lines(f"Calibration in {self.folder}", self.result)
 
     def intrinsics(self, given: Camera) -> KnownIntrinsics | None:
-        """Return what was found of the intrinsics of a camera; None if none was estimated."""
+        """Return the estimated intrinsics of a camera; None if none was estimated."""
         rows = [row for row in self.result.parameters if row.status == "estimated"]
         number, names = {row.name: i for i, row in enumerate(rows)}, intrinsic_names(given)
         for owner, numbers in self.result.cameras.items():
-            found = {
+            row_of = {
                 k: number[f"{owner}.{name}"]
                 for k, name in enumerate(names)
                 if numbers == camera_numbers(given) and f"{owner}.{name}" in number
             }
-            if found:
-                covariance, at = np.zeros((len(names), len(names))), list(found.values())
-                known = np.array(self.result.covariance)[np.ix_(at, at)]
-                covariance[np.ix_(list(found), list(found))] = known
+            if row_of:
+                covariance, indices = np.zeros((len(names), len(names))), list(row_of.values())
+                covariance_of_estimated = np.array(self.result.covariance)[np.ix_(indices, indices)]
+                covariance[np.ix_(list(row_of), list(row_of))] = covariance_of_estimated
                 mean = intrinsic_values(given)
-                mean[list(found)] = [rows[i].value for i in at]
+                mean[list(row_of)] = [rows[i].value for i in indices]
                 return KnownIntrinsics(mean, covariance)
         return None
 
@@ -200,7 +203,7 @@ def load_result(given: str | Path) -> EarlierResult:
     Raises
     ------
     DatasetError
-        If it is no such folder, damaged, or put together from several.
+        If it is not a result folder, damaged, or a mix of several results.
     """
     path = Path(given)
     path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
@@ -216,25 +219,25 @@ def load_result(given: str | Path) -> EarlierResult:
     except (ModelError, OutOfClass) as error:
         raise DatasetError(error.facts) from error
     if sorted(document.legs) != sorted(machine.leg_names):
-        found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
+        legs_in_words = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
         needed = f"{', '.join(machine.leg_names)} as in {RESULT_YAML} beside it"
-        raise unreadable(path, found, needed)
+        raise unreadable(path, legs_in_words, needed)
     machine = machine.with_leg_order(document.legs)
-    legs, known = geometries(machine), parametrization_of(machine, twists=True)
+    legs, parametrization = geometries(machine), parametrization_of(machine, twists=True)
     values = {row.name: row.value for row in document.parameters}
     _check_actuators(path, document, machine)
     nominal_legs = _with_nominal_axes(machine.leg_names, legs, document, values)
     estimated = [row for row in document.parameters if row.status == "estimated"]
     _check_covariance(path, estimated, np.array([row.sigma for row in estimated]), document)
     _check_same_model(path, document, values, machine, nominal_legs)
-    covariance, held = _kinematic(path, estimated, document, known.names)
-    known_errors = (*KINDS, *PLACES)
-    others = [name for name in document.residuals.shared_px if name not in known_errors]
-    if others:
-        raise unreadable(path, f"the shared errors '{others[0]}'", ", ".join(known_errors))
+    covariance, held = _kinematic(path, estimated, document, parametrization.names)
+    error_names = (*KINDS, *PLACES)
+    unknown = [name for name in document.residuals.shared_px if name not in error_names]
+    if unknown:
+        raise unreadable(path, f"the shared errors '{unknown[0]}'", ", ".join(error_names))
     fixed = {row.name for row in document.parameters if row.status == "fixed"}
-    kept = [i for i, name in enumerate(known.names) if name not in fixed]
-    turns = turns_between(known, legs, nominal_legs)
+    not_fixed = [i for i, name in enumerate(parametrization.names) if name not in fixed]
+    turns = turns_between(parametrization, legs, nominal_legs)
     if document.links is None:
         links = joints_in_links(
             machine, document.parameters, document.kinematic, document.nominal_axes
@@ -244,10 +247,10 @@ def load_result(given: str | Path) -> EarlierResult:
         folder=path.parent,
         document=document,
         machine=machine,
-        names=tuple(known.names[i] for i in kept),
-        covariance=(turns @ covariance @ turns.T)[np.ix_(kept, kept)],
-        held=(held @ turns.T)[:, kept],
-        fixed=tuple(name for name in values if name in fixed and name in known.names),
+        names=tuple(parametrization.names[i] for i in not_fixed),
+        covariance=(turns @ covariance @ turns.T)[np.ix_(not_fixed, not_fixed)],
+        held=(held @ turns.T)[:, not_fixed],
+        fixed=tuple(name for name in values if name in fixed and name in parametrization.names),
     )
 
 
@@ -257,7 +260,7 @@ def _with_nominal_axes(
     document: Result,
     values: Mapping[str, float],
 ) -> tuple[Leg, ...]:
-    """Return legs with the axes and twists that the parameters of a document count from."""
+    """Return legs with the nominal axes and twists to which parameters of a document refer."""
     base, platform = (
         {name: np.array(axis) for name, axis in document.nominal_axes.get(side, {}).items()}
         for side in ("base", "platform")
@@ -275,29 +278,31 @@ def _with_nominal_axes(
 
 
 def _check_actuators(path: Path, document: Result, machine: Machine) -> None:
-    """Refuse a document whose actuators are not those of the model beside it."""
+    """Refuse a document with other actuators than the model in its folder."""
     needed = {actuator.joint: actuator.kind.value for actuator in machine.actuators}
     for blocks in (document.actuators, document.nominal_actuators):
-        found = {joint: block.kind for joint, block in (blocks or {}).items()}
-        if found != needed:
-            words, wanted = (
+        kinds = {joint: block.kind for joint, block in (blocks or {}).items()}
+        if kinds != needed:
+            kinds_in_words, wanted = (
                 ", ".join(f"{joint} ({kind})" for joint, kind in sorted(of.items())) or "none"
-                for of in (found, needed)
+                for of in (kinds, needed)
             )
-            raise unreadable(path, f"the actuators {words}", f"{wanted} as in {RESULT_YAML}")
+            raise unreadable(
+                path, f"the actuators {kinds_in_words}", f"{wanted} as in {RESULT_YAML}"
+            )
 
 
 def _check_covariance(
     path: Path, estimated: Sequence[ParameterRow], sigma: Array, document: Result
 ) -> None:
-    """Refuse a covariance that cannot be that of the estimated parameters."""
-    n, found = len(estimated), document.covariance
+    """Refuse a covariance that does not match the estimated parameters."""
+    n, matrix = len(estimated), document.covariance
     needed = f"a covariance of the {n} estimated parameters that fits their sigmas"
-    if n == 0 or len(found) != n or any(len(row) != n for row in found):
-        shape = f"{len(found)} rows of {len(found[0]) if found else 0} numbers"
+    if n == 0 or len(matrix) != n or any(len(row) != n for row in matrix):
+        shape = f"{len(matrix)} rows of {len(matrix[0]) if matrix else 0} numbers"
         raise unreadable(path, shape, needed)
     if all(row.sigma is not None for row in estimated):
-        scaled = np.array(found) / np.outer(sigma, sigma)
+        scaled = np.array(matrix) / np.outer(sigma, sigma)
         if (
             np.abs(scaled - scaled.T).max() < SYMMETRY_TOLERANCE
             and np.abs(np.diagonal(scaled) - 1.0).max() < SYMMETRY_TOLERANCE
@@ -308,24 +313,26 @@ def _check_covariance(
 
 
 def _kinematic(
-    path: Path, estimated: Sequence[ParameterRow], document: Result, known: Sequence[str]
+    path: Path, estimated: Sequence[ParameterRow], document: Result, names: Sequence[str]
 ) -> tuple[Array, Array]:
     """Return covariance (p, p) and held directions (w, p) of all kinematic parameters."""
-    n, found = len(known), document.kinematic
+    n, kinematic = len(names), document.kinematic
     needed = f"a covariance and held directions of the {n} kinematic parameters"
-    if sorted(found.names) != sorted(known) or len(found.covariance) != n:
-        raise unreadable(path, f"those of {len(found.names)} others", needed)
-    if any(len(row) != n for row in (*found.covariance, *found.held)):
+    if sorted(kinematic.names) != sorted(names) or len(kinematic.covariance) != n:
+        raise unreadable(path, f"those of {len(kinematic.names)} others", needed)
+    if any(len(row) != n for row in (*kinematic.covariance, *kinematic.held)):
         raise unreadable(path, "rows of other lengths", needed)
-    order = [found.names.index(name) for name in known]
-    covariance = np.array(found.covariance)[np.ix_(order, order)]
-    held = np.array(found.held).reshape(-1, n)[:, order]
-    both = [i for i, row in enumerate(estimated) if row.name in known]
-    at = [known.index(estimated[i].name) for i in both]
+    order = [kinematic.names.index(name) for name in names]
+    covariance = np.array(kinematic.covariance)[np.ix_(order, order)]
+    held = np.array(kinematic.held).reshape(-1, n)[:, order]
+    common = [i for i, row in enumerate(estimated) if row.name in names]
+    indices = [names.index(estimated[i].name) for i in common]
     of_all = np.array(document.covariance)
-    sigma = np.sqrt(np.diagonal(of_all))[both]
-    apart = (covariance[np.ix_(at, at)] - of_all[np.ix_(both, both)]) / np.outer(sigma, sigma)
-    is_same = np.abs(apart).max(initial=0.0) <= SYMMETRY_TOLERANCE
+    sigma = np.sqrt(np.diagonal(of_all))[common]
+    difference = (covariance[np.ix_(indices, indices)] - of_all[np.ix_(common, common)]) / np.outer(
+        sigma, sigma
+    )
+    is_same = np.abs(difference).max(initial=0.0) <= SYMMETRY_TOLERANCE
     largest = np.abs(covariance).max()
     if not is_same or np.abs(covariance - covariance.T).max() > SYMMETRY_TOLERANCE * largest:
         raise unreadable(path, "another matrix in 'kinematic'", needed)
@@ -339,25 +346,40 @@ def _check_same_model(
     machine: Machine,
     nominal_legs: Sequence[Leg],
 ) -> None:
-    """Refuse a document whose parameters are not those of the model beside it."""
-    legs, known = geometries(machine), parametrization_of(machine, twists=True)
-    numbers = dict(zip(known.names, vector_of(known, legs, nominal_legs).tolist(), strict=True))
-    turned = (*AXES, "arm_axis")  # by angles from nominal axes
-    other = [
+    """Refuse a document with other parameters than the model in its folder."""
+    legs, parametrization = geometries(machine), parametrization_of(machine, twists=True)
+    numbers = dict(
+        zip(
+            parametrization.names,
+            vector_of(parametrization, legs, nominal_legs).tolist(),
+            strict=True,
+        )
+    )
+    by_angles = (*AXES, "arm_axis")  # parametrised by angles from nominal axes
+    different = [
         name
         for name, number in numbers.items()
-        if ParameterId.parse(name).kind not in turned
+        if ParameterId.parse(name).kind not in by_angles
         and not abs(values.get(name, number) - number) <= ROUNDING * machine.size
     ]
-    later = ("twist", *ARMS)  # what results of earlier versions do not have
-    other += [n for n in numbers if n not in values and ParameterId.parse(n).kind not in later]
+    optional = ("twist", *ARMS)  # missing in results of earlier versions
+    different += [
+        n for n in numbers if n not in values and ParameterId.parse(n).kind not in optional
+    ]
     for side, axes in nominal_axes(machine.leg_names, legs).items():
         for leg, axis in axes.items():
             nominal = document.nominal_axes.get(side, {}).get(leg)
-            found = None if nominal is None else calibrated_axis(nominal, leg, side, values)
+            axis_in_document = (
+                None if nominal is None else calibrated_axis(nominal, leg, side, values)
+            )
             # An axis is a line: either direction is the same.
-            if found is None or not np.linalg.norm(np.cross(found, axis)) < ROUNDING:
-                other.append(f"the {side} axis of {leg}")
-    if other:
-        found_words = f"other values of {', '.join(other[:3])}" + " and more" * (len(other) > 3)
-        raise unreadable(path, found_words, f"those of {RESULT_YAML} beside it")
+            if (
+                axis_in_document is None
+                or not np.linalg.norm(np.cross(axis_in_document, axis)) < ROUNDING
+            ):
+                different.append(f"the {side} axis of {leg}")
+    if different:
+        values_in_words = f"other values of {', '.join(different[:3])}" + " and more" * (
+            len(different) > 3
+        )
+        raise unreadable(path, values_in_words, f"those of {RESULT_YAML} beside it")

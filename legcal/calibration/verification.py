@@ -1,4 +1,4 @@
-"""Verification: a few new images of a machine against the result of an earlier calibration."""
+"""Verification of an earlier calibration by a few new images of the machine."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ from legcal.workers import Workers, worker_pool
 
 SIGNIFICANCE = 0.01
 MAX_SIGNIFICANCE = 0.5
-BETTER = 2.5  # of costs, by which another minimum of the new images is the one
-PRIOR_SIGMA = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
+BETTER = 2.5  # smallest difference of costs that decides for another minimum
+PRIOR_SIGMA = 0.009  # [rad, mean leg lengths]; below the limit for directions held at nominal
 
 
 @brief
@@ -69,16 +69,16 @@ class Check:
     dataset : Dataset
         The new images; its ``machine`` is the calibrated model of the earlier result.
     earlier : EarlierResult
-        What was tested.
+        The tested result.
     solution : Solution
-        The fit of the new images by themselves.
+        The fit of the new images alone.
     movement : Movement
         The test; ``movement.moved`` is its answer.
     at_platform : PlatformPair
-        How far the platform by the new images is from that by the earlier result, root mean square
-        over the poses, and one standard deviation of this if nothing moved.
+        Difference of the platform between new images and earlier result, root mean square over
+        the poses, and its standard deviation if nothing moved.
     notes : tuple of str
-        What else a reader should know.
+        Further remarks.
     """
 
     dataset: Dataset
@@ -94,23 +94,22 @@ class Check:
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
         test = f"p-value {p}, significance {100 * movement.significance:g} %"
-        known = (
+        uncertainty = (
             f"{1e3 * pair.expected_displacement:.3f} mm / "
             f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
         )
         if not movement.moved:
             return (
-                f"No change was detected ({test}); the platform relative to the earlier result is "
-                f"known to {known}."
+                f"No change was detected ({test}); the platform pose is confirmed to {uncertainty}."
             )
-        found = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
+        change = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
         return (
-            f"Something has moved ({test}): the platform is {found} from where the earlier result "
-            f"has it, known to {known}; calibrate again."
+            f"Something has moved ({test}): the platform pose has changed by {change}, uncertainty "
+            f"{uncertainty}; calibrate again."
         )
 
     def document(self) -> dict[str, Any]:
-        """Return the document that ``--json`` prints."""
+        """Return the output of ``--json``."""
         movement, pair = self.movement, self.at_platform
         return CheckDocument(
             legcal_check=1,
@@ -125,16 +124,16 @@ class Check:
             verdict=self.sentence,
             explanations=[
                 ExplanationBlock(
-                    what=found.change.what,
-                    components=list(found.change.components),
-                    units=list(found.change.units),
-                    links=list(found.change.links),
-                    values=found.values.tolist(),
-                    sigma=found.sigma.tolist(),
-                    remaining=found.remaining,
-                    p_value=found.p_value,
+                    what=explanation.change.what,
+                    components=list(explanation.change.components),
+                    units=list(explanation.change.units),
+                    links=list(explanation.change.links),
+                    values=explanation.values.tolist(),
+                    sigma=explanation.sigma.tolist(),
+                    remaining=explanation.remaining,
+                    p_value=explanation.p_value,
                 )
-                for found in movement.explanations
+                for explanation in movement.explanations
             ],
             platform=MovedPlatform(
                 dX_m=pair.displacement,
@@ -161,9 +160,9 @@ def check(
     Parameters
     ----------
     source : path or Dataset
-        The new images, of cameras anywhere. Nothing is written beside them.
+        The new images, from arbitrary cameras. Nothing is written into their folder.
     result : path
-        The folder that the earlier calibration wrote.
+        The result folder of the earlier calibration.
     significance : float
         Probability of a false alarm.
     progress : bool or callable
@@ -182,7 +181,7 @@ def check(
     DatasetError, ModelError, OutOfClass
         If images or result are malformed, or of different machines.
     NotVisible, NotIdentifiable, DidNotConverge
-        If the new images cannot be fitted, or say nothing.
+        If the new images cannot be fitted, or determine nothing.
     """
     if not 0.0 < significance <= MAX_SIGNIFICANCE:
         raise UsageError(
@@ -197,31 +196,31 @@ def check(
     choices = _choices(dataset, earlier, prior)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=outline_key(dataset, choices))
-        every_row = np.arange(dataset.measurements.n_rows)
-        found = estimate_parameters(data, every_row, Options(choices, every_leg=False))
-    if dataset.axes is None and not found.outlines.used.any():
+        all_rows = np.arange(dataset.measurements.n_rows)
+        estimate = estimate_parameters(data, all_rows, Options(choices, every_leg=False))
+    if dataset.axes is None and not estimate.outlines.used.any():
         refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
             "any image, needed some; take images that show the legs."
         )
-        raise NotVisible([refusal, *found.image_notes])
-    solution = found.in_file_order().solution
-    tested = _compare(dataset, earlier, solution, prior, significance)
-    wrong = (one.sentence for one in found.diagnosis)
-    on_images = (*found.image_notes, *found.fit_notes)
-    of_images = notes_beside(found.diagnosis, on_images, "legcal calibrate --check")
-    notes = (*wrong, *dataset.notes, *of_images, *solution.notes)
-    return replace(tested, notes=tuple(dict.fromkeys(notes)))
+        raise NotVisible([refusal, *estimate.image_notes])
+    solution = estimate.in_file_order().solution
+    answer = _compare(dataset, earlier, solution, prior, significance)
+    sentences = (diagnosis.sentence for diagnosis in estimate.diagnosis)
+    on_images = (*estimate.image_notes, *estimate.fit_notes)
+    of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
+    notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
+    return replace(answer, notes=tuple(dict.fromkeys(notes)))
 
 
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
-    """Return new images with the calibrated model in place of the one that they name."""
-    given, calibrated = dataset.machine, earlier.machine
-    if sorted(given.leg_names) != sorted(calibrated.leg_names):
-        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
+    """Return the new images with the calibrated model in place of their own."""
+    named, calibrated = dataset.machine, earlier.machine
+    if sorted(named.leg_names) != sorted(calibrated.leg_names):
+        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(named.leg_names)}"
     else:
-        calibrated = calibrated.with_leg_order(given.leg_names)
-        different = _model_difference(calibrated, given)
+        calibrated = calibrated.with_leg_order(named.leg_names)
+        different = _model_difference(calibrated, named)
     if different:
         raise DatasetError(
             f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
@@ -232,13 +231,15 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
 
 
 def _model_difference(calibrated: Machine, given: Machine) -> str:
-    """Return what differs between two models of the same legs, nothing if they are one machine."""
-    for one, other in zip(calibrated.legs, given.legs, strict=True):
-        here, there = (f"{leg.name} ({leg.kind}, {leg.type})" for leg in (one, other))
-        if here != there:
-            return f"the leg {here}, not {there}"
-        if one.prismatic != other.prismatic:
-            return f"the joint {one.prismatic}, not {other.prismatic}"
+    """Return the difference of two models with the same legs in words; "" without one."""
+    for calibrated_leg, given_leg in zip(calibrated.legs, given.legs, strict=True):
+        calibrated_in_words, given_in_words = (
+            f"{leg.name} ({leg.kind}, {leg.type})" for leg in (calibrated_leg, given_leg)
+        )
+        if calibrated_in_words != given_in_words:
+            return f"the leg {calibrated_in_words}, not {given_in_words}"
+        if calibrated_leg.prismatic != given_leg.prismatic:
+            return f"the joint {calibrated_leg.prismatic}, not {given_leg.prismatic}"
     frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
     if frames[0] != frames[1]:
         return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
@@ -247,29 +248,31 @@ def _model_difference(calibrated: Machine, given: Machine) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _EarlierEstimate:
-    """The parameters that may have moved: where they were, and how far they may be now."""
+    """The tested parameters with the earlier estimate and their wide priors."""
 
     names: tuple[str, ...]
-    old: Array  # (n,) earlier values
-    covariance: Array  # (n, n) of these, with room along what was held
-    sigma: Array  # (n,) standard deviations that leave room for whatever moved [m, rad]
-    held_sigma: float  # the same along directions that are held [m]
+    old: Array  # (n,): earlier values
+    covariance: Array  # (n, n): earlier covariance, with the wide prior along held directions
+    sigma: Array  # (n,): standard deviations of the wide priors [m, rad]
+    held_sigma: float  # standard deviation of the wide prior along held directions [m]
 
     @classmethod
     def of(cls, machine: Machine, earlier: EarlierResult) -> _EarlierEstimate:
-        """Return what an earlier result says of the parameters of its mechanism."""
-        legs, found = geometries(machine), parametrization_of(machine, twists=True)
-        values = vector_of(found, legs, legs)
-        chosen = [found.names.index(name) for name in earlier.names]
+        """Return the tested parameters of an earlier result."""
+        legs, parametrization = geometries(machine), parametrization_of(machine, twists=True)
+        values = vector_of(parametrization, legs, legs)
+        chosen = [parametrization.names.index(name) for name in earlier.names]
         at_home = vectors_A_to_B(machine, machine.home)
         held_sigma = PRIOR_SIGMA * float(np.mean(np.linalg.norm(at_home, axis=1)))
-        sigma = np.array([held_sigma if found.units[i] == "m" else PRIOR_SIGMA for i in chosen])
+        sigma = np.array(
+            [held_sigma if parametrization.units[i] == "m" else PRIOR_SIGMA for i in chosen]
+        )
         covariance = earlier.covariance + held_sigma**2 * earlier.held.T @ earlier.held
         return cls(earlier.names, values[chosen], covariance, sigma, held_sigma)
 
 
 def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) -> Choices:
-    """Return priors that leave room for whatever may have moved."""
+    """Return choices with wide priors, so that any plausible change fits."""
     means, sigmas = prior.old.tolist(), prior.sigma.tolist()
     priors = {
         name: Prior(mean, sigma)
@@ -277,13 +280,19 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
     }
     views = dataset.measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    found = {owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)}
-    # Lines of arms that the earlier images did not show were left at nominal, and not known.
+    intrinsics = {
+        owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)
+    }
+    # Lines of arms that the earlier images did not show were kept nominal and are uncertain.
     fixed = [name for name in earlier.fixed if ParameterId.parse(name).kind not in ARMS]
     return Choices(
         fixed=frozenset(fixed),
         priors=priors,
-        cameras={owner: known for owner, known in found.items() if known is not None},
+        cameras={
+            owner: known_intrinsics
+            for owner, known_intrinsics in intrinsics.items()
+            if known_intrinsics is not None
+        },
         least_shared_px=earlier.document.residuals.shared_px,
     )
 
@@ -294,9 +303,9 @@ class _Free:
 
     problem: FitProblem
     minimum: Minimum[State]
-    which: IntArray  # the tested parameters among the named unknowns
-    more: Array  # (n, n) covariance of these besides that by information
-    prior: Array  # (n,) their wide priors
+    tested: IntArray  # indices of the tested parameters among the named unknowns
+    more: Array  # (n, n): covariance of the tested parameters not included in the information
+    prior: Array  # (n,): standard deviations of the wide priors
 
     @property
     def poses(self) -> Frames:
@@ -304,53 +313,62 @@ class _Free:
         return self.minimum.state.platform_pose.frames
 
     def estimate(self) -> tuple[Array, Array]:
-        """Return the tested parameters (n,) and their covariance (n, n), below the prior's."""
-        problem, state, which = self.problem, self.minimum.state, self.which
+        """Return the tested parameters (n,) and their covariance (n, n), at most the prior's."""
+        problem, state, tested = self.problem, self.minimum.state, self.tested
         normal = information(problem, state, self.minimum.linear, problem.loss)
         named = named_covariance(problem, state, normal.kept_covariance())
-        covariance, unit = named[np.ix_(which, which)] + self.more, np.outer(self.prior, self.prior)
+        covariance, unit = (
+            named[np.ix_(tested, tested)] + self.more,
+            np.outer(self.prior, self.prior),
+        )
         variance, vectors = np.linalg.eigh(covariance / unit)
         covariance = (vectors * np.minimum(variance, 1.0)) @ vectors.T * unit
-        return problem.coordinates(state)[which], covariance
+        return problem.coordinates(state)[tested], covariance
 
 
 def _fits(
     solution: Solution, prior: _EarlierEstimate, variance_factor: float
 ) -> tuple[_Free, _Free, float]:
-    """Return the free fit, that one next to the earlier result, and the squares that it saves.
+    """Return the free fit, the free fit near the earlier result, and the reduction of the squares.
 
-    They are saved over a fit with the earlier result as a prior beside the wide ones. A free fit
-    that starts where this one ends is what the images say near the earlier result; another minimum
-    counts where it fits better.
+    The reduction is relative to a fit with the earlier result as additional prior. A free fit that
+    starts at its solution gives the minimum near the earlier result; another minimum counts only if
+    it fits better.
     """
     posterior, loss = solution.posterior, solution.posterior.problem.loss
     problem, state = posterior.problem, posterior.state
     block, outlines = problem.block("legs"), problem.factor("outlines")
     number = np.array([block.labels.index(name) for name in prior.names], dtype=np.intp)
-    which = problem.where("legs")[number]
-    # Errors of edges that return to places are in no residual.
+    tested = problem.where("legs")[number]
+    # Local edge biases do not show in residuals.
     normal = information(problem, state, linearize(problem, state), loss)
     at_places = named_covariance(problem, state, posterior.covariance - normal.kept_covariance())
-    at_places = at_places[np.ix_(which, which)]
+    at_places = at_places[np.ix_(tested, tested)]
     held = solution.kinematic.of_values(prior.names)[1]
-    more = at_places + prior.held_sigma**2 * held.T @ held
+    additional = at_places + prior.held_sigma**2 * held.T @ held
     earlier = GaussianPrior.from_covariance(number, prior.old, prior.covariance + at_places)
 
     whitening = outlines.whitening / np.sqrt(variance_factor)
     problem = problem.with_factors(replace(outlines, whitening=whitening))
     with_earlier = problem.with_parts((replace(block, prior=block.prior + earlier),), ())
 
-    def minimum(of: FitProblem, begin: State) -> Minimum[State]:
-        most = of.settings.max_iterations
-        return minimise(of, begin, loss, max_iterations=most, must_converge=False)
+    def minimum(fit_problem: FitProblem, begin: State) -> Minimum[State]:
+        max_iterations = fit_problem.settings.max_iterations
+        return minimise(
+            fit_problem, begin, loss, max_iterations=max_iterations, must_converge=False
+        )
 
     starts = (replace(state, legs=problem.legs.nominal), state)
-    there = min((minimum(with_earlier, begin) for begin in starts), key=lambda one: one.cost)
-    near, elsewhere = minimum(problem, there.state), minimum(problem, state)
+    constrained = min(
+        (minimum(with_earlier, begin) for begin in starts), key=lambda result: result.cost
+    )
+    near, elsewhere = minimum(problem, constrained.state), minimum(problem, state)
     best = elsewhere if near.cost - elsewhere.cost > BETTER else near
-    beside, free = (_Free(problem, one, which, more, prior.sigma) for one in (near, best))
-    saved = 2.0 * (there.cost - min(near.cost, elsewhere.cost))
-    return free, beside, max(saved, 0.0)  # images of the earlier result save nothing
+    near_earlier, free = (
+        _Free(problem, result, tested, additional, prior.sigma) for result in (near, best)
+    )
+    saved = 2.0 * (constrained.cost - min(near.cost, elsewhere.cost))
+    return free, near_earlier, max(saved, 0.0)  # zero for the images of the earlier result
 
 
 def _compare(
@@ -360,19 +378,19 @@ def _compare(
     prior: _EarlierEstimate,
     significance: float,
 ) -> Check:
-    """Return what the fit of the new images says against the earlier result."""
+    """Return the test of the earlier result by the fit of the new images."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     variance_factor = _earlier_noise(solution, earlier)
     free, near, saved = _fits(solution, prior, variance_factor)
     values, covariance = free.estimate()
-    found = difference(values, covariance, prior.sigma, prior.old, prior.covariance)
+    measured_difference = difference(values, covariance, prior.sigma, prior.old, prior.covariance)
     dof = earlier.document.residuals.dof
     if variance_factor == 1.0:
         dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
     ratio = LikelihoodRatio.of(saved, covariance, prior.sigma)
     changes = possible_changes(machine, _only(parametrization, columns))
-    movement = judge_movement(found, ratio, dof, changes, significance)
+    movement = judge_movement(measured_difference, ratio, dof, changes, significance)
     fit = free if movement.moved else near
     J = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, *fit.poses)
     at_platform = _moved_platform(J[:, :, columns], fit, prior)
@@ -380,9 +398,9 @@ def _compare(
 
 
 def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPair:
-    """Return how far a fit moves the platform; J (k, 6, n) has its derivative by the parameters."""
+    """Return the platform motion of a fit; J (k, 6, n) is its derivative by the parameters."""
     values, covariance = fit.estimate()
-    # Priors pull what was found to the earlier result by 1 - G.
+    # Priors shrink the estimate towards the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.sigma**2
     spread = G @ covariance + G @ prior.covariance @ G.T
     shift = J @ (values - prior.old)
@@ -396,20 +414,20 @@ def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPa
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
-    """Return how many times the variance by the new images is that by the earlier ones, or one."""
+    """Return the ratio of the earlier to the new variance of outlines, at least one."""
     claimed = solution.outlines.covariance[solution.outlines.used]
     if len(claimed) == 0:
         return 1.0
     before = NoiseModel(**earlier.document.residuals.noise.document())
-    now, then = (
+    new_variance, earlier_variance = (
         float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
         for noise in (solution.quality.noise, before)
     )
-    return max(then / now, 1.0)
+    return max(earlier_variance / new_variance, 1.0)
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
-    """Return some of the parameters."""
+    """Return the parametrization with selected parameters."""
     place = np.full(parametrization.place.shape, -1, dtype=np.intp)
     for new, old in enumerate(columns):
         place[parametrization.place == old] = new
@@ -421,5 +439,5 @@ def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametri
 
 
 def _rms(squares: Array) -> float:
-    """Return the root of the mean over poses of sums of squares (k, 3)."""
+    """Return the root mean square over poses of vectors with squared components (k, 3)."""
     return float(np.sqrt(np.mean(squares.sum(axis=1))))

@@ -1,8 +1,8 @@
-"""What a calibration means at the platform, all over the workspace.
+"""Platform errors of a calibration over the workspace.
 
-At the poses that stand for the workspace, and on a grid of places at the orientation of home, where
-the machine can be there: how far the nominal model is off by the calibrated one, eq (20), and the
-error that the covariance predicts for the calibrated one.
+At sample poses of the workspace, and on a grid of reachable positions at the orientation of home:
+the change from the nominal to the calibrated model, eq (20), and the error of the calibrated model
+predicted by its covariance.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.parameters import geometries
 
-N_ACROSS, N_LEVELS = 7, 3  # places of the grid in x and y, and in z
-MIN_PLACES = 6  # of a grid that the machine reaches, for it to say anything
-_FLAT = 1e-3  # of the largest extent: a machine that moves in a plane
-_CLOSED = 2.5e-6  # mean leg lengths, [rad] between a place and the pose that its readings give
+N_ACROSS, N_LEVELS = 7, 3  # points of the grid in x and y, and in z
+MIN_PLACES = 6  # smallest number of reachable points of a grid
+_FLAT = 1e-3  # extent of a planar workspace, relative to the largest extent
+_CLOSED = 2.5e-6  # largest difference of a point and the pose by its readings [leg lengths, rad]
 
 
 @brief
@@ -45,12 +45,12 @@ class PlatformMap:
     position : (n, 3) array
         The origin of the platform link in the base link [m].
     change, sigma : PlatformError
-        At these places: from the nominal to the calibrated model at the same readings, and the
-        predicted error of the calibrated model, one standard deviation.
+        At these positions: change from the nominal to the calibrated model at the same readings,
+        and predicted error of the calibrated model, one standard deviation.
     x, y, z : (n_x,), (n_y,), (n_z,) arrays
-        The grid [m]; empty where the machine cannot keep the orientation of home at other places.
+        The grid [m]; empty if the machine cannot keep the orientation of home elsewhere.
     index : (n_z, n_y, n_x) array of int
-        Which place stands at each point of the grid, -1 where the machine does not reach it.
+        Index of the position of each point of the grid; -1 if the machine cannot reach it.
     """
 
     position: Array
@@ -63,9 +63,9 @@ class PlatformMap:
 
 
 def platform_map(calibration: Calibration) -> PlatformMap | None:
-    """Return the platform errors over the workspace; None where no reading gives a pose.
+    """Return the platform errors over the workspace; None if readings do not determine the pose.
 
-    None too where the travels or home of the model forbid random poses.
+    None also if no random poses can be drawn within the travels of the model.
     """
     machine = calibration.dataset.machine
     if calibration.platform is None:
@@ -82,25 +82,25 @@ def platform_map(calibration: Calibration) -> PlatformMap | None:
     poses = list(motions_of(R, places))
     readings = readings_at_poses(machine, np.concatenate([R, places[..., None]], axis=2))
     inside = _inside(machine, readings)
-    every = [*drawn, *(poses[k] for k in np.flatnonzero(inside))]
-    found = _errors(calibration, np.concatenate([q, readings[inside]]), every)
-    if found is None:
+    all_poses = [*drawn, *(poses[k] for k in np.flatnonzero(inside))]
+    errors = _errors(calibration, np.concatenate([q, readings[inside]]), all_poses)
+    if errors is None:
         return None
-    reached, change, sigma = found
-    number = np.full(len(every), -1)
+    reached, change, sigma = errors
+    number = np.full(len(all_poses), -1)
     number[reached] = np.arange(reached.sum())
     index = np.full(len(places), -1)
     index[inside] = number[len(drawn) :]
     if np.count_nonzero(index >= 0) < MIN_PLACES:
         axes, index = [np.zeros(0)] * 3, np.zeros(0, dtype=np.intp)
     shape = tuple(len(axis) for axis in axes[::-1])
-    where = np.concatenate([position, places[inside]])[reached]
+    reached_position = np.concatenate([position, places[inside]])[reached]
     x, y, z = axes
-    return PlatformMap(where, change, sigma, x, y, z, index.reshape(shape))
+    return PlatformMap(reached_position, change, sigma, x, y, z, index.reshape(shape))
 
 
 def _grid(position: Array) -> list[Array]:
-    """Return places along x and y over the whole workspace, and levels of z inside it."""
+    """Return points along x and y over the whole workspace, and levels of z inside it."""
     low, high = position.min(axis=0), position.max(axis=0)
     flat = high - low < _FLAT * float(np.max(high - low))
     x, y = (np.linspace(a, b, N_ACROSS) for a, b in zip(low[:2], high[:2], strict=True))
@@ -109,7 +109,7 @@ def _grid(position: Array) -> list[Array]:
 
 
 def _inside(machine: Machine, q: Array) -> BoolArray:
-    """Return which rows of readings (n, n_legs) are within the travels."""
+    """Return a mask of the rows of readings (n, n_legs) within the travels."""
     inside = np.ones(len(q), dtype=np.bool_)
     for j, leg in enumerate(machine.legs):
         if leg.is_motor:
@@ -120,24 +120,24 @@ def _inside(machine: Machine, q: Array) -> BoolArray:
 def _errors(
     calibration: Calibration, q: Array, T_base_platform: list[RigidTransform]
 ) -> tuple[BoolArray, PlatformError, PlatformError] | None:
-    """Return which poses both models have, and change and predicted error there."""
+    """Return a mask of the poses that both models reach, and change and predicted error there."""
     machine, solution = calibration.dataset.machine, calibration.solution
     wanted = platforms_in_base(machine, T_base_platform)
     nominal = poses_at_readings(machine, geometries(machine), q, wanted)
     calibrated = poses_at_readings(machine, solution.legs, q, nominal)
-    apart, turned = pose_differences(nominal, wanted)
-    reached = (apart < _CLOSED * machine.size) & (turned < _CLOSED)
+    distance, angle = pose_differences(nominal, wanted)
+    reached = (distance < _CLOSED * machine.size) & (angle < _CLOSED)
     reached &= reach_readings(machine, solution.legs, q, calibrated)
-    kept = np.flatnonzero(reached)
-    if not len(kept):
+    indices = np.flatnonzero(reached)
+    if not len(indices):
         return None
-    here = [calibrated[k] for k in kept]
+    reached_poses = [calibrated[k] for k in indices]
     try:
         moves = platform_by_parameters(
-            solution.legs, solution.kinematic.parametrization, machine.frame_legs, here
+            solution.legs, solution.kinematic.parametrization, machine.frame_legs, reached_poses
         )
-    except NotIdentifiable:  # a place of the grid is singular
+    except NotIdentifiable:  # a point of the grid is singular
         return None
     sigma = expected_error(moves, solution.kinematic.total_covariance)
-    change = PlatformError(*pose_differences(here, [nominal[k] for k in kept]))
+    change = PlatformError(*pose_differences(reached_poses, [nominal[k] for k in indices]))
     return reached, change, sigma

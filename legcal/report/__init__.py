@@ -1,5 +1,5 @@
-"""What people read: results of the jobs as text and as pages.
+"""Results of the jobs as text and as pages.
 
-In go the results of :mod:`legcal.calibration` or their documents, out come rich renderables, by one
-renderer of tables (``render``), and HTML files, by one template (``page``).
+Results of :mod:`legcal.calibration` or their documents become rich renderables with the tables of
+``render``, or HTML files (``page``).
 """

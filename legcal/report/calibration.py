@@ -1,4 +1,4 @@
-"""What people read of a calibration, of a check of an earlier one, and of two models compared."""
+"""Text reports of a calibration, of a check of an earlier one, and of two compared models."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from legcal.calibration.result import Calibration
     from legcal.calibration.verification import Check
 
-_SAME_M, _SAME_RAD = 1e-9, 1e-9  # [m, rad]: frames that are closer are in the same place
-_LARGEST = 5  # changes of parameters that are named
-_EXPLANATIONS = 3  # that are named beside the best
+_SAME_M, _SAME_RAD = 1e-9, 1e-9  # largest distance of equal frames [m, rad]
+_LARGEST = 5  # largest changes of parameters shown
+_EXPLANATIONS = 3  # alternative explanations shown
 
 
 def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> RenderableType:
     """Return one screen: verdict, platform, largest changes, weakest direction, notes.
 
-    *verbose* adds all parameters in mm, degrees and pixels, and how the fit went.
+    *verbose* adds all parameters in mm, degrees and pixels, and the quality of the fit.
     """
     result, good = calibration.result, calibration.verdict.trustworthy
     verdict = Text(calibration.verdict.sentence, style="bold green" if good else "bold red")
@@ -49,25 +49,25 @@ def summary(calibration: Calibration, output: Path, *, verbose: bool = False) ->
             _largest_changes(result),
             [*brief_sentences(result), f"{written} All parameters: --verbose, or the files there."],
         )
-    shown = [
+    tables_of_result = [
         table(
-            *(f">{name}" if name in NUMBERS else name for name in found.columns),
-            rows=found.cells(),
+            *(f">{name}" if name in NUMBERS else name for name in parameter_table.columns),
+            rows=parameter_table.cells(),
             title=title,
         )
-        for title, found in tables(result)
+        for title, parameter_table in tables(result)
     ]
-    return report(*shown, [*sentences(result, verbose=True), written, verdict])
+    return report(*tables_of_result, [*sentences(result, verbose=True), written, verdict])
 
 
-def _platform(found: PlatformBlock) -> RenderableType:
-    """Return the platform error before the calibration, and as predicted after it."""
-    after: PlatformBlock | WorkspaceAccuracy = found.workspace or found
-    where = "poses" if found.workspace is None else "workspace"
+def _platform(platform: PlatformBlock) -> RenderableType:
+    """Return the platform error before the calibration, and the predicted error after it."""
+    after: PlatformBlock | WorkspaceAccuracy = platform.workspace or platform
+    scope = "poses" if platform.workspace is None else "workspace"
     rows = [
-        ("nominal model, off the calibrated one", found.change_dX_m, found.change_dE_rad),
-        (f"calibrated, predicted (1 sigma, {where})", after.sigma_dX_m, after.sigma_dE_rad),
-        ("at most", after.sigma_dX_max_m, after.sigma_dE_max_rad),
+        ("nominal vs. calibrated", platform.change_dX_m, platform.change_dE_rad),
+        (f"calibrated, predicted (1 sigma, {scope})", after.sigma_dX_m, after.sigma_dE_rad),
+        ("maximum", after.sigma_dX_max_m, after.sigma_dE_max_rad),
     ]
     return table(
         "platform error",
@@ -89,19 +89,19 @@ def _largest_changes(result: Result) -> RenderableType | None:
         for row in ParameterTable.of(result, joints=False)
         if row["unit"] == "mm" and row["sigma"] is not None
     ]
-    most = sorted(rows, key=lambda row: -abs(row[1]))[:_LARGEST]
-    if not most:
+    largest = sorted(rows, key=lambda row: -abs(row[1]))[:_LARGEST]
+    if not largest:
         return None
     return table(
         "largest changes",
         ">mm",
         ">sigma",
-        rows=[(name, f"{change:+.3f}", f"{sigma:.3f}") for name, change, sigma in most],
+        rows=[(name, f"{change:+.3f}", f"{sigma:.3f}") for name, change, sigma in largest],
     )
 
 
 def check_summary(check: Check) -> RenderableType:
-    """Return whether something has moved, and what explains it."""
+    """Return the result of a check: movement, test and explanations."""
     movement, images = check.movement, check.dataset.measurements.n_rows
     lines = [
         *(f"Note: {note}" for note in check.notes),
@@ -111,14 +111,14 @@ def check_summary(check: Check) -> RenderableType:
     ]
     if movement.explanations:
         best, *others = movement.explanations
-        what, amount = best.change.what, _amount(best)
+        change, amount = best.change.what, _amount(best)
         if best.p_value < movement.significance:
             lines.append(
-                f"No single leg explains it; {what} explains most ({amount}; {best.remaining:.1f} "
-                f"of {movement.statistic:.1f} are left)."
+                f"No single leg explains it; {change} explains most ({amount}; residual statistic "
+                f"{best.remaining:.1f} of {movement.statistic:.1f})."
             )
         else:
-            lines.append(f"It is explained by {what}: {amount}.")
+            lines.append(f"It is explained by {change}: {amount}.")
             named = ", ".join(other.change.what for other in others[:_EXPLANATIONS])
             lines += [f"These images cannot distinguish that from: {named}."] if named else []
     style = "bold red" if movement.moved else "bold green"
@@ -126,11 +126,11 @@ def check_summary(check: Check) -> RenderableType:
 
 
 def _amount(explanation: Explanation) -> str:
-    """Return by how much something changed, in words."""
+    """Return the amount of a change in words."""
     change, parts = explanation.change, []
-    named = zip(change.components, change.units, change.links, strict=True)
+    components = zip(change.components, change.units, change.links, strict=True)
     numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
-    for (name, unit, link), (value, sigma) in zip(named, numbers, strict=True):
+    for (name, unit, link), (value, sigma) in zip(components, numbers, strict=True):
         scale, shown, digits = UNITS[unit]
         amount = f"{scale * value:+.{digits}f} {shown}"
         moved = f"{amount} in {name} of {link}" if link else f"{name} {amount}"
@@ -159,8 +159,8 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     return report(
         headline,
         *(
-            f"Readings of redundant motors in the {who}: {residuals_in_words(found)}"
-            for who, found in (evaluation.redundant_readings or {}).items()
+            f"Readings of redundant motors in the {who}: {residuals_in_words(residuals)}"
+            for who, residuals in (evaluation.redundant_readings or {}).items()
         ),
         *_left_out(evaluation),
         *_joint_tables(evaluation),
@@ -169,8 +169,8 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
 
 
 def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
-    """Return the joints of two models in the links of the first, and where the frames differ."""
-    found: list[RenderableType] = []
+    """Return the joints of two models in the links of the first, and the distance of the frames."""
+    blocks: list[RenderableType] = []
     for side, block in evaluation.links.items():
         rows = [
             (
@@ -185,20 +185,20 @@ def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
         ]
         title = joints_title(side, block.link, evaluation.joints_move)
         columns = ("leg", "axis", ">model", ">reference", ">difference", "")
-        found.append(table(*columns, rows=rows, title=title))
-        apart, frame = block.frames_apart, FRAMES[side]
-        if apart.dX_m > _SAME_M or apart.dE_rad > _SAME_RAD:
-            found.append(
+        blocks.append(table(*columns, rows=rows, title=title))
+        distance, frame = block.frames_apart, FRAMES[side]
+        if distance.dX_m > _SAME_M or distance.dE_rad > _SAME_RAD:
+            blocks.append(
                 Text(
-                    f"In their links {frame} of both models are {1e3 * apart.dX_m:.4f} mm and "
-                    f"{np.degrees(apart.dE_rad):.4f} deg apart; they are laid on each other."
+                    f"In their links {frame} of both models are {1e3 * distance.dX_m:.4f} mm and "
+                    f"{np.degrees(distance.dE_rad):.4f} deg apart; they are aligned for this table."
                 )
             )
-    return found
+    return blocks
 
 
 def _left_out(evaluation: Evaluation) -> list[RenderableType]:
-    """Return a table of the rows that are left out, if there are any."""
+    """Return a table of the rows left out, if any."""
     n, rows = evaluation.n_left_out, evaluation.unreached
     if not n:
         return []

@@ -1,4 +1,4 @@
-"""What people read of a look at a dataset: figures, findings with remedies, what comes next."""
+"""Text report of an examination: figures, findings with remedies, next command."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from legcal.report.render import heading, report, text_table
 _STYLES = {"note": "green", "warning": "yellow", "error": "red"}
 
 
-def examination_table(found: Examination, output: Path | None = None) -> RenderableType:
-    """Return what ``legcal doctor`` and ``legcal detect`` print; output is what was written."""
+def examination_table(examination: Examination, output: Path | None = None) -> RenderableType:
+    """Return the text of ``legcal doctor`` and ``legcal detect``; *output* is the folder."""
     return report(
-        heading(printable(found.mechanism), f": {printable(found.dataset)}"),
-        *map(text_table, tables_of(found)),
+        heading(printable(examination.mechanism), f": {printable(examination.dataset)}"),
+        *map(text_table, tables_of(examination)),
         [
-            Text.assemble((f"{one.severity}: ", _STYLES[one.severity]), printable(one.what))
-            for one in found.findings
+            Text.assemble(
+                (f"{finding.severity}: ", _STYLES[finding.severity]), printable(finding.what)
+            )
+            for finding in examination.findings
         ],
-        [found.sentence, "" if output is None else f"Look at {output / DETECTION_PAGE}."],
+        [examination.sentence, "" if output is None else f"Look at {output / DETECTION_PAGE}."],
     )

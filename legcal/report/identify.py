@@ -1,4 +1,4 @@
-"""What people read of identifiability: conditions, ranks, weak directions and remedies."""
+"""Text report of identifiability: conditions, ranks, weak directions and remedies."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ CONDITIONS = {
     "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
-_LEGEND = (
-    "known length law: a leg with a reading (length = reading + offset), or of constant length"
-)
+_LEGEND = "length known: leg with an encoder (length = reading + offset), or of constant length"
 _NEEDS = {"full": "the joint fit"}
 _MAX_WEAK = 6  # directions shown
 _MAX_MENDED = 3
@@ -41,7 +39,7 @@ _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
 def identify_table(report: Identifiability) -> RenderableType:
-    """Return an identifiability report as people read it, on 80 columns."""
+    """Return an identifiability report as text, 80 columns wide."""
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
@@ -49,25 +47,27 @@ def identify_table(report: Identifiability) -> RenderableType:
         _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
         _scale(report) if report.scale else None,
-        [*_boards(report), *(_intrinsics(one) for one in report.intrinsics)],
+        [*_boards(report), *(_intrinsics(intrinsics) for intrinsics in report.intrinsics)],
         _verdict(report),
     )
 
 
 def _heading(report: Identifiability) -> list[str]:
-    """Return what is judged."""
+    """Return the machine, views and boards of the report."""
     space = "spatial" if report.spatial else "planar"
     r = f", {report.r} with a revolute joint at the base" if report.r else ""
-    lines = [f"{space}, {report.n} legs ({report.n_ac} of known length law{r})"]
+    lines = [f"{space}, {report.n} legs ({report.n_ac} with known length{r})"]
     labels = leg_labels(report.legs)
     first = 0
     for (view, images), group in groupby(zip(report.views, report.images, strict=True)):
         last = first + len(list(group))
         between = " and " if last == first + 2 else " to "
-        which = f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
-        each = "" if last == first + 1 else " each"
+        views_in_heading = (
+            f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
+        )
+        per_view = "" if last == first + 1 else " each"
         legs = f"legs {', '.join(labels[name] for name in view)}" if view else "no leg"
-        lines.append(f"{which}: {legs} in {images} image{'s' * (images != 1)}{each}")
+        lines.append(f"{views_in_heading}: {legs} in {images} image{'s' * (images != 1)}{per_view}")
         first = last
     if report.board.present:
         lines.append("a calibration board on the base in every view")
@@ -77,19 +77,21 @@ def _heading(report: Identifiability) -> list[str]:
 
 
 def _recommendation(report: Identifiability) -> list[str | RenderableType]:
-    """Return the sets of views that suffice."""
+    """Return the sufficient sets of views."""
     if not report.recommendation:
-        return ["No set of views was found that suffices; all legs in one view are judged."]
+        return ["No sufficient set of views was found; the report is for all legs in one view."]
     labels, rows = leg_labels(report.legs), []
-    for found in report.recommendation:
-        number = len(found.views)
-        views = views_in_words([",".join(labels[name] for name in view) for view in found.views])
-        sigma = "" if found.platform_sigma is None else f"{1e3 * found.platform_sigma.dX_m:.2g}"
-        judged = "  *" if found.views == report.views else ""
+    for view_set in report.recommendation:
+        number = len(view_set.views)
+        views = views_in_words([",".join(labels[name] for name in view) for view in view_set.views])
+        sigma = (
+            "" if view_set.platform_sigma is None else f"{1e3 * view_set.platform_sigma.dX_m:.2g}"
+        )
+        judged = "  *" if view_set.views == report.views else ""
         words = f"{number} view{'s' * (number != 1)}: {views}"
-        rows.append((words, str(found.legs_a_view), sigma + judged))
-    columns = ("smallest sets of views that suffice", ">legs each", "sigma [mm]")
-    legend = "sigma: predicted error of the platform; *: the set that is judged here"
+        rows.append((words, str(view_set.legs_a_view), sigma + judged))
+    columns = ("smallest sufficient sets of views", ">legs each", "sigma [mm]")
+    legend = "sigma: predicted error of the platform; *: the set of this report"
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
@@ -106,15 +108,15 @@ def _conditions(report: Identifiability) -> Table:
 
 
 def _weak(ranks: Ranks) -> Table:
-    """Return the directions that are not determined."""
+    """Return the undetermined directions."""
     rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
     if len(ranks.weak) > _MAX_WEAK:
         rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
-    return table("not determined", ">hides [mm]", ">[deg]", rows=rows)
+    return table("undetermined combination", ">hides [mm]", ">[deg]", rows=rows)
 
 
 def _hidden(weak: WeakDirection) -> tuple[str, str]:
-    """Return the platform error that a direction hides when its largest component is 1 mm."""
+    """Return the unobserved platform error of a direction with 1 mm in its largest component."""
     if weak.dX_m is None or weak.dE_rad is None:
         return "?", "?"
     if weak.harmless:
@@ -127,34 +129,34 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
 
 
 def _two_digits(value: float) -> str:
-    """Return a number with two digits, never with an exponent where it is large."""
+    """Return a number with two significant digits, without exponent if it is large."""
     return f"{float(f'{value:.2g}'):.12g}"
 
 
 def _scale(report: Identifiability) -> list[str | RenderableType]:
-    """Return what would fix the scale, and how well."""
+    """Return the possible sources of scale with their precision."""
     rows = []
     for source in report.scale:
         scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
         motion = source.platform_sigma
         rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
     return [
-        "Readings carry no length here: the scale of the machine is that of the radii, unless "
-        "something else fixes it.",
-        table("what fixes the scale", ">sigma of it", ">platform [mm]", rows=rows),
+        "Readings are angles: without another source of scale it is determined by the leg radii "
+        "only.",
+        table("source of scale", ">sigma of scale", ">platform [mm]", rows=rows),
     ]
 
 
 def _boards(report: Identifiability) -> list[str]:
-    """Return what boards do; of one on the platform only where there is one, or it would help."""
-    of, moving = report.full.of, report.platform_board
+    """Return the effect of boards; one on the platform only if present or helpful."""
+    n_parameters, moving = report.full.of, report.platform_board
     helps = moving.needed_for or moving.without != moving.with_board
-    on_platform = [_board(moving, of, "platform")] if moving.present or helps else []
-    return [_board(report.board, of, "base"), *on_platform]
+    on_platform = [_board(moving, n_parameters, "platform")] if moving.present or helps else []
+    return [_board(report.board, n_parameters, "base"), *on_platform]
 
 
-def _board(board: BoardReport, of: int, link: Link) -> str:
-    """Return what a calibration board on a link does, in a few sentences."""
+def _board(board: BoardReport, n_parameters: int, link: Link) -> str:
+    """Return the effect of a calibration board on a link, in a few sentences."""
     subject = f"The calibration board on the {link}" if board.present else "A calibration board"
     before, after = board.without, board.with_board
     if not board.needed_for and before == after:
@@ -165,35 +167,35 @@ def _board(board: BoardReport, of: int, link: Link) -> str:
         needed = list_in_words(
             [_NEEDS.get(name, CONDITIONS.get(name, name)) for name in board.needed_for]
         )
-        where = "" if board.present else f" on the {link}"
-        text = f"{subject}{where} is needed for {needed}; it raises"
-    text += f" the rank from {before.full_rank} to {after.full_rank} of {of}"
+        on_link = "" if board.present else f" on the {link}"
+        text = f"{subject}{on_link} is needed for {needed}; it raises"
+    text += f" the rank from {before.full_rank} to {after.full_rank} of {n_parameters}"
     if not board.mends:
         return f"{text}."
-    shown = list(board.mends[:_MAX_MENDED])
+    phrases = list(board.mends[:_MAX_MENDED])
     if len(board.mends) > _MAX_MENDED:
-        shown.append(f"{len(board.mends) - _MAX_MENDED} more (see --json)")
-    return f"{text}, and determines: {'; '.join(shown)}."
+        phrases.append(f"{len(board.mends) - _MAX_MENDED} more (see --json)")
+    return f"{text}, and determines: {'; '.join(phrases)}."
 
 
-def _intrinsics(found: CameraIntrinsics) -> str:
-    """Return what the legs determine of a camera."""
-    camera = f"Camera of {found.camera}: the legs"
-    known = {name: sigma for name, sigma in found.sigma.items() if sigma is not None}
-    if not found.determined:
-        open_ = list_in_words([name for name in found.sigma if name not in known])
+def _intrinsics(intrinsics: CameraIntrinsics) -> str:
+    """Return the intrinsics that the legs determine."""
+    camera = f"Camera of {intrinsics.camera}: the legs"
+    sigma_of = {name: sigma for name, sigma in intrinsics.sigma.items() if sigma is not None}
+    if not intrinsics.determined:
+        open_ = list_in_words([name for name in intrinsics.sigma if name not in sigma_of])
         return f"{camera} do not determine {open_}; calibrate it with legcal camera."
-    sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in known.items())
+    sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in sigma_of.items())
     return f"{camera} determine its intrinsics too (predicted sigma: {sigmas} px)."
 
 
 def _remedies(report: Identifiability) -> Table:
-    """Return what would help."""
-    of = report.full.of
+    """Return the remedies."""
+    n_parameters = report.full.of
     rows = [
         (
             r.remedy,
-            f"{r.full_rank}/{of}",
+            f"{r.full_rank}/{n_parameters}",
             "enough" if r.enough else "helps",
         )
         for r in report.remedies
@@ -207,10 +209,10 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     determined = f"the joint fit determines {report.full.rank} of {report.full.of} parameters"
     lines: list[str | RenderableType] = []
     if report.identifiable:
-        rest = (
-            f"; {harmless} directions that stay open do not move the platform" if harmless else ""
+        undetermined = (
+            f"; {harmless} undetermined directions do not move the platform" if harmless else ""
         )
-        lines.append(f"Identifiable: {determined}{rest}.")
+        lines.append(f"Identifiable: {determined}{undetermined}.")
         if report.scale:
             lines.append(
                 "But for the scale: calibrate refuses this machine until a length or radii are "
@@ -234,7 +236,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
                     f"largest part of it; better is {', or '.join(ways)}."
                 )
     if any(weak.dX_m is not None and not weak.harmless for weak in report.full.weak):
-        hidden = "The platform error of a direction is that for 1 mm in its largest component."
+        hidden = "hides: unobserved platform error if the largest component is 1 mm."
         lines.append(Text(hidden, style="dim"))
     failed = [CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:

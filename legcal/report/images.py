@@ -1,4 +1,4 @@
-"""What people read of images: a calibrated camera, a simulated dataset."""
+"""Text reports of a calibrated camera and of a simulated dataset."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.report.render import heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
-_OFTEN = 0.5  # of the images, in which a leg should be seen
+_OFTEN = 0.5  # smallest share of images with a leg without a remark
 
 
-def camera_table(found: CameraCalibration, output: Path) -> RenderableType:
-    """Return a calibrated camera, and where it was written."""
-    used = [image for image in found.images if image.rms_px is not None]
-    camera = found.camera
+def camera_table(calibration: CameraCalibration, output: Path) -> RenderableType:
+    """Return a calibrated camera and its file."""
+    used = [image for image in calibration.images if image.rms_px is not None]
+    camera = calibration.camera
     title = heading(
         camera.model,
-        f", {camera.width} x {camera.height} px: {len(used)} of {len(found.images)} images, "
-        f"{sum(image.used for image in used)} corners, {found.rms_px:.3f} px off (rms), "
-        f"{100.0 * found.coverage:.0f} % of the image covered",
+        f", {camera.width} x {camera.height} px: {len(used)} of {len(calibration.images)} images, "
+        f"{sum(image.used for image in used)} corners, {calibration.rms_px:.3f} px off (rms), "
+        f"{100.0 * calibration.coverage:.0f} % of the image covered",
     )
     images = [
         (
@@ -36,40 +36,44 @@ def camera_table(found: CameraCalibration, output: Path) -> RenderableType:
             "left out" if image.rms_px is None else f"{image.rms_px:.3f} px",
             "" if image.tilt is None else f"{np.degrees(image.tilt):.0f} deg",
         )
-        for image in found.images
+        for image in calibration.images
     ]
     numbers = []
-    for name, value, sigma in zip(found.names, found.values, found.sigma, strict=True):
+    for name, value, sigma in zip(
+        calibration.names, calibration.values, calibration.sigma, strict=True
+    ):
         unit = " px" if intrinsic_unit(name) else ""
         numbers.append((name, f"{value:.{3 if unit else 5}f}{unit}", f"{sigma:.2g}{unit}"))
-    warnings = [Text(f"warning: {warning}", style="yellow") for warning in found.warnings]
+    warnings = [Text(f"warning: {warning}", style="yellow") for warning in calibration.warnings]
     return report(
         title,
         table("image", ">corners", ">residual", ">tilt", rows=images),
         table("", ">value", ">sigma", rows=numbers),
-        _model_and_sheet(found),
+        _model_and_sheet(calibration),
         [*warnings, f"Written to {output}."],
     )
 
 
-def _model_and_sheet(found: CameraCalibration) -> str:
-    """Return why the lens model was taken, and what the board is like, in sentences."""
-    unseen = (
-        "" if found.validated_px is None else f", {found.validated_px:.3f} px off in new images"
+def _model_and_sheet(calibration: CameraCalibration) -> str:
+    """Return the lens model with its reason, and the shape of the board, in sentences."""
+    cross_validation = (
+        ""
+        if calibration.validated_px is None
+        else f", {calibration.validated_px:.3f} px off in new images"
     )
-    k = int(np.argmax(np.abs(found.sheet[:3])))
-    bend, sigma = 1e3 * abs(found.sheet[k]), 1e3 * found.sheet_sigma[k]
-    wider, open_to = 100.0 * found.sheet[3], 100.0 * found.sheet_sigma[3]
+    k = int(np.argmax(np.abs(calibration.sheet[:3])))
+    bend, sigma = 1e3 * abs(calibration.sheet[k]), 1e3 * calibration.sheet_sigma[k]
+    wider, wider_sigma = 100.0 * calibration.sheet[3], 100.0 * calibration.sheet_sigma[3]
     return (
-        f"Lens model {found.lens}{unseen}. The board is bent by {bend:.2g} +- {sigma:.2g} mm, and "
-        f"printed {wider:+.2g} +- {open_to:.2g} % wider than high."
+        f"Lens model {calibration.lens}{cross_validation}. The board is bent by {bend:.2g} +- "
+        f"{sigma:.2g} mm, and printed {wider:+.2g} +- {wider_sigma:.2g} % wider than high."
     )
 
 
 def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
-    """Return the document of ``simulate``: how many images of each view show each leg.
+    """Return the document of ``simulate``: the number of images of each view with each leg.
 
-    *to_measure* is the distance that would fix the scale, where nothing in the dataset does.
+    *to_measure* is the distance that would fix the scale, if nothing in the dataset does.
     """
     n_images, n_poses, left_out = (document[key] for key in ("images", "poses", "left_out"))
     views = document["views"]
@@ -113,23 +117,23 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Rende
     )
 
 
-def _hidden(views: Iterable[dict[str, Any]], of: int) -> str:
-    """Return which legs few images show, in words; nothing if there are none."""
+def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
+    """Return the legs that few images show, in words; "" without any."""
     images = Counter[str]()
     for view in views:
         images.update(view["legs"])
-    few = {name: n for name, n in images.items() if n < _OFTEN * of}
-    if not few:
+    rarely_shown = {name: n for name, n in images.items() if n < _OFTEN * n_images}
+    if not rarely_shown:
         return ""
-    legs = ", ".join(f"{name} in {n}" for name, n in few.items())
+    legs = ", ".join(f"{name} in {n}" for name, n in rarely_shown.items())
     return (
-        f"Few of the {of} images show these legs: {legs}. Other parts or a board stand before "
-        "them, or they are outside; take other or more --views, or a smaller board."
+        f"Few of the {n_images} images show these legs: {legs}. Other parts or a board hide them, "
+        "or they are outside; use other or more --views, or a smaller board."
     )
 
 
 def _left_out(n: int) -> str:
-    """Return how many images are left out, in words."""
+    """Return the number of images left out, in words."""
     return (
         "1 image shows no leg and is left out."
         if n == 1

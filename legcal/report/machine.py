@@ -1,4 +1,4 @@
-"""What people read of a mechanism, and of where its base and tool are."""
+"""Text reports of a machine, and of the location of its base and tool."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
-_MAX_ROWS = 60  # of residuals; the file has them all
+_MAX_ROWS = 60  # rows of residuals shown; the file has all
 
 
 def scale_option(machine: Machine, *, board: bool) -> str:
-    """Return what a command to calibrate ends with to fix the scale, "" where it needs nothing."""
-    found = machine.rod_for_scale(has_length=board)
-    return "" if found is None else f" {machine.length_option}"
+    """Return the option of ``legcal calibrate`` that fixes the scale; "" if none is needed."""
+    rod = machine.rod_for_scale(has_length=board)
+    return "" if rod is None else f" {machine.length_option}"
 
 
 def inspect_table(description: dict[str, Any]) -> RenderableType:
-    """Return the document of ``inspect`` as people read it, lengths in millimetres."""
+    """Return the document of ``inspect`` as text, lengths in millimetres."""
     motors, mobility, legs = description["motors"], description["mobility"], description["legs"]
     verdict = "the motors determine the pose"
     if description["motor_rank"] < mobility:
@@ -61,22 +61,22 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     widths = [max(map(len, cells)) for cells in zip(names, *rows, strict=True)]
     widths[1] = kinds
     joints: list[tuple[str, ...]] = [*rows]
-    more = None
+    details = None
     if sum(widths) + 2 * len(columns[1:]) > _WIDTH:  # long names would be broken
         joints = [row[:4] for row in rows]
-        more = table(*columns[:1], *columns[4:], rows=[(row[0], *row[4:]) for row in rows])
+        details = table(*columns[:1], *columns[4:], rows=[(row[0], *row[4:]) for row in rows])
     laws = [
         (
             leg["name"],
             _span(leg["travel"]),
-            _span([_at(leg, q) for q in leg["travel"] or ()]),
+            _span([_length_at(leg, q) for q in leg["travel"] or ()]),
             "" if leg["travel"] is None else f"{1e3 * leg['q_home']:z.2f}",
-            f"{1e3 * _at(leg, leg['q_home']):.2f}",
+            f"{1e3 * _length_at(leg, leg['q_home']):.2f}",
         )
         for leg in legs
         if "actuator" not in leg
     ]
-    of_laws = ("leg", ">travel [mm]", ">length [mm]", ">reading at home", ">length at home")
+    columns_of_laws = ("leg", ">travel [mm]", ">length [mm]", ">reading at home", ">length at home")
     axes = [
         (
             leg["name"],
@@ -87,7 +87,7 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
         for leg in legs
         if leg["base_axis"] or leg["platform_axis"]
     ]
-    of_axes = ("leg", ">axis at base", ">axis at platform", ">twist [deg]")
+    columns_of_axes = ("leg", ">axis at base", ">axis at platform", ">twist [deg]")
     frame = ", ".join(description["base_frame"])
     legend = f"R_b and R_e stand on the joints of {frame}; q is the reading."
     if "actuators" in description:
@@ -95,10 +95,10 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     return report(
         title,
         table(*columns[: len(joints[0])], rows=joints, least={1: kinds}),
-        more,
-        table(*of_laws, rows=laws) if laws else None,
+        details,
+        table(*columns_of_laws, rows=laws) if laws else None,
         _motors(description) if "actuators" in description else None,
-        table(*of_axes, rows=axes) if axes else None,
+        table(*columns_of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
             Text(legend, style="dim"),
@@ -114,7 +114,7 @@ def _travel(limits: Sequence[float], turns: bool) -> str:
 
 
 def _motors(description: dict[str, Any]) -> RenderableType:
-    """Return the motors that rods hang on: what moves them, and how far."""
+    """Return the motors that move joints of rods, with axis and travel."""
     rows = []
     for joint, motor in description["actuators"].items():
         rods = [leg for leg in description["legs"] if leg.get("actuator") == joint]
@@ -145,7 +145,7 @@ def _motors(description: dict[str, Any]) -> RenderableType:
 
 
 def _direction(axis: Sequence[float] | None) -> str:
-    """Return a unit vector, or nothing where there is no axis."""
+    """Return a unit vector as text; "" without an axis."""
     return "" if axis is None else " ".join(f"{round(x, 4) + 0.0:7.4f}" for x in axis)
 
 
@@ -162,13 +162,13 @@ def _radii(leg: dict[str, Any]) -> str:
     return ", ".join(dict.fromkeys(f"{radius:g}" for radius in rounded))
 
 
-def _at(leg: dict[str, Any], q: float) -> float:
+def _length_at(leg: dict[str, Any], q: float) -> float:
     """Return the length of a leg at a reading [m]."""
     return float(leg["q0"] if leg["kind"] == "constant" else leg["sign"] * q + leg["q0"])
 
 
 def _span(values: Sequence[float] | None) -> str:
-    """Return the least and the greatest of lengths in millimetres, or nothing without any."""
+    """Return the range of lengths in millimetres; "" without any."""
     return f"{1e3 * min(values):z.2f} to {1e3 * max(values):z.2f}" if values else ""
 
 
@@ -197,7 +197,7 @@ def location_table(location: Location, written: Sequence[str]) -> RenderableType
         if i == 1 and not location.has_tool_orientation:
             frames.append((name, "rotation", "not measured", "", ""))
             continue
-        # Sigma of an angle is that of a turn about the axis.
+        # The sigma of an angle is that of a rotation about the axis.
         angles = roll_pitch_yaw(T.rotation.as_matrix())
         for component, value, s in zip(_TURNS, angles, sigma[i, 3:], strict=True):
             value, s = np.degrees(value), np.degrees(s)
@@ -232,19 +232,19 @@ def location_table(location: Location, written: Sequence[str]) -> RenderableType
 
 
 def _noise_line(location: Location) -> str:
-    """Return how precise the measurement is, and where that comes from."""
+    """Return the noise of the measurement and its source."""
     noise = location.noise
     stated = {True: "stated", False: "from the residuals"}
     words = f"position {1e3 * noise.position:.3g} mm ({stated[noise.position_stated]})"
     if noise.angle is not None:
         angle = f"{np.degrees(noise.angle):.3g} deg"
         words += f", orientation {angle} ({stated[noise.angle_stated]})"
-    others = [
+    possible_sources = [
         "errors of the readings" * (noise.reading > 0.0),
         "the covariance of the model" * noise.model,
     ]
-    known = [other for other in others if other]
-    counted = f"; {' and '.join(known)} counted in" if known else ""
+    sources = [other for other in possible_sources if other]
+    counted = f"; {' and '.join(sources)} counted in" if sources else ""
     p_value = "" if location.p_value is None else f", p {location.p_value:.2g}"
     return (
         f"Noise of a component: {words}{counted}. chi2 {location.chi2:.1f} at {location.dof} "

@@ -1,4 +1,4 @@
-"""What is said of a dataset that is made: matching, frames of recordings, what was written."""
+"""Text reports of a new dataset: matching, frames of recordings, written files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from legcal.recordings.importing import Import
 from legcal.report.machine import scale_option
 from legcal.report.render import heading, report, table
 
-_MOST = 200  # rows that are shown
+_MOST = 200  # largest number of rows shown
 
 
 def matching_table(new: NewDataset) -> RenderableType:
-    """Return what was understood of a folder and a table, and which photograph has which row."""
+    """Return the interpretation of a folder and a table: columns, units, matched photographs."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
     joints = new.joints
     size, unit = SHOWN_IN[new.machine.legs[new.machine.motors[0]].reading_unit]
@@ -39,7 +39,7 @@ def matching_table(new: NewDataset) -> RenderableType:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", ""))
     counts = {view: new.views.count(view) for view in new.cameras}
     columns = [f"{text} is {name}" for text, name in new.columns.items() if text != name]
-    what = "whole lengths of legs" if new.are_lengths else "readings"
+    noun = "whole lengths of legs" if new.are_lengths else "readings"
     return report(
         heading(
             printable(str(new.destination)),
@@ -48,7 +48,7 @@ def matching_table(new: NewDataset) -> RenderableType:
         ),
         [
             printable(f"Columns: {', '.join(columns)}.") if columns else "",
-            f"Unit of the {what}: {new.readings.unit}, {new.readings.unit_from}.",
+            f"Unit of the {noun}: {new.readings.unit}, {new.readings.unit_from}.",
             f"Photographs are matched {new.matching.how}.",
         ],
         table(
@@ -73,7 +73,7 @@ def matching_table(new: NewDataset) -> RenderableType:
 
 
 def written_lines(destination: Path, written: Sequence[Path], machine: Machine) -> RenderableType:
-    """Return what was written, and the command that goes on from there."""
+    """Return the written files and the next command."""
     names = ", ".join(path.name for path in written)
     folder, length = shlex.quote(str(destination)), scale_option(machine, board=False)
     return report(
@@ -84,22 +84,26 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
     )
 
 
-def import_table(found: Import) -> RenderableType:
-    """Return which frames of recordings are used, and why others are not."""
+def import_table(recording_import: Import) -> RenderableType:
+    """Return the used frames of recordings, and the reasons for leaving out others."""
     blocks: list[RenderableType | list[str] | list[Text]] = []
-    for view in found.views:
+    for view in recording_import.views:
         stills = view.stills
-        lost = [still for still in stills if still.why_not]
-        shown = [
+        unused = [still for still in stills if still.why_not]
+        rows = [
             (f"{s.begin:.2f}", f"{s.end - s.begin:.2f}", s.why_not or f"frame {s.frame}")
             for s in stills[:_MOST]
         ]
         if len(stills) > _MOST:
-            shown.append(("...", "", f"{len(stills) - _MOST} more"))
-        apart = f"{view.offset.seconds:+.3f} s"
+            rows.append(("...", "", f"{len(stills) - _MOST} more"))
+        offset = f"{view.offset.seconds:+.3f} s"
         if view.offset.agreement is not None:
-            apart += f" (+-{view.offset.sigma:.3f} s, motion agrees to {view.offset.agreement:.0%})"
-        why = [f"{sum(s.why_not == w for s in lost)} {w}" for w in {s.why_not: 0 for s in lost}]
+            offset += (
+                f" (+-{view.offset.sigma:.3f} s, motion agrees to {view.offset.agreement:.0%})"
+            )
+        reasons = [
+            f"{sum(s.why_not == w for s in unused)} {w}" for w in {s.why_not: 0 for s in unused}
+        ]
         blocks += [
             heading(
                 printable(view.name),
@@ -107,17 +111,17 @@ def import_table(found: Import) -> RenderableType:
             ),
             [
                 printable(f"Clock of {view.recording.path} less that of {view.series.source}: "
-                          f"{apart}."),
+                          f"{offset}."),
                 f"Unit of the readings: {view.series.unit}.",
-                f"Not used: {', '.join(why)}." if why else "",
+                f"Not used: {', '.join(reasons)}." if reasons else "",
             ],
-            table(">rest from [s]", ">for [s]", "used", rows=shown),
+            table(">rest from [s]", ">for [s]", "used", rows=rows),
             [Text(printable(f"note: {note}")) for note in view.notes],
         ]  # fmt: skip
-    sigma = found.encoder_sigma
-    said = (
+    sigma = recording_import.encoder_sigma
+    scatter_in_words = (
         f"{1e6 * sigma:.3g} um"
         if isinstance(sigma, float)
-        else ", ".join(f"{name} {one:.3g}" for name, one in sigma.items()) + " [m or rad]"
+        else ", ".join(f"{name} {scatter:.3g}" for name, scatter in sigma.items()) + " [m or rad]"
     )
-    return report(*blocks, [f"encoder_sigma, the scatter at rest: {said}."])
+    return report(*blocks, [f"encoder_sigma, the scatter at rest: {scatter_in_words}."])

@@ -1,4 +1,4 @@
-"""What is said and drawn of a plan: places, images, expected accuracy, and what to look after."""
+"""The report of a plan: positions, images, expected accuracy, checklist, drawings."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
 
 PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
-_WORST = 12  # parameters that are told, as many of each unit
+_WORST = 12  # least certain parameters shown, equally many of each unit
 _PANEL = (6.0, 5.6)  # [inch]
-_LEAST = 6  # images, from which errors are drawn: fewer know next to nothing
-_FEW_TICKS = 5.0  # times the least error, up to which ticks are not those of decades
-_WIDTH = 9.0  # [inch] of the picture of places
-_MOST_NAMES = 4  # of joints or cameras near each other
-_ROOM = 0.1  # of its width, around what it shows
+_LEAST = 6  # smallest number of images drawn; fewer determine next to nothing
+_FEW_TICKS = 5.0  # largest ratio of errors with linear ticks
+_WIDTH = 9.0  # width of the picture of places [inch]
+_MOST_NAMES = 4  # largest number of names in one label
+_ROOM = 0.1  # margin around the drawing, relative to its width
 
 
 def plan_table(plan: Plan, output: Path | None) -> RenderableType:
-    """Return what a plan is, what is expected of it, and where it is written, if that is told."""
+    """Return the views, distances and expected accuracy of a plan, and the written folder."""
     names = plan.machine.leg_names
     views = [
         (
@@ -54,9 +54,9 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         )
         for view in plan.views
     ]
-    known = [i for i in np.argsort(-plan.sigma, kind="stable").tolist() if plan.sigma[i] > 0.0]
+    estimated = [i for i in np.argsort(-plan.sigma, kind="stable").tolist() if plan.sigma[i] > 0.0]
     by_unit = {
-        unit: [i for i in known if plan.units[i] == unit] for unit in sorted(set(plan.units))
+        unit: [i for i in estimated if plan.units[i] == unit] for unit in sorted(set(plan.units))
     }
     of_units = [of_unit for of_unit in by_unit.values() if of_unit]
     worst = [i for of_unit in of_units for i in of_unit[: _WORST // len(of_units)]]
@@ -68,7 +68,7 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
         )
         for i in worst
     ]
-    growth = [(f"{n:.0f}", _shown(plan, value)) for n, value in _told(plan)]
+    growth = [(f"{n:.0f}", _scaled_in_words(plan, value)) for n, value in _selected_growth(plan)]
     distances = [
         (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
     ]
@@ -81,20 +81,21 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
             rows=[tuple(map(printable, row)) for row in views],
         ),
         table(
-            "lens of", *(f">to A{j + 1} [mm]" for j in _measured(plan)), ">above these [mm]",
+            "view", *(f">distance to A{j + 1} [mm]" for j in _measured(plan)),
+            ">height above the base joints [mm]",
             rows=[tuple(map(printable, row)) for row in distances],
             title="Distances to measure, from the middle of the lens to joints of the base"
             + plan.machine.at_zero,
         ),
-        table("parameter", ">sigma", "unit", rows=parameters, title="Known worst"),
+        table("parameter", ">sigma", "unit", rows=parameters, title="Least certain parameters"),
         table(
             ">images", ">expected", rows=growth,
-            title="With other numbers of images",
+            title="Expected error vs. number of images",
         ),
         [plan.sentence, *map(printable, plan.notes)],
         [] if output is None else [
             printable(f"written: {output}"),
-            *([printable(f"once it is shot, {_to_be_added(plan)}")] if plan.given else []),
+            *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
             printable(
                 f"calibrate with: legcal calibrate {plan.given or output} -o OUT{length}"
             ),
@@ -103,72 +104,72 @@ def plan_table(plan: Plan, output: Path | None) -> RenderableType:
 
 
 def _to_be_added(plan: Plan) -> str:
-    """Return what to do with a session that adds to another one."""
+    """Return the instruction for a session that adds to another one."""
     return (
         "copy the photographs, the views in dataset.yaml and the rows of "
         f"measurements.csv into {plan.given}"
     )
 
 
-def _told(plan: Plan) -> list[tuple[float, float]]:
-    """Return numbers of images and the criterion, a few of them."""
+def _selected_growth(plan: Plan) -> list[tuple[float, float]]:
+    """Return the criterion at selected numbers of images."""
     n = plan.n_images
-    told = {
+    chosen = {
         max(n // 3, 1),
         max(2 * n // 3, 1),
         n,
         *(k for k in plan.growth[:, 0] if n < k <= 4 * n),
     }
-    return [(k, value) for k, value in plan.growth.tolist() if k in told]
+    return [(k, value) for k, value in plan.growth.tolist() if k in chosen]
 
 
 def _scaled(plan: Plan, value: float) -> tuple[float, str]:
-    """Return what is expected where the criterion has another value, and its unit."""
+    """Return the expected error at another value of the criterion, and its unit."""
     ratio = value / plan.value
     if plan.error is None:
-        return ratio, "of that planned"
+        return ratio, "relative to the plan"
     return 1e3 * ratio * plan.error.mean_displacement, "mm"
 
 
-def _shown(plan: Plan, value: float) -> str:
-    """Return the same in words."""
+def _scaled_in_words(plan: Plan, value: float) -> str:
+    """Return the expected error at another value of the criterion, in words."""
     expected, unit = _scaled(plan, value)
     return f"{expected:.{3 if unit == 'mm' else 2}f} {unit}"
 
 
 def _measured(plan: Plan) -> tuple[int, ...]:
-    """Return the joints of the base that distances are measured to."""
+    """Return the joints of the base to which distances are measured."""
     return plan.machine.frame_legs
 
 
 def _measured_joints(plan: Plan) -> Array:
-    """Return where they are in the base, motors at zero, of shape (3, 3) [m]."""
+    """Return the measured joints in the base, motors at zero, (3, 3) [m]."""
     return np.asarray(plan.machine.A_base[list(_measured(plan))])
 
 
 def camera_distances(plan: Plan) -> dict[str, list[float]]:
-    """Return for each view how far the lens is from joints of the base, and how high [m]."""
+    """Return the distances of the lens of each view from joints of the base, and its height [m]."""
     A = _measured_joints(plan)
-    found = {}
+    distances = {}
     for view in plan.views:
-        where = view.T_base_camera.translation
-        found[view.name] = [
-            *np.linalg.norm(A - where, axis=1).tolist(),
-            float(where[2] - A[:, 2].mean()),
+        centre = view.T_base_camera.translation
+        distances[view.name] = [
+            *np.linalg.norm(A - centre, axis=1).tolist(),
+            float(centre[2] - A[:, 2].mean()),
         ]
-    return found
+    return distances
 
 
 def checklist(plan: Plan) -> list[str]:
-    """Return what to look after before and while photographs are taken."""
-    held = plan.hand_held
+    """Return the checklist for taking the photographs."""
+    hand_held = plan.hand_held
     first = f"Put the file of the calibrated camera in place of camera_info.yaml: it was planned \
 with {plan.camera.width} x {plan.camera.height} px and a focal length of \
 {plan.camera.K[0, 0]:.0f} px."
     cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
     place = (
-        "Take each image from where poses.csv says, about; the whole board must be in it."
-        if held
+        "Take each image from about the position in poses.csv; the whole board must be in it."
+        if hand_held
         else f"Set the tripod to {cm:g} cm and {deg:g} deg: measure the distances from the lens, "
         "then turn the camera until the picture looks as its preview."
     )
@@ -183,13 +184,14 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
         "nor background.",
         "A background that differs from the legs in brightness along their whole length.",
         "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
-        "Lead the machine as poses.csv says, in its order, by way of what stands in 'on the way'. "
-        f"It begins at home, where motors read {_home_in_words(plan)}.",
-        "Wait until it rests; write what the encoders say, not the command, into measurements.csv.",
+        "Move the machine through the poses of poses.csv in order, via the pose in the column "
+        f"'on the way'. It starts at home, where motors read {_home_in_words(plan)}.",
+        "Wait until it is at rest; record the encoder values, not the commands, in "
+        "measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
     ]
     if plan.given:
-        items.append(f"In the end, {_to_be_added(plan)}.")
+        items.append(f"Afterwards, {_to_be_added(plan)}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
     measured = plan.machine.rod_for_scale(has_length=plan.board is not None)
@@ -207,22 +209,22 @@ def _home_in_words(plan: Plan) -> str:
     """Return the readings of the motors at home."""
     machine = plan.machine
     readings = poses_at(machine, [machine.home_configuration]).readings[0]
-    found = []
+    readings_in_words = []
     for j in machine.motors:
         leg = machine.legs[j]
         size, unit = SHOWN_IN[leg.reading_unit]
-        found.append(f"{leg.prismatic} {size * readings[j]:z.2f} {unit}")
-    return ", ".join(found)
+        readings_in_words.append(f"{leg.prismatic} {size * readings[j]:z.2f} {unit}")
+    return ", ".join(readings_in_words)
 
 
 def _board_in_words(plan: Plan, board: LaidBoard) -> str:
-    """Return where the board is to lie."""
+    """Return the instruction for fixing the board."""
     A = _measured_joints(plan)
-    far = 1e3 * np.linalg.norm(A - board.middle, axis=1)
+    distance = 1e3 * np.linalg.norm(A - board.middle, axis=1)
     x, y, z = 1e3 * board.middle
-    facing = "up" if board.normal[2] > 0.0 else "down"  # of a machine that hangs
+    facing = "up" if board.normal[2] > 0.0 else "down"  # down for a hanging machine
     joints = ", ".join(
-        f"{d:.0f} mm from A{j + 1}" for d, j in zip(far, _measured(plan), strict=True)
+        f"{d:.0f} mm from A{j + 1}" for d, j in zip(distance, _measured(plan), strict=True)
     )
     return (
         f"Fix the board to the base, flat at the level of its joints, print {facing}, as "
@@ -243,7 +245,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     ]
     blocks: list[Any] = [
         Drawing(Markup(places), "Camera places from above and from the side."),
-        Drawing(Markup(growth), "What is expected of other numbers of images."),
+        Drawing(Markup(growth), "Expected error vs. number of images."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
@@ -291,26 +293,26 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
         ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
     for view in plan.views:
-        where = 1e3 * view.T_base_camera.translation
+        centre = 1e3 * view.T_base_camera.translation
         sight = view.T_base_camera.rotation.as_matrix()[:, 2]
-        tip = where + 250.0 * sight
+        tip = centre + 250.0 * sight
         arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
-        ax.annotate("", (tip[i], tip[j]), (where[i], where[j]), arrowprops=arrow)
-        ax.scatter(where[i], where[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
+        ax.annotate("", (tip[i], tip[j]), (centre[i], centre[j]), arrowprops=arrow)
+        ax.scatter(centre[i], centre[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
         if (i, j) == (0, 1) and not plan.hand_held:
-            _draw_distances(ax, where, 1e3 * _measured_joints(plan))
+            _draw_distances(ax, centre, 1e3 * _measured_joints(plan))
     ax.set_aspect("equal")
     ax.margins(0.0)
     room = _ROOM * float(np.ptp(ax.get_xlim()))
     joints_of_base = [f"A{k + 1}" for k in range(len(A))]
-    for n, (name, at) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
-        ax.annotate(name, at, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
+    for n, (name, position) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
+        ax.annotate(name, position, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
                     textcoords="offset points", fontsize="small")  # fmt: skip
     lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
-    for n, (name, at) in enumerate(
+    for n, (name, position) in enumerate(
         _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
     ):
-        ax.annotate(name, at, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
+        ax.annotate(name, position, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
                     textcoords="offset points")  # fmt: skip
     for limits, put in ((ax.get_xlim(), ax.set_xlim), (ax.get_ylim(), ax.set_ylim)):
         put(limits[0] - room, limits[1] + room)
@@ -320,53 +322,55 @@ def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> Non
 def _together(
     names: Sequence[str], points: Array, near: float
 ) -> list[tuple[str, tuple[float, float]]]:
-    """Return names of points (n, 2), in one text for those near each other, and where it stands.
+    """Return labels of points (n, 2) with their positions, one label for points near each other.
 
-    From left to right: above and below in turn, neighbours do not meet.
+    Labels are ordered from left to right, so that they can alternate above and below.
     """
     groups: list[list[int]] = []
     for k in range(len(points)):
-        beside = [g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near]
-        groups = [g for g in groups if g not in beside]
-        groups.append(sorted([k, *(i for g in beside for i in g)]))
-    found = []
+        near_groups = [
+            g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near
+        ]
+        groups = [g for g in groups if g not in near_groups]
+        groups.append(sorted([k, *(i for g in near_groups for i in g)]))
+    labels = []
     for group in groups:
         of_group = [names[k] for k in group]
         if len(group) > _MOST_NAMES:
             of_group = [of_group[0], "...", of_group[-1]]
         x, y = points[group[int(np.argmax(points[group, 0]))]].tolist()
-        found.append((plain(", ".join(of_group)), (x, y)))
-    return sorted(found, key=lambda text: text[1])
+        labels.append((plain(", ".join(of_group)), (x, y)))
+    return sorted(labels, key=lambda text: text[1])
 
 
 def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
-    """Draw from above how far a lens is from joints (rings), each distance along its line [mm]."""
+    """Draw the distances of a lens from joints (rings) from above, as text along lines [mm]."""
     ax.scatter(joints[:, 0], joints[:, 1], s=70.0, facecolors="none", edgecolors=_CAMERA_COLOUR)
     for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
         ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
                 linewidth=0.6, linestyle=":")  # fmt: skip
-        at = part * lens[:2] + (1.0 - part) * joint[:2]
+        x, y = (part * lens[:2] + (1.0 - part) * joint[:2]).tolist()
         slope = np.degrees(np.arctan2(lens[1] - joint[1], lens[0] - joint[0]))
-        ax.text(at[0], at[1], f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
+        ax.text(x, y, f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
                 fontsize="x-small", ha="center", va="center", rotation_mode="anchor",
                 rotation=(slope + 90.0) % 180.0 - 90.0,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
 
 
 def _draw_growth(plan: Plan) -> Figure:
-    """Return a figure of what is expected over the number of images."""
+    """Return a figure of the expected error over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
-    least = 1 if plan.given else min(_LEAST, plan.n_images)
-    known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= least)
+    min_images = 1 if plan.given else min(_LEAST, plan.n_images)
+    is_known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min_images)
     scale, unit = _scaled(plan, 1.0)
-    what = "expected error of the platform" if unit == "mm" else "determinant's root"
+    quantity = "expected error of the platform" if unit == "mm" else "determinant's root"
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     with new_figure(1, 1, _PANEL) as (figure, (ax,)):
-        more = known & (~planned | (plan.growth[:, 0] == plan.n_images))
-        for chosen, style, label, above in (  # planned ones in front, where they are one point
-            (known & planned, "-o", "planned", 3.0),
-            (more, "--o", "more of their kind", 2.0),
+        extrapolated = is_known & (~planned | (plan.growth[:, 0] == plan.n_images))
+        for chosen, style, label, above in (  # planned images in front
+            (is_known & planned, "-o", "planned", 3.0),
+            (extrapolated, "--o", "more of their kind", 2.0),
         ):
             n, value = plan.growth[chosen].T
             ax.loglog(n, scale * value, style, markersize=3.0, label=label, zorder=above)
@@ -374,22 +378,22 @@ def _draw_growth(plan: Plan) -> Figure:
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
-        drawn = plan.growth[known, 1]
+        drawn = plan.growth[is_known, 1]
         if drawn.max() < _FEW_TICKS * drawn.min():
             ax.yaxis.set_major_locator(MaxNLocator(6))
         ax.set_xlabel("images")
-        ax.set_ylabel(f"{what} [{unit}]")
+        ax.set_ylabel(f"{quantity} [{unit}]")
         ax.grid(which="both", alpha=0.2)
         ax.legend()
     return figure
 
 
 def _svg(figure: Figure) -> str:
-    """Return a figure as SVG, the same at every call."""
+    """Return a figure as reproducible SVG."""
     import matplotlib as mpl
 
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": "legcal plan"})
-    whole = text.getvalue()
-    return whole[whole.index("<svg") :]
+    svg = text.getvalue()
+    return svg[svg.index("<svg") :]

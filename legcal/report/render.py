@@ -1,4 +1,4 @@
-"""The one renderer of text tables, and of what stands around them."""
+"""The renderer of text tables and reports."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from legcal.pages import document
 Cells = Sequence[str | Text]
 
 
-def shown(text: str | Text) -> Text:
-    """Return text as a terminal may show it: names of files and links do nothing there."""
+def safe_text(text: str | Text) -> Text:
+    """Return text with control characters and markup escaped for the terminal."""
     if isinstance(text, Text):
         if text.plain != (plain := escaped(text.plain)):
             return Text(plain, style=text.style, overflow=text.overflow)
@@ -31,10 +31,10 @@ def table(
 ) -> Table:
     """Return a plain table; a column whose name begins with ">" holds numbers, flush right.
 
-    ``least`` are the characters that a column keeps on a narrow terminal.
+    ``least`` is the minimum width of columns on a narrow terminal.
     """
-    found = Table(
-        title=shown(title) if title else None,
+    text = Table(
+        title=safe_text(title) if title else None,
         title_justify="left",
         box=None,
         pad_edge=False,
@@ -42,25 +42,27 @@ def table(
     )
     for k, column in enumerate(columns):
         is_number = column.startswith(">")
-        found.add_column(
-            shown(column.removeprefix(">")),
+        text.add_column(
+            safe_text(column.removeprefix(">")),
             justify="right" if is_number else "left",
             overflow="fold",
             no_wrap=is_number,
             min_width=(least or {}).get(k),
         )
     for row in rows:
-        found.add_row(*map(shown, row))
-    return found
+        text.add_row(*map(safe_text, row))
+    return text
 
 
-def text_table(found: document.Table) -> Table:
-    """Return a table of a page as text; nothing is a dash."""
-    rows = [[cell if isinstance(cell, str) else cell.text for cell in row] for row in found.rows]
+def text_table(page_table: document.Table) -> Table:
+    """Return a table of a page as text; empty cells become dashes."""
+    rows = [
+        [cell if isinstance(cell, str) else cell.text for cell in row] for row in page_table.rows
+    ]
     return table(
-        *found.columns,
+        *page_table.columns,
         rows=[[printable(text) or "-" for text in row] for row in rows],
-        title=found.title,
+        title=page_table.title,
     )
 
 
@@ -70,7 +72,7 @@ def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None
     for block in blocks:
         lines = [block] if isinstance(block, str) or not isinstance(block, Sequence) else [*block]
         parts_of_block = [
-            shown(line) if isinstance(line, str | Text) else line for line in lines if line
+            safe_text(line) if isinstance(line, str | Text) else line for line in lines if line
         ]
         if parts_of_block:
             parts += [Text(), *parts_of_block] if parts else parts_of_block
@@ -78,5 +80,5 @@ def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None
 
 
 def heading(name: str, rest: str) -> Text:
-    """Return what a report is of, the name in bold."""
+    """Return the heading of a report, the name in bold."""
     return Text.assemble((escaped(name), "bold"), escaped(rest))

@@ -1,4 +1,4 @@
-"""What people read of the paper's evaluation (section 4.3): errors before and after calibration."""
+"""Text report of the paper's evaluation (section 4.3): errors before and after calibration."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _LABELS = {
     "bound": "Cramer-Rao bound",
 }
 _COLUMNS = ("joints", ">dX [mm]", ">dE [deg]", ">parameters [mm]", ">of bound", ">runs")
-_LARGE = 10.0  # in the unit of its column
+_LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 
 
 def study_table(document: Mapping[str, Any]) -> RenderableType:
-    """Return the document of ``study paper`` as people read it, beside the printed figures."""
+    """Return the document of ``study paper`` as text, with the printed figures."""
     printed = document["as_printed"]
     rows, failures = [], []
     for is_coplanar in dict.fromkeys(row["coplanar"] for row in document["rows"]):
@@ -60,14 +60,14 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _printed_cells(printed: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the figures of a row that the paper prints."""
+    """Return the figures of a row of the paper."""
     between = _range(*printed["parameters_mm"]) if "parameters_mm" in printed else ""
     runs = f"{printed.get('runs', '')}"
     return (f"{printed['dX_mm']:g}", f"{printed['dE_deg']:g}", between, "", runs)
 
 
 def _range(lowest: float, highest: float) -> str:
-    """Return the least and the largest error of a parameter."""
+    """Return the range of the errors of parameters."""
     digits = 3 if highest < _LARGE else 1
     return f"{lowest:.{digits}f} to {highest:.{digits}f}"
 

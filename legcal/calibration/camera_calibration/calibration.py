@@ -62,8 +62,8 @@ from legcal.vision.photograph_comparison import differences, recorded
 from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
-_N_DESCRIBED = 2  # images of which it is said what they show instead
-_SAME_PLACE = 0.01  # of the diagonal of the board, by which it moved from an image to the next
+_N_DESCRIBED = 2  # images without the board that are described
+_SAME_PLACE = 0.01  # smallest motion of the board between two images, relative to its diagonal
 
 
 def calibrate_camera(
@@ -86,8 +86,8 @@ def calibrate_camera(
         Such as ``chessboard:9x6:25mm`` (squares), or a YAML file with the block ``board`` of a
         dataset. Its size does not matter here, its proportions do.
     model : {"plumb_bob", "rational_polynomial", "equidistant"}, optional
-        How the lens distorts. Chosen by the images where it is not given: plumb_bob unless its
-        residuals lean over the field and a richer model predicts other images better.
+        The distortion model of the lens. Chosen by default: plumb_bob unless its residuals show a
+        radial trend and a richer model predicts other images better.
     output : path, optional
         Write a ROS camera_info file there, with the covariance of all intrinsics, which
         :func:`legcal.calibrate` takes as their prior.
@@ -96,7 +96,7 @@ def calibrate_camera(
     workers : int, str or executor
         Search the images there, as :func:`legcal.calibrate` does.
     picture : path, optional
-        Write a PNG there of where corners were seen, and how residuals lean over the field.
+        Write a PNG of the corners and their mean residuals over the field there.
 
     Returns
     -------
@@ -106,9 +106,9 @@ def calibrate_camera(
     Raises
     ------
     DatasetError
-        If images cannot be read, or are not of one size.
+        If images cannot be read, or differ in size.
     UsageError
-        If the board, the model or the output cannot be meant.
+        If the board, the model or the output is invalid.
     NotVisible
         If no image shows the board.
     NotIdentifiable
@@ -124,10 +124,10 @@ def calibrate_camera(
     )
     with shown_progress(progress) as report:
         with worker_pool(workers) as run:
-            seen = _search(stated, photographs, run, report)
-        shown = _shown_in(stated, photographs, seen)
+            board_images = _search(stated, photographs, run, report)
+        board_in_images = _shown_in(stated, photographs, board_images)
         report(_ADJUSTING, 0, 1)
-        table, size = shown.table, photographs.size
+        table, size = board_in_images.table, photographs.size
         lens = chosen_lens(table, size) if model is None else given_lens(table, size, model)
         report(_ADJUSTING, 1, 1)
     if lens is None:
@@ -135,11 +135,11 @@ def calibrate_camera(
             f"The camera could not be calibrated: found no {model or 'lens model'} that explains "
             "the corners, needed one; check the board and the model of the lens."
         )
-    names = [photographs.paths[k].name for k in shown.images]
+    names = [photographs.paths[k].name for k in board_in_images.images]
     refuse_divided(lens.fit, names)
-    left_out = [f"{names[i]}: {why}" for i, why in lens.fit.left_out.items()]
+    left_out = [f"{names[i]}: {reason}" for i, reason in lens.fit.left_out.items()]
     refuse_undetermined(lens.fit, [names[i] for i in lens.fit.images], left_out)
-    result = _result(photographs, shown, lens)
+    result = _result(photographs, board_in_images, lens)
     if output is not None:
         write_camera(result, Path(output))
     if picture is not None:
@@ -150,7 +150,7 @@ def calibrate_camera(
 def _check_options(
     model: DistortionModel | None, output: str | Path | None, picture: str | Path | None
 ) -> None:
-    """Raise UsageError for a model that is none, and for files that could not be written."""
+    """Raise UsageError for an unknown model, and for files that could not be written."""
     if model is not None and model not in get_args(DistortionModel):
         raise UsageError(
             f"The camera could not be calibrated: found the model {model!r}, needed "
@@ -172,34 +172,34 @@ class _Photographs:
     """Photographs of one size."""
 
     paths: tuple[Path, ...]
-    facts: tuple[ImageFacts, ...]  # what the file of each says of itself
+    facts: tuple[ImageFacts, ...]  # metadata of each file
     size: ImageSize
 
     def read(self, k: int) -> Array:
-        """Return the grey levels of one of them."""
+        """Return the grey levels of photograph k."""
         blank = Camera(np.eye(3), self.size.width, self.size.height)
         return np.asarray(read_image(self.paths[k], blank))
 
 
 @dataclass(frozen=True, eq=False)
 class _ShownBoard:
-    """A board, and what photographs show of it."""
+    """A board with its corners in photographs."""
 
     board: Board
-    corners: Sequence[NumberedCorners]  # of every photograph
-    images: Sequence[int]  # those that show it in a place of its own
-    unused: Mapping[int, str]  # why others are not used, if not for lack of corners
-    note: str  # of how it differs from what was stated
+    corners: Sequence[NumberedCorners]  # corners in every photograph
+    images: Sequence[int]  # photographs with the board in distinct poses
+    unused: Mapping[int, str]  # reasons why others are not used, except for lack of corners
+    note: str  # difference from the stated board
 
     @property
     def table(self) -> BoardImages:
-        """The corners of the images that show it, in one table."""
-        found = [self.corners[k] for k in self.images]
+        """The corners of all used images in one table."""
+        tables = [self.corners[k] for k in self.images]
         return BoardImages(
-            np.repeat(np.arange(len(found)), [len(corners.number) for corners in found]),
-            np.concatenate([self.board.points[corners.number] for corners in found]),
-            np.concatenate([corners.px for corners in found]),
-            np.concatenate([corners.sigma_px for corners in found]),
+            np.repeat(np.arange(len(tables)), [len(corners.number) for corners in tables]),
+            np.concatenate([self.board.points[corners.number] for corners in tables]),
+            np.concatenate([corners.px for corners in tables]),
+            np.concatenate([corners.sigma_px for corners in tables]),
         )
 
 
@@ -215,56 +215,58 @@ class _CornerSearch:
 
 
 def _search(board: Board, photographs: _Photographs, run: Run, progress: Report) -> list[SeenBoard]:
-    """Return what every image shows of the board."""
-    n, found = len(photographs.paths), list[SeenBoard]()
+    """Return the board features of every image."""
+    n, results = len(photographs.paths), list[SeenBoard]()
     progress(_STAGE, 0, n)
     anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
-    for seen in run(_CornerSearch(board, anywhere), range(n)):
-        found.append(seen)
-        progress(_STAGE, len(found), n)
-    return found
+    for result in run(_CornerSearch(board, anywhere), range(n)):
+        results.append(result)
+        progress(_STAGE, len(results), n)
+    return results
 
 
-def _shown_in(stated: Board, photographs: _Photographs, seen: Sequence[SeenBoard]) -> _ShownBoard:
-    """Return the board that images show, and in which.
+def _shown_in(
+    stated: Board, photographs: _Photographs, board_images: Sequence[SeenBoard]
+) -> _ShownBoard:
+    """Return the board with its corners in the images.
 
     Raises
     ------
     NotVisible, NotIdentifiable
-        If none does, or too few do.
+        If no image shows the board, or too few do.
     """
     paths = photographs.paths
-    board, note = shown_board(stated, seen)
+    board, note = shown_board(stated, board_images)
     if board is None:
         raise _not_visible(stated, note)
-    found = [one.numbered(board) for one in seen]
-    shown = [k for k, corners in enumerate(found) if len(corners.number) >= MIN_CORNERS]
-    if not shown:
+    corners_by_image = [board_image.numbered(board) for board_image in board_images]
+    usable = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    if not usable:
         raise _not_visible(stated, _shown_instead(stated, photographs))
-    copies = _copies(found, shown, paths)
-    own = [k for k in shown if k not in copies]
-    if len(own) < MIN_IMAGES:
-        same = _by_reason((paths[k].name, why) for k, why in copies.items())
-        raise too_few_images(len(own), [paths[k].name for k in own], copies=same)
-    without = set(range(len(paths))).difference(shown) if board.kind != "chessboard" else ()
+    copies = _copies(corners_by_image, usable, paths)
+    distinct = [k for k in usable if k not in copies]
+    if len(distinct) < MIN_IMAGES:
+        same = _by_reason((paths[k].name, reason) for k, reason in copies.items())
+        raise too_few_images(len(distinct), [paths[k].name for k in distinct], copies=same)
+    without = set(range(len(paths))).difference(usable) if board.kind != "chessboard" else ()
     mirrored = {
         k: "mirrored, left and right exchanged"
         for k in sorted(without)
         if tags_are_mirrored(board, photographs.read(k))
     }
-    return _ShownBoard(board, found, own, copies | mirrored, note)
+    return _ShownBoard(board, corners_by_image, distinct, copies | mirrored, note)
 
 
 def _shown_instead(board: Board, photographs: _Photographs) -> str:
-    """Return what images without the board show instead, in words that go after "found"."""
+    """Return a description of images without the board, to follow "found"."""
     n = len(photographs.paths)
     described = (describe_image(board, photographs.read(k)) for k in range(min(n, _N_DESCRIBED)))
-    what = next((words for words in described if words), "nothing like the board")
-    return f"{what} in its {n} image{'s' * (n != 1)}"
+    description = next((words for words in described if words), "nothing like the board")
+    return f"{description} in its {n} image{'s' * (n != 1)}"
 
 
 def _not_visible(board: Board, instead: str) -> NotVisible:
-    """Return the refusal of images that show something else than the board."""
+    """Return the error for images without the board."""
     hint = ""
     if board.kind == "chessboard":
         hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
@@ -275,21 +277,21 @@ def _not_visible(board: Board, instead: str) -> NotVisible:
 
 
 def _copies(
-    found: Sequence[NumberedCorners], shown: Sequence[int], paths: Sequence[Path]
+    corners: Sequence[NumberedCorners], usable: Sequence[int], paths: Sequence[Path]
 ) -> dict[int, str]:
-    """Return the images that show what one before shows, and which.
+    """Return a reason for each image with the board in the pose of an earlier image.
 
-    Errors of corners that lens and print make are the same in all images of one place of the board.
+    Such images share the errors of corners by lens and print, and add no information.
     """
     copies: dict[int, str] = {}
-    kept: list[int] = []
-    for k in shown:
-        for i in kept:
-            _, a, b = np.intersect1d(found[i].number, found[k].number, return_indices=True)
-            if 2 * len(a) < max(len(found[i].number), len(found[k].number)):
+    distinct: list[int] = []
+    for k in usable:
+        for i in distinct:
+            _, a, b = np.intersect1d(corners[i].number, corners[k].number, return_indices=True)
+            if 2 * len(a) < max(len(corners[i].number), len(corners[k].number)):
                 continue
-            moved = found[k].px[b] - found[i].px[a]
-            size = float(np.linalg.norm(np.ptp(found[i].px, axis=0)))
+            moved = corners[k].px[b] - corners[i].px[a]
+            size = float(np.linalg.norm(np.ptp(corners[i].px, axis=0)))
             if not moved.any():
                 copies[k] = f"the same photograph as {paths[i].name}"
             elif np.sqrt(np.mean(np.sum(moved**2, axis=1))) < _SAME_PLACE * size:
@@ -298,35 +300,42 @@ def _copies(
                 continue
             break
         else:
-            kept.append(k)
+            distinct.append(k)
     return copies
 
 
-def _result(photographs: _Photographs, shown: _ShownBoard, lens: ChosenLens) -> CameraCalibration:
-    """Return the camera with what it rests on."""
+def _result(
+    photographs: _Photographs, board_in_images: _ShownBoard, lens: ChosenLens
+) -> CameraCalibration:
+    """Return the result with its diagnostics."""
     fitted, paths, facts = lens.fit, photographs.paths, photographs.facts
-    adjusted, seen = fitted.adjusted, fitted.seen
-    used = {shown.images[k]: i for i, k in enumerate(fitted.images)}
-    left_out = {**shown.unused, **{shown.images[k]: why for k, why in fitted.left_out.items()}}
+    adjusted, corners = fitted.adjusted, fitted.corners
+    used = {board_in_images.images[k]: i for i, k in enumerate(fitted.images)}
+    left_out = {
+        **board_in_images.unused,
+        **{board_in_images.images[k]: reason for k, reason in fitted.left_out.items()},
+    }
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(shown.corners[k].number)
-        why = left_out.get(k, "" if k in shown.images else "the board was not found")
+        n = len(board_in_images.corners[k].number)
+        reason = left_out.get(k, "" if k in board_in_images.images else "the board was not found")
         if i is None:
-            images.append(ImageResult(path.name, n, 0, None, None, why))
+            images.append(ImageResult(path.name, n, 0, None, None, reason))
             continue
-        here = seen.image == i
-        n_used = int(np.count_nonzero(here))
-        images.append(ImageResult(path.name, n, n_used, adjusted.rms_px(here), float(tilt[i]), ""))
-    kept = [k for k, image in enumerate(images) if image.used]
+        of_image = corners.image == i
+        n_used = int(np.count_nonzero(of_image))
+        images.append(
+            ImageResult(path.name, n, n_used, adjusted.rms_px(of_image), float(tilt[i]), "")
+        )
+    used_images = [k for k, image in enumerate(images) if image.used]
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
         covariance=fitted.covariance,
-        board=shown.board,
+        board=board_in_images.board,
         images=tuple(images),
         rms_px=adjusted.rms_px(),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
@@ -334,37 +343,39 @@ def _result(photographs: _Photographs, shown: _ShownBoard, lens: ChosenLens) -> 
         sheet=fitted.sheet,
         sheet_covariance=fitted.all_covariance[-len(SHEET) :, -len(SHEET) :],
         error_ratio=float(np.sqrt(fitted.ratio)),
-        lens=lens.why,
+        lens=lens.reason,
         validated_px=lens.validated_px,
-        corners=np.concatenate([seen.px, adjusted.residual], axis=1),
+        corners=np.concatenate([corners.px, adjusted.residual], axis=1),
         warnings=(
-            *([shown.note] if shown.note else []),
+            *([board_in_images.note] if board_in_images.note else []),
             *_left_out(images),
             *lens.warnings,
             *warnings(fitted),
-            *_changes([paths[k] for k in kept], [facts[k] for k in kept], photographs.size),
+            *_changes(
+                [paths[k] for k in used_images], [facts[k] for k in used_images], photographs.size
+            ),
         ),
-        photographs=recorded([facts[k] for k in kept]),
+        photographs=recorded([facts[k] for k in used_images]),
     )
 
 
 def _left_out(images: Sequence[ImageResult]) -> list[str]:
-    """Return a sentence for each reason for which images were left out."""
+    """Return a sentence for each reason, with the images left out."""
     by_reason = _by_reason((image.name, image.reason) for image in images if image.reason)
-    return [f"{', '.join(names)} left out: {why}." for why, names in by_reason.items()]
+    return [f"{', '.join(names)} left out: {reason}." for reason, names in by_reason.items()]
 
 
 def _by_reason(left_out: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the names of images by the reasons for which they were left out."""
-    found: dict[str, list[str]] = {}
-    for name, why in left_out:
-        found.setdefault(why, []).append(name)
-    return found
+    """Return the names of the left-out images by reason."""
+    names_by_reason: dict[str, list[str]] = {}
+    for name, reason in left_out:
+        names_by_reason.setdefault(reason, []).append(name)
+    return names_by_reason
 
 
 def _listed_images(named: Sequence[str | Path]) -> list[Path]:
-    """Return the image files that are named, each once, those of a folder or pattern by name."""
-    found: dict[Path, None] = {}
+    """Return the image files without duplicates; a folder or pattern is sorted by name."""
+    files: dict[Path, None] = {}
     problems = []
     for name in named:
         paths = _matching(str(name))
@@ -374,22 +385,22 @@ def _listed_images(named: Sequence[str | Path]) -> list[Path]:
                 f"with images or pattern that matches one, needed {', '.join(image_suffixes())}; "
                 "check the path."
             )
-        found |= dict.fromkeys(paths)
-    if problems or not found:
+        files |= dict.fromkeys(paths)
+    if problems or not files:
         raise DatasetError(
             problems or "The images could not be read: found none, needed some; name them."
         )
-    return list(found)
+    return list(files)
 
 
 def _matching(name: str) -> list[Path]:
-    """Return the images that one name stands for."""
+    """Return the images of a file, folder or pattern."""
     if not name:
         return []
     path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
-        shown = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
-        return [p for p in shown if p.suffix.lower() in suffixes and p.is_file()]
+        files = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
+        return [p for p in files if p.suffix.lower() in suffixes and p.is_file()]
     if os.path.lexists(path):
         return [path]
     hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
@@ -397,7 +408,7 @@ def _matching(name: str) -> list[Path]:
 
 
 def _of_one_size(paths: Sequence[Path]) -> _Photographs:
-    """Return photographs of one size; raise DatasetError where they cannot be read, or differ."""
+    """Return photographs; raise DatasetError if they cannot be read or differ in size."""
     sizes: dict[ImageSize, list[Path]] = {}
     facts: list[ImageFacts] = []
     problems = []
@@ -408,21 +419,21 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
             facts.append(read_facts(content))
             continue
         except OSError as error:
-            wrong = f"'{error.strerror}'", "a readable file"
+            mismatch = f"'{error.strerror}'", "a readable file"
         except BadImage as error:
-            wrong = str(error.found), error.needed
+            mismatch = str(error.found), error.needed
         unread, remedy = "the image could not be read", "copy it again or leave it out"
-        problems.append(Problem(unread, *wrong, remedy, str(path)))
+        problems.append(Problem(unread, *mismatch, remedy, str(path)))
     if problems:
         raise DatasetError(problems)
     if len(sizes) > 1:
         by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
         usual = by_count[0][0]
-        first = {size: facts[paths.index(some[0])] for size, some in by_count}
+        first = {size: facts[paths.index(paths_of_size[0])] for size, paths_of_size in by_count}
         sizes_in_words = "; ".join(
-            f"{size.width} x {size.height} px in {few([path.name for path in some])}"
+            f"{size.width} x {size.height} px in {few([path.name for path in paths_of_size])}"
             f"{likely_cause(size, usual, first[size]) if size != usual else ''}"
-            for size, some in by_count
+            for size, paths_of_size in by_count
         )
         raise DatasetError(
             f"The camera could not be calibrated: found images of different sizes, "
@@ -435,10 +446,12 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
 def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:
     """Yield a warning for each fact that photographs of a camera must share."""
     named = list(zip([path.name for path in paths], facts, strict=True))
-    for found in differences(named, (size.width, size.height), None):
-        groups = " and ".join(f"images {how} ({few(names)})" for how, names in found.images.items())
+    for difference in differences(named, (size.width, size.height), None):
+        groups = " and ".join(
+            f"images {condition} ({few(names)})" for condition, names in difference.images.items()
+        )
         yield (
             f"No one camera may hold for all images: found {groups}, needed one "
-            f"{found.fact.what}; leave out those that differ, and photograph the machine like the "
-            "others."
+            f"{difference.fact.what}; leave out those that differ, and photograph the machine like "
+            "the others."
         )

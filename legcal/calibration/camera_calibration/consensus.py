@@ -1,11 +1,11 @@
-"""Which images of a board agree on a camera, and what is the matter with the others.
+"""The largest group of images of a board that agree on a camera, and the faults of the others.
 
-An image says little of a camera alone; it contradicts a group of images by its score and
-information (``Clusters``), along all numbers of the camera and of the sheet,
-along the focal length, the principal point, and along the sheet. The group begins as the half of
-the images that is cheapest together (least trimmed squares from many random starts, on the
-quadratic costs of all images), takes in whatever does not contradict it, and is fitted again until
-it stays. Images that are wrong alike, as a third that was taken at another zoom, cannot move it.
+A single image hardly determines a camera. It contradicts a group of images by its score and
+information (``Clusters``): along all parameters of camera and sheet together, along the focal
+length, the principal point, and the sheet. The group starts as the half of the images with the
+least total cost (least trimmed squares from many random starts, on quadratic costs), grows by all
+images that do not contradict it, and is fitted again until it is stable. Images with a common
+fault, such as a third of them at another zoom, cannot move it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
-from legcal.calibration.camera_calibration.starts import again, from_scratch, part_of
+from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
 from legcal.estimation.clusters import Clusters
 from legcal.estimation.solver import COST_TOLERANCE
 from legcal.geometry.types import Array, BoolArray
@@ -34,134 +34,136 @@ from legcal.vision.camera import intrinsic_names, intrinsic_values
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize
 
-_SIGNIFICANCE = 1e-5  # of a contradiction
-_FEW = 5  # images of which none can be outvoted
-_STARTS, _OF_START = 100, 4  # random groups, and the images of each
+_SIGNIFICANCE = 1e-5  # significance level of a contradiction
+_FEW = 5  # smallest number of images with a majority
+_STARTS, _OF_START = 100, 4  # number of random groups, images of each
 _ROUNDS = 8
-_FIRST_RATIO = 3.0  # by which errors of the cheapest half are smaller than those of all
-_CLEAR = 0.6  # part of the images, from which a group is not searched further
-_MORE_STARTS = 4  # fits of random images, then
-_EXPLAINED = 0.6  # part of what is wrong with an image, from which it is the reason
-_NEGLIGIBLE = 1e-3  # part of what is wrong with an image that is not searched for
-_ALMOST = 0.9  # part of the best explanation, from which a simpler one is the reason
-_ALIKE = 0.2  # part by which changes of both focal lengths, or in images, may differ from a mean
-_PAIR = 2  # images that have a change in common by chance
-_TWO = 0.85  # part of the scatter between two values, of a normal distribution 0.64
-_RIVAL = 4  # images that make another group
+_FIRST_RATIO = 3.0  # scatter of all images, relative to that of the half with the least cost
+_CLEAR = 0.6  # share of the images in a group that ends the search
+_MORE_STARTS = 4  # fits of random images if the first fit has no clear group
+_EXPLAINED = 0.6  # smallest share of the excess cost that a fault has to explain
+_NEGLIGIBLE = 1e-3  # tolerance of the fits, relative to the excess cost
+_ALMOST = 0.9  # explained share of a simpler fault that is preferred, relative to the best
+_ALIKE = 0.2  # largest relative difference of two changes that are equal
+_PAIR = 2  # images with a common change by chance
+_TWO = 0.85  # smallest share of scatter between two clusters (0.64 for a normal distribution)
+_RIVAL = 4  # smallest size of another group
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """Images that agree on a camera."""
 
-    adjusted: AdjustedBoard  # to these; poses and residuals of all images before this camera
-    left_out: dict[int, str]  # images that contradict it, and how
-    rival: tuple[int, ...]  # those of them that agree among themselves
+    adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
+    left_out: dict[int, str]  # the other images with their faults
+    rival: tuple[int, ...]  # other images that agree among themselves
 
 
-def agreeing_images(seen: BoardImages, size: ImageSize, model: DistortionModel) -> Agreement | None:
-    """Return the largest group of images that agree on a camera; None if nothing can be fitted."""
-    n = int(seen.image[-1]) + 1
-    found = _largest(seen, size, model)
-    if found is None:
+def agreeing_images(
+    corners: BoardImages, size: ImageSize, model: DistortionModel
+) -> Agreement | None:
+    """Return the largest group of images that agree on a camera; None if no fit succeeds."""
+    n = int(corners.image[-1]) + 1
+    largest = _largest(corners, size, model)
+    if largest is None:
         return None
-    adjusted, group = found
+    adjusted, group = largest
     others = np.flatnonzero(~group)
     if not len(others):
         return Agreement(adjusted, {}, ())
     rival: tuple[int, ...] = ()
     if len(others) >= _RIVAL:
-        part, numbers = part_of(seen, np.isin(seen.image, others), n)
+        part, numbers = part_of(corners, np.isin(corners.image, others), n)
         second = _largest(part, size, model)
         if second is not None and np.count_nonzero(second[1]) >= _RIVAL:
             rival = tuple(np.array(numbers)[second[1]].tolist())
-    return Agreement(adjusted, _reasons(adjusted, seen, group), rival)
+    return Agreement(adjusted, _reasons(adjusted, corners, group), rival)
 
 
 def _largest(
-    seen: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[AdjustedBoard, BoolArray] | None:
-    """Return the largest group of images that agree, and the adjustment to it."""
-    n = int(seen.image[-1]) + 1
+    """Return the adjustment to the largest group of agreeing images, and the group."""
+    n = int(corners.image[-1]) + 1
     rng = np.random.default_rng(0)
     best: tuple[AdjustedBoard, BoolArray] | None = None
-    first = from_scratch(seen, size, model)
+    first = from_scratch(corners, size, model)
     if first is not None:
-        every = np.ones(n, dtype=np.bool_)
+        all_images = np.ones(n, dtype=np.bool_)
         if n < _FEW:
-            return first, every
-        group = _grown(first, _cheapest(first, seen, rng))
+            return first, all_images
+        group = _grown(first, _cheapest(first, corners, rng))
         if group.all():
             return first, group
         if np.count_nonzero(group) >= _OF_START:
-            best = _settled(first, first, group, seen)
+            best = _settled(first, first, group, corners)
     for _ in range(_MORE_STARTS if n >= _FEW else 0):
         if best is not None and np.count_nonzero(best[1]) >= _CLEAR * n:
             break
-        some = rng.choice(n, _OF_START, replace=False)
-        part, _ = part_of(seen, np.isin(seen.image, some), n)
+        chosen = rng.choice(n, _OF_START, replace=False)
+        part, _ = part_of(corners, np.isin(corners.image, chosen), n)
         rough = from_scratch(part, size, model)
         if rough is None:
             continue
         start = first or rough
-        found = _settled(rough, start, None, seen)
-        if found is not None and (
-            best is None or np.count_nonzero(found[1]) > np.count_nonzero(best[1])
+        candidate = _settled(rough, start, None, corners)
+        if candidate is not None and (
+            best is None or np.count_nonzero(candidate[1]) > np.count_nonzero(best[1])
         ):
-            best = found
+            best = candidate
     return best
 
 
 def _settled(
-    near: AdjustedBoard, start: AdjustedBoard, group: BoolArray | None, seen: BoardImages
+    near: AdjustedBoard, start: AdjustedBoard, group: BoolArray | None, corners: BoardImages
 ) -> tuple[AdjustedBoard, BoolArray] | None:
-    """Return the group that stays when it is fitted, and the adjustment to it."""
-    n = int(seen.image[-1]) + 1
+    """Return the adjustment to a group that fitting it does not change, and the group."""
+    n = int(corners.image[-1]) + 1
     poses = list(start.T_camera_board)
     settled: tuple[AdjustedBoard, BoolArray] | None = None
     for _ in range(_ROUNDS):
         if group is not None:
-            part, images = part_of(seen, group[seen.image], n)
-            fitted = again(near, [poses[k] for k in images], part)
+            part, images = part_of(corners, group[corners.image], n)
+            fitted = readjust(near, [poses[k] for k in images], part)
             if fitted is None:
                 return None
             near = fitted
             for k, T in zip(images, fitted.T_camera_board, strict=True):
                 poses[k] = T
         names = intrinsic_names(near.camera)
-        held = adjust_board(near.camera, poses, seen, names, near.sheet, held=True)
-        if held is None:
+        adjusted = adjust_board(near.camera, poses, corners, names, near.sheet, held=True)
+        if adjusted is None:
             return None
-        poses = list(held.T_camera_board)
+        poses = list(adjusted.T_camera_board)
         before = group
         if group is None:
-            cost = _costs(held, seen)
+            cost = _costs(adjusted, corners)
             group = cost <= np.sort(cost)[n // 2]
-        group = _grown(held, group)
+        group = _grown(adjusted, group)
         if np.count_nonzero(group) < _OF_START:
             return None
-        settled = held, group
+        settled = adjusted, group
         if before is not None and np.array_equal(before, group):
             break
     return settled
 
 
-def _costs(adjusted: AdjustedBoard, seen: BoardImages) -> Array:
-    """Return squared residuals of images by their degrees of freedom, (n_images,)."""
-    square = np.sum((adjusted.residual / seen.sigma_px[:, None]) ** 2, axis=1)
+def _costs(adjusted: AdjustedBoard, corners: BoardImages) -> Array:
+    """Return the squared residuals of images over their degrees of freedom, (n_images,)."""
+    square = np.sum((adjusted.residual / corners.sigma_px[:, None]) ** 2, axis=1)
     n = len(adjusted.T_camera_board)
-    corners = np.bincount(seen.image, minlength=n)
-    return np.bincount(seen.image, square, n) / np.maximum(2 * corners - 6, 1)
+    n_corners = np.bincount(corners.image, minlength=n)
+    return np.bincount(corners.image, square, n) / np.maximum(2 * n_corners - 6, 1)
 
 
-def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generator) -> BoolArray:
-    """Return the half of the images that is cheapest together, on quadratic costs."""
+def _cheapest(adjusted: AdjustedBoard, corners: BoardImages, rng: np.random.Generator) -> BoolArray:
+    """Return the half of the images with the least total quadratic cost."""
     clusters = adjusted.clusters
     n = len(clusters.score)
-    dof = np.maximum(2 * np.bincount(seen.image, minlength=n) - 6, 1)
-    base = _costs(adjusted, seen) * dof
+    dof = np.maximum(2 * np.bincount(corners.image, minlength=n) - 6, 1)
+    base = _costs(adjusted, corners) * dof
     half = n // 2 + 1
-    best, least = np.ones(n, dtype=np.bool_), np.inf
+    best, least_total = np.ones(n, dtype=np.bool_), np.inf
     for _ in range(_STARTS):
         group = np.isin(np.arange(n), rng.choice(n, _OF_START, replace=False))
         for _ in range(_ROUNDS):
@@ -172,13 +174,13 @@ def _cheapest(adjusted: AdjustedBoard, seen: BoardImages, rng: np.random.Generat
             if np.array_equal(before, group):
                 break
         total = float(cost[group].sum())
-        if total < least:
-            best, least = group, total
+        if total < least_total:
+            best, least_total = group, total
     return best
 
 
 def _grown(adjusted: AdjustedBoard, group: BoolArray) -> BoolArray:
-    """Return a group with all images that do not contradict it, to first order."""
+    """Return the group grown by all images that do not contradict it, to first order."""
     clusters, first = adjusted.clusters, _FIRST_RATIO
     for _ in range(_ROUNDS):
         before = group
@@ -196,7 +198,7 @@ def _grown(adjusted: AdjustedBoard, group: BoolArray) -> BoolArray:
 def _contradicting(
     adjusted: AdjustedBoard, clusters: Clusters, group: BoolArray, ratio: float
 ) -> BoolArray:
-    """Return which images contradict a group at its minimum."""
+    """Return a mask of the images that contradict a group at its minimum."""
     k = clusters.score.shape[1]
     whole = _whole_picture(adjusted)
     limits = [
@@ -205,41 +207,42 @@ def _contradicting(
         (whole[:, 1:], 2),
         (np.eye(k)[:, k - len(SHEET) :], len(SHEET)),
     ]
-    wrong = np.zeros(len(group), dtype=np.bool_)
+    contradicts = np.zeros(len(group), dtype=np.bool_)
     for directions, dof in limits:
         limit = float(chdtri(dof, _SIGNIFICANCE))
-        wrong |= clusters.contradiction(group, ratio, directions) > limit
-    return wrong
+        contradicts |= clusters.contradiction(group, ratio, directions) > limit
+    return contradicts
 
 
 def _of_two_kinds(direction: Array, clusters: Clusters, group: BoolArray) -> BoolArray:
-    """Return which images of a group are the fewer ones of two kinds along a change (k,).
+    """Return a mask of the smaller of two clusters of a group along a change (k,).
 
-    Errors are judged with that change free in each image, so that these do not hide it.
+    The scatter is estimated with the change free in each image, so that the clusters do not
+    inflate it.
     """
-    others, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
+    minority, n = np.zeros(len(group), dtype=np.bool_), int(np.count_nonzero(group))
     if n < _FEW:
-        return others
-    left, change, own = clusters.choose(group).freed(direction)
-    weight = own / max(left.ratio(), 1.0)
+        return minority
+    freed, change, information = clusters.choose(group).freed(direction)
+    weight = information / max(freed.ratio(), 1.0)
     order = np.argsort(change)
     w, z = weight[order], change[order]
     mean = float(w @ z) / float(w.sum())
     spread = float(w @ (z - mean) ** 2)
     if spread < chdtri(n - 1, _SIGNIFICANCE):
-        return others
+        return minority
     low = np.cumsum(w)[:-1]
     between = np.cumsum(w * (z - mean))[:-1] ** 2 * (1.0 / low + 1.0 / (w.sum() - low))
     if between.max() < _TWO * spread:
-        return others
+        return minority
     cut = int(np.argmax(between)) + 1
     fewer = order[:cut] if cut <= n - cut else order[cut:]
-    others[np.flatnonzero(group)[fewer]] = True
-    return others
+    minority[np.flatnonzero(group)[fewer]] = True
+    return minority
 
 
 def _whole_picture(adjusted: AdjustedBoard) -> Array:
-    """Return changes (k, 3) of kept unknowns: the picture larger, moved along x and along y."""
+    """Return changes (k, 3) of the shared unknowns: scaling, and shifts along x and along y."""
     k = adjusted.clusters.score.shape[1]
     zoom = np.concatenate([intrinsic_values(adjusted.camera)[:2], np.zeros(k - 2)])
     return np.column_stack([zoom, np.eye(k)[:, 2:4]])
@@ -247,58 +250,61 @@ def _whole_picture(adjusted: AdjustedBoard) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fault:
-    """What may be the matter with an image."""
+    """A possible fault of an image."""
 
     n_unknowns: int
-    gain: float  # part of what is wrong with the image that it explains
-    change: Array  # (2,) of both focal lengths, as parts, or (shift) of the principal point [px]
+    gain: float  # share of the excess cost of the image that it explains
+    # (2,): relative change of both focal lengths, or shift of the principal point [px]
+    change: Array
 
 
-def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> dict[int, str]:
-    """Return what is the matter with images outside of a group, before the camera of the group."""
-    usual = float(np.median(_costs(adjusted, seen)[group]))
-    likely: dict[int, dict[str, _Fault]] = {}
+def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) -> dict[int, str]:
+    """Return the likeliest fault of each image outside of a group, in words."""
+    usual = float(np.median(_costs(adjusted, corners)[group]))
+    candidates: dict[int, dict[str, _Fault]] = {}
     for i in np.flatnonzero(~group).tolist():
-        faults = _faults(adjusted, seen, i, usual)
-        most = max(fault.gain for fault in faults.values())
-        likely[i] = {
+        faults = _faults(adjusted, corners, i, usual)
+        max_gain = max(fault.gain for fault in faults.values())
+        candidates[i] = {
             name: fault
             for name, fault in faults.items()
-            if fault.gain > max(_EXPLAINED, _ALMOST * most)
+            if fault.gain > max(_EXPLAINED, _ALMOST * max_gain)
         }
-    # The simplest; of equally simple ones that which would explain most images. What most images
-    # have in common is no unknown of each.
-    names = [name for faults in likely.values() for name in faults]
+    # The simplest fault wins; among equally simple ones, the most frequent. A change that most
+    # images share does not count as an unknown of each.
+    names = [name for faults in candidates.values() for name in faults]
     shared = {
-        name: _shared([f[name].change for f in likely.values() if name in f]) for name in names
+        name: _shared([f[name].change for f in candidates.values() if name in f]) for name in names
     }
 
     def complexity(i: int, name: str) -> tuple[int, int]:
-        fault = likely[i][name]
-        n_known = len(fault.change) if _near(fault.change, shared[name]) else 0
-        return fault.n_unknowns - n_known, -names.count(name)
+        fault = candidates[i][name]
+        n_shared = len(fault.change) if _near(fault.change, shared[name]) else 0
+        return fault.n_unknowns - n_shared, -names.count(name)
 
-    found = {i: min(faults, key=partial(complexity, i)) for i, faults in likely.items() if faults}
+    best_names = {
+        i: min(faults, key=partial(complexity, i)) for i, faults in candidates.items() if faults
+    }
     reasons = {}
-    for i in likely:
-        name = found.get(i, "")
-        alike = [likely[k][name].change for k, other in found.items() if other == name]
+    for i in candidates:
+        name = best_names.get(i, "")
+        equal = [candidates[k][name].change for k, other in best_names.items() if other == name]
         if name == "zoom":
-            longer = likely[i][name].change.mean() > 0.0
-            zooms = [change.mean() for change in alike if (change.mean() > 0.0) == longer]
+            longer = candidates[i][name].change.mean() > 0.0
+            zooms = [change.mean() for change in equal if (change.mean() > 0.0) == longer]
             reasons[i] = (
                 f"another zoom or focus, with a focal length about "
                 f"{100.0 * abs(np.median(zooms)):.2g} % {'longer' if longer else 'shorter'} than "
                 "in the others"
             )
         elif name == "stretch":
-            wider, higher = np.median(alike, axis=0)
+            wider, higher = np.median(equal, axis=0)
             reasons[i] = (
                 f"its picture is stretched, {100.0 * abs(wider - higher):.2g} % more "
                 f"{'along x' if wider > higher else 'along y'} than those of the others"
             )
         elif name == "shift":
-            x, y = np.rint(np.median(alike, axis=0)).astype(np.intp)
+            x, y = np.rint(np.median(equal, axis=0)).astype(np.intp)
             reasons[i] = (
                 f"its picture lies about ({x}, {y}) px beside that of the others, as with "
                 "stabilisation or another crop"
@@ -306,7 +312,7 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
         elif name:
             reasons[i] = _IN_WORDS[name]
         else:
-            rms = [adjusted.rms_px(which) for which in (seen.image == i, group[seen.image])]
+            rms = [adjusted.rms_px(mask) for mask in (corners.image == i, group[corners.image])]
             reasons[i] = (
                 f"its corners are {rms[0]:.2f} px off (rms) before the camera of the others, whose "
                 f"own are {rms[1]:.2f} px off"
@@ -315,14 +321,14 @@ def _reasons(adjusted: AdjustedBoard, seen: BoardImages, group: BoolArray) -> di
 
 
 def _shared(changes: Sequence[Array]) -> Array:
-    """Return the change (2,) that most of some images have in common; zero if there is none."""
+    """Return the change (2,) of the majority of images; zero without a majority."""
     middle = np.median(changes, axis=0)
     alike = sum(_near(change, middle) for change in changes)
     return np.asarray(middle if alike > max(_PAIR, len(changes) // 2) else np.zeros(2))
 
 
 def _near(change: Array, other: Array) -> bool:
-    """Say whether a change is another one, which is none if it is zero."""
+    """Return whether a change is about equal to another, nonzero one."""
     return bool(np.linalg.norm(change - other) < _ALIKE * np.linalg.norm(other))
 
 
@@ -337,29 +343,35 @@ _IN_WORDS = {
     "mirrored": "mirrored",
     "crop": "a part of the picture that was cut out and scaled",
     "lens": "another distortion of the lens than in the others, as where a program corrects it",
-    "sheet": "the board is bent otherwise in it than in the others",
-    "motion": "camera or board moved while its rows were read out, or stabilisation bent it",
+    "sheet": "the board is bent differently in it than in the others",
+    "motion": "camera or board moved during the readout of its rows, or stabilisation warped it",
 }
 
 
-def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) -> dict[str, _Fault]:
-    """Return what each fault explains of an image, of the usual cost of a degree of freedom."""
-    camera, T, own = adjusted.camera, adjusted.T_camera_board[i], seen.image == i
-    points, sheet = seen.points[own], adjusted.sheet or Sheet.flat(seen.points)
+def _faults(
+    adjusted: AdjustedBoard, corners: BoardImages, i: int, usual: float
+) -> dict[str, _Fault]:
+    """Return the possible faults of an image, given the usual cost of a degree of freedom."""
+    camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], corners.image == i
+    points, sheet = corners.points[of_image], adjusted.sheet or Sheet.flat(corners.points)
     only = np.zeros(len(points), dtype=np.intp)
-    image = BoardImages(only, sheet.placed(points)[0], seen.px[own], seen.sigma_px[own])
+    image = BoardImages(
+        only, sheet.placed(points)[0], corners.px[of_image], corners.sigma_px[of_image]
+    )
     plain = adjust_board(camera, [T], image)
     if plain is None:
         return {"motion": _Fault(0, 0.0, np.zeros(2))}
-    wrong = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
-    fine = max(_NEGLIGIBLE * wrong, COST_TOLERANCE)
+    excess = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
+    tolerance = max(_NEGLIGIBLE * excess, COST_TOLERANCE)
 
-    def fault(n_unknowns: int, found: AdjustedBoard | None, change: Array | None = None) -> _Fault:
-        gain = 0.0 if found is None else (plain.cost - found.cost) / wrong
+    def fault(
+        n_unknowns: int, variant: AdjustedBoard | None, change: Array | None = None
+    ) -> _Fault:
+        gain = 0.0 if variant is None else (plain.cost - variant.cost) / excess
         return _Fault(n_unknowns, gain, np.zeros(2) if change is None else change)
 
     faults = {}
-    # The image turned or mirrored back shows the board so, numbered as if it were mirrored.
+    # Undo the rotation or mirroring of the image; corner numbers are those of the mirrored board.
     far = np.array([camera.width - 1.0, camera.height - 1.0])
     for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
         side = np.array(sides)
@@ -370,37 +382,39 @@ def _faults(adjusted: AdjustedBoard, seen: BoardImages, i: int, usual: float) ->
         pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
         px = np.where(side[:2] < 0.0, far - image.px, image.px)
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=fine))
+        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
-        found = adjust_board(camera, [T], image, free, tolerance=fine)
+        variant = adjust_board(camera, [T], image, free, tolerance=tolerance)
         change = np.zeros(2)
-        if found is not None and name == "shift":
-            change = found.camera.K[:2, 2] - camera.K[:2, 2]
-        elif found is not None:
-            change = np.diag(found.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
-        both = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
-        if name == "crop" and not both:
+        if variant is not None and name == "shift":
+            change = variant.camera.K[:2, 2] - camera.K[:2, 2]
+        elif variant is not None:
+            change = np.diag(variant.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
+        is_uniform = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
+        if name == "crop" and not is_uniform:
             continue
-        faults["stretch" if name == "zoom" and not both else name] = fault(len(free), found, change)
-    bent = adjust_board(camera, [T], image, (), Sheet.flat(seen.points), tolerance=fine)
+        faults["stretch" if name == "zoom" and not is_uniform else name] = fault(
+            len(free), variant, change
+        )
+    bent = adjust_board(camera, [T], image, (), Sheet.flat(corners.points), tolerance=tolerance)
     faults["sheet"] = fault(4, bent)
-    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / wrong, np.zeros(2))
+    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / excess, np.zeros(2))
     return faults
 
 
-def _gain_of_motion(adjusted: AdjustedBoard, seen: BoardImages) -> float:
-    """Return by how much a motion of the board from row to row lowers the cost of one image."""
+def _gain_of_motion(adjusted: AdjustedBoard, corners: BoardImages) -> float:
+    """Return the reduction of the cost of an image by a motion of the board during readout."""
     T = adjusted.T_camera_board[0]
-    arm = T.rotation.apply(seen.points)
+    arm = T.rotation.apply(corners.points)
     _, by_point = adjusted.camera.project_with_derivative(arm + T.translation)
     by_pose = np.concatenate([np.cross(arm[:, None, :], by_point), by_point], axis=-1)
-    row = seen.px[:, 1] - seen.px[:, 1].mean()
+    row = corners.px[:, 1] - corners.px[:, 1].mean()
     J = np.concatenate([by_pose, by_pose * row[:, None, None]], axis=-1)
-    J = J / seen.sigma_px[:, None, None]
+    J = J / corners.sigma_px[:, None, None]
     J = J / np.maximum(np.linalg.norm(J, axis=(0, 1)), 1e-300)
-    r = left = adjusted.residual / seen.sigma_px[:, None]
+    r = remaining = adjusted.residual / corners.sigma_px[:, None]
     for _ in range(_ROUNDS):
-        _, weighted = LOSS.softened(left, np.concatenate([J, r[..., None]], axis=-1))
+        _, weighted = LOSS.softened(remaining, np.concatenate([J, r[..., None]], axis=-1))
         rows = weighted.reshape(-1, weighted.shape[-1])
-        left = r - J @ np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
-    return LOSS.cost(np.sum(r * r, axis=1)) - LOSS.cost(np.sum(left * left, axis=1))
+        remaining = r - J @ np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
+    return LOSS.cost(np.sum(r * r, axis=1)) - LOSS.cost(np.sum(remaining * remaining, axis=1))

@@ -1,4 +1,4 @@
-"""What images of a board determine of a camera: refused where it is too little, else warnings."""
+"""Checks of a calibrated camera: refusals if the images do not determine it, else warnings."""
 
 from __future__ import annotations
 
@@ -17,62 +17,60 @@ from legcal.perception.board_adjustment import SHEET, adjust_board
 from legcal.vision.camera import Camera, intrinsic_names
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
-_MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # as parts of the focal length
+_MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # relative to the focal length
 _MIN_TILT, _MIN_SPREAD = np.radians(15.0), np.radians(20.0)
 _MIN_COVERAGE = 0.5
-_MAX_RIVAL = 2.0 / 3.0  # of the images that agree, those that agree on another camera
+_MAX_RIVAL = 2.0 / 3.0  # largest size of the second group of images, relative to the first
 _LARGE_RESIDUAL_PX = 1.0
-_MANY_LEFT_OUT = 0.05  # of all corners
-_OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
+_MANY_LEFT_OUT = 0.05  # share of corners left out that is worth a warning
+_OVERFIT = 0.01  # significance level of the gain by more coefficients
 _FOLDED_PX = 0.1
-_MAX_RATIO = 25.0  # of squared errors to what corners scatter
+_MAX_RATIO = 25.0  # largest ratio of squared errors to the scatter of corners
 _MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
 _MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
 _SIGNIFICANT = 4.0  # standard deviations
-_OPEN_PRIOR = 0.5  # part of the prior of the print ratio that is left where images say little
-_IMAGES_OF_PART = 2  # that show corners in a part of the image
+_OPEN_PRIOR = 0.5  # sigma of an undetermined print ratio, relative to its prior
+_IMAGES_OF_PART = 2  # images with corners in a covered part of the image
 _PARTS = (
     "the top left", "the top", "the top right", "the left", "the middle", "the right",
     "the bottom left", "the bottom", "the bottom right",
 )  # fmt: skip
 
 
-def tilts(found: RobustFit) -> Array:
+def tilts(fit: RobustFit) -> Array:
     """Return the angle of each board out of the image plane, (n_images,) [rad]."""
-    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in fit.adjusted.T_camera_board])
     return np.asarray(np.arccos(np.clip(np.abs(normal[:, 2]), 0.0, 1.0)))
 
 
-def spread(found: RobustFit) -> float:
+def spread(fit: RobustFit) -> float:
     """Return the largest angle between two boards' planes [rad]."""
-    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in fit.adjusted.T_camera_board])
     return float(np.arccos(np.clip(np.abs(normal @ normal.T), 0.0, 1.0).min()))
 
 
-def coverage(found: RobustFit) -> float:
+def coverage(fit: RobustFit) -> float:
     """Return the share of the image inside the convex hull of all corners."""
-    hull = cv2.convexHull(found.seen.px.astype(np.float32))
-    camera = found.adjusted.camera
+    hull = cv2.convexHull(fit.corners.px.astype(np.float32))
+    camera = fit.adjusted.camera
     return float(cv2.contourArea(hull)) / (camera.width * camera.height)
 
 
-def refuse_undetermined(
-    found: RobustFit, names: Sequence[str], left_out: Sequence[str] = ()
-) -> None:
+def refuse_undetermined(fit: RobustFit, names: Sequence[str], left_out: Sequence[str] = ()) -> None:
     """Raise NotIdentifiable if the images do not determine the camera."""
-    n = len(found.images)
+    n = len(fit.images)
     if n < MIN_IMAGES:
         raise too_few_images(n, names, left_out)
-    camera = found.adjusted.camera
+    camera = fit.adjusted.camera
     f = float(camera.K[0, 0])
-    sigma = float(np.sqrt(found.covariance[0, 0]))
+    sigma = float(np.sqrt(fit.covariance[0, 0]))
     if not sigma <= _MAX_FOCAL_SIGMA * f:
         raise NotIdentifiable(
             f"The camera could not be calibrated: found boards tilted by at most "
-            f"{np.degrees(tilts(found).max()):.0f} deg out of the image plane and at most "
-            f"{np.degrees(spread(found)):.0f} deg to each other, which leave the focal length open "
+            f"{np.degrees(tilts(fit).max()):.0f} deg out of the image plane and at most "
+            f"{np.degrees(spread(fit)):.0f} deg to each other, which leave the focal length open "
             f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
-            f"board by 30 deg and more{_missing_tilts(found)}."
+            f"board by 30 deg and more{_missing_tilts(fit)}."
         )
     centre = camera.K[:2, 2]
     if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
@@ -83,27 +81,28 @@ def refuse_undetermined(
         )
 
 
-def refuse_divided(found: RobustFit, names: Sequence[str]) -> None:
-    """Raise NotIdentifiable if no group of images is clearly the largest that agrees.
+def refuse_divided(fit: RobustFit, names: Sequence[str]) -> None:
+    """Raise NotIdentifiable if no group of agreeing images is clearly the largest.
 
-    *names* are those of all images that were fitted.
+    *names* are the names of all images that were fitted.
     """
-    own, rival = ([names[k] for k in images] for images in (found.images, found.rival))
-    if len(rival) > _MAX_RIVAL * len(own):
-        whys = [found.left_out[k] for k in found.rival]
-        why = max(set(whys), key=whys.count)
+    largest, rival = ([names[k] for k in images] for images in (fit.images, fit.rival))
+    if len(rival) > _MAX_RIVAL * len(largest):
+        reasons = [fit.left_out[k] for k in fit.rival]
+        reason = max(set(reasons), key=reasons.count)
         raise NotIdentifiable(
             "The camera could not be calibrated: found two groups of images that each agree on "
-            f"another camera, {few(own)} and {few(rival)} (the second: {why}), needed one camera; "
-            "give only the images of one group, with zoom, focus and stabilisation off."
+            f"another camera, {few(largest)} and {few(rival)} (the second: {reason}), needed one "
+            "camera; give only the images of one group, with zoom, focus and stabilisation off."
         )
-    n_others = len(found.left_out)
-    if n_others > len(own):
-        whys = sorted({f"{names[k]}: {why}" for k, why in found.left_out.items()})
+    n_others = len(fit.left_out)
+    if n_others > len(largest):
+        reasons = sorted({f"{names[k]}: {reason}" for k, reason in fit.left_out.items()})
         raise NotIdentifiable(
-            f"The camera could not be calibrated: found that only {len(own)} of "
-            f"{len(own) + n_others} images agree on a camera ({few(own)}; {few(whys)}), needed "
-            "more than half; take them again, the board still, and zoom, focus, stabilisation off."
+            f"The camera could not be calibrated: found that only {len(largest)} of "
+            f"{len(largest) + n_others} images agree on a camera ({few(largest)}; {few(reasons)}), "
+            "needed more than half; take them again, the board still, and zoom, focus, "
+            "stabilisation off."
         )
 
 
@@ -113,54 +112,56 @@ def too_few_images(
     left_out: Sequence[str] = (),
     copies: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> NotIdentifiable:
-    """Return the refusal of so few images with the board, saying why others were left out.
+    """Return the error for too few images, with the reasons for leaving others out.
 
-    *copies* are the names of images that show what one of these shows, by which.
+    *copies* are the names of redundant images by reason.
     """
-    found = f"{n} images" if n != 1 else "1 image"
-    which = f" ({', '.join(names)})" if names else ""
-    others, mend = "", ""
+    count = f"{n} images" if n != 1 else "1 image"
+    listed = f" ({', '.join(names)})" if names else ""
+    others, hint = "", ""
     if left_out:
         reasons = "; ".join(left_out)
-        others = f" that agree{which}, and {len(left_out)} more that had to be left out ({reasons})"
-        mend = "see that the board is flat and does not move while it is photographed, and "
+        others = (
+            f" that agree{listed}, and {len(left_out)} more that had to be left out ({reasons})"
+        )
+        hint = "see that the board is flat and does not move while it is photographed, and "
     elif copies:
-        reasons = "; ".join(f"{few(same)}: {why}" for why, same in copies.items())
+        reasons = "; ".join(f"{few(same_names)}: {reason}" for reason, same_names in copies.items())
         n_more = sum(map(len, copies.values()))
-        others = f"{which}, and {n_more} more that show the same ({reasons})"
+        others = f"{listed}, and {n_more} more that show the same ({reasons})"
     return NotIdentifiable(
-        f"The camera could not be calibrated: found {found} with the board{others or which}, "
-        f"needed {MIN_IMAGES} at least and better {_FEW_IMAGES}; {mend}take more, with the "
+        f"The camera could not be calibrated: found {count} with the board{others or listed}, "
+        f"needed {MIN_IMAGES} at least and better {_FEW_IMAGES}; {hint}take more, with the "
         "board tilted to all sides."
     )
 
 
-def warnings(found: RobustFit) -> list[str]:
-    """Return what is wrong with a camera that can be used, one sentence each."""
-    n, camera = len(found.images), found.adjusted.camera
-    sigma = np.sqrt(np.diag(found.covariance))
+def warnings(fit: RobustFit) -> list[str]:
+    """Return the warnings about a usable camera, one sentence each."""
+    n, camera = len(fit.images), fit.adjusted.camera
+    sigma = np.sqrt(np.diag(fit.covariance))
     sentences = []
     if n < _FEW_IMAGES:
         sentences.append(
             f"{n} images are few: the standard deviations themselves are uncertain; take "
             f"{_FEW_IMAGES} or more."
         )
-    tilt, apart = float(tilts(found).max()), spread(found)
+    tilt, largest_angle = float(tilts(fit).max()), spread(fit)
     focal = float(sigma[0] / camera.K[0, 0])
-    if tilt < _MIN_TILT or apart < _MIN_SPREAD or focal > _WEAK_FOCAL_SIGMA:
+    if tilt < _MIN_TILT or largest_angle < _MIN_SPREAD or focal > _WEAK_FOCAL_SIGMA:
         sentences.append(
             f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
             f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
-            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more"
-            f"{_missing_tilts(found)}."
+            f"and {np.degrees(largest_angle):.0f} deg to each other; tilt them by 30 deg and more"
+            f"{_missing_tilts(fit)}."
         )
-    covered = coverage(found)
+    covered = coverage(fit)
     if covered < _MIN_COVERAGE:
         sentences.append(
-            f"Corners cover {100.0 * covered:.0f} % of the image: what the lens does outside is "
-            f"extrapolated; bring the board to {_unseen_parts(found)} of the image."
+            f"Corners cover {100.0 * covered:.0f} % of the image: the distortion outside is "
+            f"extrapolated; bring the board to {_uncovered_parts(fit)} of the image."
         )
-    sentences += _sheet(found)
+    sentences += _sheet(fit)
     ratio = float(camera.K[1, 1] / camera.K[0, 0] - 1.0)
     error = float(np.hypot(sigma[0], sigma[1])) / camera.K[0, 0]
     if abs(ratio) > _MAX_PIXEL_RATIO and abs(ratio) > _SIGNIFICANT * error:
@@ -170,35 +171,35 @@ def warnings(found: RobustFit) -> list[str]:
             "or the proportions of the board are wrong; take the files as the camera writes them, "
             "and measure the board."
         )
-    if found.ratio > _MAX_RATIO:
+    if fit.ratio > _MAX_RATIO:
         sentences.append(
-            f"Images disagree on the camera {np.sqrt(found.ratio):.0f} times as much as corners "
+            f"Images disagree on the camera {np.sqrt(fit.ratio):.0f} times as much as corners "
             "scatter, which the standard deviations count: zoom, focus or stabilisation change, or "
             "the board moves or bends; switch these off, and lay the board on something flat."
         )
     sentences += _folding(camera)
-    sentences += _overfit(found)
-    rms = found.adjusted.rms_px()
+    sentences += _overfit(fit)
+    rms = fit.adjusted.rms_px()
     if rms > _LARGE_RESIDUAL_PX:
         sentences.append(
             f"The residuals are large, {rms:.2f} px (rms): the board is bent, its dimensions are "
             "wrong, or the model of the lens does not fit."
         )
-    n_all = found.n_left_out + len(found.seen.px)
-    if found.n_left_out > _MANY_LEFT_OUT * n_all:
+    n_all = fit.n_left_out + len(fit.corners.px)
+    if fit.n_left_out > _MANY_LEFT_OUT * n_all:
         sentences.append(
-            f"{found.n_left_out} of {n_all} corners disagree with the others and were left out; "
+            f"{fit.n_left_out} of {n_all} corners disagree with the others and were left out; "
             "see that the board is flat, sharp and evenly lit."
         )
     return sentences
 
 
-def _sheet(found: RobustFit) -> list[str]:
-    """Return warnings of a board that is not what was stated, or of which too little is known."""
-    sheet = found.adjusted.sheet
+def _sheet(fit: RobustFit) -> list[str]:
+    """Return warnings about a board that differs from the stated one or is poorly determined."""
+    sheet = fit.adjusted.sheet
     if sheet is None:
         return []
-    sigma = np.sqrt(np.diag(found.all_covariance)[-len(SHEET) :])
+    sigma = np.sqrt(np.diag(fit.all_covariance)[-len(SHEET) :])
     side, ratio = 2.0 * float(sheet.half.max()), float(sheet.numbers[3])
     sentences = []
     if abs(ratio) > _MAX_PRINT_RATIO and abs(ratio) > _SIGNIFICANT * sigma[3]:
@@ -217,26 +218,26 @@ def _sheet(found: RobustFit) -> list[str]:
         )
     if sigma[3] > _OPEN_PRIOR * sheet.prior_sigma[3]:
         sentences.append(
-            f"Whether squares are square is open to {100.0 * sigma[3]:.2g} %, and with it fx over "
-            "fy: turn the board by a quarter in some images."
+            f"The aspect ratio of the squares, and with it fx / fy, is determined only to "
+            f"{100.0 * sigma[3]:.2g} %: turn the board by a quarter in some images."
         )
     return sentences
 
 
-def _unseen_parts(found: RobustFit) -> str:
-    """Return the parts of the image where few corners were seen."""
-    camera = found.adjusted.camera
-    part = np.floor(3.0 * (found.seen.px + 0.5) / [camera.width, camera.height]).astype(np.intp)
+def _uncovered_parts(fit: RobustFit) -> str:
+    """Return the names of the parts of the image with few corners."""
+    camera = fit.adjusted.camera
+    part = np.floor(3.0 * (fit.corners.px + 0.5) / [camera.width, camera.height]).astype(np.intp)
     number = np.clip(part, 0, 2) @ [1, 3]
-    images = [len(set(found.seen.image[number == k].tolist())) for k in range(9)]
+    images = [len(set(fit.corners.image[number == k].tolist())) for k in range(9)]
     unseen = [name for name, n in zip(_PARTS, images, strict=True) if n < _IMAGES_OF_PART]
     return ", ".join(unseen) or "every edge and corner"
 
 
-def _missing_tilts(found: RobustFit) -> str:
-    """Return to which sides boards were not tilted, as the end of a sentence; "" if to all."""
-    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
-    towards = -normal * np.sign(normal[:, 2:])  # the side that is seen
+def _missing_tilts(fit: RobustFit) -> str:
+    """Return the directions without tilted boards, as the end of a sentence; "" without any."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in fit.adjusted.T_camera_board])
+    towards = -normal * np.sign(normal[:, 2:])  # normal towards the camera
     slant = np.degrees(np.arctan2(towards[:, :2], -towards[:, 2:]))
     least = float(np.degrees(_MIN_TILT))
     farther = {
@@ -254,8 +255,8 @@ def _folding(camera: Camera) -> list[str]:
     w, h = camera.width - 1.0, camera.height - 1.0
     corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
     back = camera.distort(camera.undistort(corners))
-    off = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
-    if off < _FOLDED_PX:
+    error = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
+    if error < _FOLDED_PX:
         return []
     return [
         "The lens model folds back before the corners of the image, where no board was seen: "
@@ -263,19 +264,19 @@ def _folding(camera: Camera) -> list[str]:
     ]
 
 
-def _overfit(found: RobustFit) -> list[str]:
-    """Return a warning if the three more coefficients of the rational model gain nothing."""
-    full = found.adjusted
+def _overfit(fit: RobustFit) -> list[str]:
+    """Return a warning if the three further coefficients of the rational model gain nothing."""
+    full = fit.adjusted
     if full.camera.model != "rational_polynomial":
         return []
     simple = [name for name in intrinsic_names(full.camera) if name not in ("k4", "k5", "k6")]
     zeroed = full.camera.distortion.copy()
     zeroed[5:] = 0.0
     start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
-    plain = adjust_board(start, full.T_camera_board, found.seen, simple, full.sheet)
+    plain = adjust_board(start, full.T_camera_board, fit.corners, simple, full.sheet)
     if plain is None:
         return []
-    dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)
+    dof = 2 * len(fit.corners.px) - len(full.covariance) - 6 * len(fit.images)
     gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
     if gain > 0.0 and fdtrc(3, max(dof, 1), gain) < _OVERFIT:
         return []

@@ -21,28 +21,28 @@ from legcal.vision.camera_file import CALIBRATED, camera_info
 CAMERA_FILE = OutputFile(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
 )
-_DIGITS = 6  # of figures that describe the calibration
+_DIGITS = 6  # significant digits of the diagnostics
 
 
 @dataclass(frozen=True)
 class ImageResult:
-    """What an image gave.
+    """Corners, residuals and board tilt of an image.
 
     Attributes
     ----------
     name : str
-        Its file.
+        Name of the file.
     corners : int
         Number of corners of the board that were found.
     used : int
         Number of corners that were used.
     rms_px : float or None
-        Root mean square of their residuals, both coordinates together [px]; None if the image
-        was left out.
+        Root mean square of the residuals, both coordinates together [px]; None if the image was
+        left out.
     tilt : float or None
         Tilt of the board out of the image plane [rad].
     reason : str
-        Why it was left out, "" if it was not.
+        Reason for leaving the image out; "" if it was used.
     """
 
     name: str
@@ -65,9 +65,9 @@ class CameraCalibration:
     covariance : (k, k) array
         Covariance of its intrinsics, in the order of ``names`` [px, and without unit].
     board : Board
-        The board that it was calibrated with.
+        The calibration board.
     images : tuple of ImageResult
-        All images, in their order.
+        All images in the given order.
     rms_px : float
         Root mean square of the residuals, both coordinates together [px].
     noise_px : float
@@ -75,23 +75,22 @@ class CameraCalibration:
     coverage : float
         Share of the image inside the convex hull of all corners.
     warnings : tuple of str
-        What is wrong with it, one sentence each.
+        Warnings, one sentence each.
     sheet : (4,) array
-        How the board is bent along x and y, twisted [m], and how much wider it is printed.
+        Bending of the board along x and y and its twist [m], relative excess width of the print.
     sheet_covariance : (4, 4) array
-        Covariance of these.
+        Covariance of ``sheet``.
     error_ratio : float
-        Errors that images disagree by, or residuals, over what corners claim.
+        Ratio of the errors, by residuals or by disagreement of images, to the claimed sigmas.
     lens : str
-        The lens model, and why it was taken.
+        The lens model, and the reason for choosing it.
     validated_px : float or None
-        Root mean square of residuals of images that the camera was not calibrated with [px]; None
-        if there are fewer than four images.
+        Root mean square of the residuals of held-out images in cross-validation [px]; None with
+        fewer than four images.
     corners : (n, 4) array
-        Where corners that were used were seen, and their residuals [px].
+        Pixels and residuals of the used corners [px].
     photographs : mapping
-        What the files of the used images say of how they were made: the distinct values of each
-        fact, by its key in the camera file.
+        Metadata of the used image files: distinct values by key of the camera file.
     """
 
     camera: Camera
@@ -112,17 +111,17 @@ class CameraCalibration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the numbers: ``fx fy cx cy``, then the distortion in OpenCV's order."""
+        """Names of the intrinsics: ``fx fy cx cy``, then the distortion in OpenCV's order."""
         return intrinsic_names(self.camera)
 
     @property
     def values(self) -> Array:
-        """The numbers, (k,) [px, and without unit]."""
+        """The intrinsics, (k,) [px, and without unit]."""
         return intrinsic_values(self.camera)
 
     @property
     def sigma(self) -> Array:
-        """Their standard deviations, (k,) [px, and without unit]."""
+        """Standard deviations of the intrinsics, (k,) [px, and without unit]."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -131,7 +130,7 @@ class CameraCalibration:
         return np.sqrt(np.diag(self.sheet_covariance))
 
     def document(self) -> dict[str, Any]:
-        """Return what ``--json`` prints."""
+        """Return the output of ``--json``."""
         sheet = zip(SHEET, self.sheet.tolist(), self.sheet_sigma.tolist(), strict=True)
         numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
         return CameraDocument(
@@ -172,7 +171,7 @@ class Intrinsic(Document):
 
 
 class BoardImage(Document):
-    """What an image gave."""
+    """Corners, residuals and board tilt of an image."""
 
     image: str
     corners: int
@@ -183,7 +182,7 @@ class BoardImage(Document):
 
 
 class CameraDocument(Document):
-    """What ``legcal camera --json`` prints."""
+    """The output of ``legcal camera --json``."""
 
     legcal_camera: int
     model: str

@@ -1,4 +1,4 @@
-"""A picture of a calibration: where corners were seen, and how residuals lean over the field."""
+"""A picture of a calibration: the corners and their mean residuals over the field."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.files.folder import OutputFile
 
 _LONGER = 1280  # side of the picture [px]
-_CELLS = 16  # along it
-_ARROW = 0.45  # of a cell: the longest arrow
-_LEAST_ARROW = 3  # corners of a cell whose mean residual is drawn
+_CELLS = 16  # cells along the longer side
+_ARROW = 0.45  # length of the longest arrow, relative to a cell
+_LEAST_ARROW = 3  # smallest number of corners of a cell with an arrow
 _LETTER = 0.55  # scale of letters
 _DARK, _WHITE, _EMPTY = (32, 32, 32), (255, 255, 255), (60, 60, 140)
 _SEEN, _RESIDUAL, _CENTRE = (90, 120, 60), (0, 225, 255), (255, 170, 40)  # blue, green, red
@@ -48,14 +48,14 @@ def write_picture(calibration: CameraCalibration, path: Path) -> None:
 
 
 def picture(calibration: CameraCalibration) -> Canvas:
-    """Return the picture: cells by how many corners were seen, arrows of mean residuals, BGR."""
+    """Return the picture (BGR): cells coloured by number of corners, arrows of mean residuals."""
     camera = calibration.camera
     factor = _LONGER / max(camera.width, camera.height)
     side = _LONGER / _CELLS
     width, height = (round(factor * n) for n in (camera.width, camera.height))
-    shown = np.full((height, width, 3), _DARK, dtype=np.uint8)
-    at = (calibration.corners[:, :2] + 0.5) * factor
-    cell = np.floor(at / side).astype(np.intp)
+    canvas = np.full((height, width, 3), _DARK, dtype=np.uint8)
+    points = (calibration.corners[:, :2] + 0.5) * factor
+    cell = np.floor(points / side).astype(np.intp)
     shape = int(np.ceil(height / side)), int(np.ceil(width / side))
     index = np.clip(cell[:, 1], 0, shape[0] - 1) * shape[1] + np.clip(cell[:, 0], 0, shape[1] - 1)
     count = np.bincount(index, minlength=shape[0] * shape[1])
@@ -73,9 +73,9 @@ def picture(calibration: CameraCalibration) -> Canvas:
         high = min(round((x + 1) * side), width) - 1, min(round((y + 1) * side), height) - 1
         share = 0.25 + 0.75 * min(count[k] / full, 1.0)
         colour = _EMPTY if not count[k] else tuple(int(share * c) for c in _SEEN)
-        cv2.rectangle(shown, low, high, colour, -1)
-    for point in at:
-        cv2.circle(shown, tuple(np.rint(point).astype(int).tolist()), 1, (150, 180, 130), -1)
+        cv2.rectangle(canvas, low, high, colour, -1)
+    for point in points:
+        cv2.circle(canvas, tuple(np.rint(point).astype(int).tolist()), 1, (150, 180, 130), -1)
     for drawn in np.flatnonzero(enough).tolist():
         y, x = divmod(drawn, shape[1])
         middle = (np.array([x, y]) + 0.5) * side
@@ -83,20 +83,22 @@ def picture(calibration: CameraCalibration) -> Canvas:
             tuple(np.rint(p).astype(int).tolist())
             for p in (middle - scale * mean[drawn], middle + scale * mean[drawn])
         )
-        cv2.arrowedLine(shown, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
+        cv2.arrowedLine(canvas, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
     centre = tuple(np.rint((camera.K[:2, 2] + 0.5) * factor).astype(int).tolist())
-    cv2.drawMarker(shown, centre, _CENTRE, cv2.MARKER_CROSS, 24, 2, cv2.LINE_AA)
-    unseen = calibration.validated_px
+    cv2.drawMarker(canvas, centre, _CENTRE, cv2.MARKER_CROSS, 24, 2, cv2.LINE_AA)
+    validated_px = calibration.validated_px
     lines = (
-        f"{camera.model}, {len(at)} corners, {calibration.rms_px:.3f} px off (rms)"
-        + ("" if unseen is None else f", {unseen:.3f} px in images left out"),
+        f"{camera.model}, {len(points)} corners, {calibration.rms_px:.3f} px off (rms)"
+        + ("" if validated_px is None else f", {validated_px:.3f} px in images left out"),
         f"arrows: mean residual of a cell, the longest {longest:.3f} px; green: corners, brighter "
         "where more; red: none; cross: principal point",
     )
     legend = np.full((62, width, 3), _DARK, dtype=np.uint8)
     for row, line in enumerate(lines):
         (w, _), _ = cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, _LETTER, 1)
-        fit = _LETTER * min(1.0, (width - 20) / w)
-        where = (10, 24 + 26 * row)
-        cv2.putText(legend, line, where, cv2.FONT_HERSHEY_SIMPLEX, fit, _WHITE, 1, cv2.LINE_AA)
-    return np.vstack([shown, legend])
+        letter_scale = _LETTER * min(1.0, (width - 20) / w)
+        origin = (10, 24 + 26 * row)
+        cv2.putText(
+            legend, line, origin, cv2.FONT_HERSHEY_SIMPLEX, letter_scale, _WHITE, 1, cv2.LINE_AA
+        )
+    return np.vstack([canvas, legend])

@@ -1,4 +1,4 @@
-"""Adjustments of a camera and a board to corners: from scratch, and from one nearby."""
+"""Adjustments of a camera and a board to corners: from scratch, and from a nearby adjustment."""
 
 from __future__ import annotations
 
@@ -17,99 +17,99 @@ from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize, quiet_opencv
 
-_FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
+_FOCAL_LENGTHS = (0.25, 4.0, 13)  # smallest and largest, relative to the longer side; number
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
 _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
 
 
 def from_scratch(
-    seen: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> AdjustedBoard | None:
-    """Return the adjustment from where a camera is roughly right, None if none succeeds."""
-    start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(seen, size, model)
-    start = start or _by_straight_lines(seen, size, model)
+    """Return the adjustment without a start; None if no start or adjustment succeeds."""
+    start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(corners, size, model)
+    start = start or _by_straight_lines(corners, size, model)
     if start is None:
         return None
-    rough = adjust_board(*start, seen, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
+    rough = adjust_board(*start, corners, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
     if rough is None:
         return None
-    return _all_adjusted(rough.camera, rough.T_camera_board, Sheet.flat(seen.points), seen)
+    return _all_adjusted(rough.camera, rough.T_camera_board, Sheet.flat(corners.points), corners)
 
 
 def _all_adjusted(
-    camera: Camera, poses: Sequence[RigidTransform], sheet: Sheet, seen: BoardImages
+    camera: Camera, poses: Sequence[RigidTransform], sheet: Sheet, corners: BoardImages
 ) -> AdjustedBoard | None:
     """Return the adjustment of poses, all intrinsics and the sheet from a start."""
-    return adjust_board(camera, poses, seen, intrinsic_names(camera), sheet)
+    return adjust_board(camera, poses, corners, intrinsic_names(camera), sheet)
 
 
-def again(
-    near: AdjustedBoard, poses: Sequence[RigidTransform], seen: BoardImages
+def readjust(
+    near: AdjustedBoard, poses: Sequence[RigidTransform], corners: BoardImages
 ) -> AdjustedBoard | None:
-    """Return the adjustment of other corners, from one nearby."""
-    sheet = near.sheet or Sheet.flat(seen.points)
-    return _all_adjusted(near.camera, poses, sheet, seen)
+    """Return the adjustment to other corners from a nearby one."""
+    sheet = near.sheet or Sheet.flat(corners.points)
+    return _all_adjusted(near.camera, poses, sheet, corners)
 
 
 def _by_straight_lines(
-    seen: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the camera without distortion before which boards are flattest, of several."""
+    """Return the distortion-free camera and poses with the flattest boards, by grid search."""
     no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
     cameras = []
     for part in np.geomspace(*_FOCAL_LENGTHS).tolist():
         K = _matrix(part, size)
         cameras.append(Camera(K, size.width, size.height, no_distortion, model))
-    best = min(cameras, key=lambda camera: _non_flatness(camera, seen))
+    best = min(cameras, key=lambda camera: _non_flatness(camera, corners))
     poses = []
-    for a, b in pairwise(_bounds(seen)):
-        found = plane_poses(best, seen.points[a:b], seen.px[a:b], np.ones(b - a))
-        if not found:
+    for a, b in pairwise(_bounds(corners)):
+        candidates = plane_poses(best, corners.points[a:b], corners.px[a:b], np.ones(b - a))
+        if not candidates:
             return None
-        poses.append(found[0].T_camera_plane)
+        poses.append(candidates[0].T_camera_plane)
     return best, poses
 
 
 def _matrix(part: float, size: ImageSize) -> Array:
-    """Return the matrix of a camera (3, 3) whose focal length is a part of the longer side."""
+    """Return a camera matrix (3, 3) with a focal length relative to the longer side."""
     f = part * max(size.width, size.height)
     u, v = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
     return np.array([[f, 0.0, u], [0.0, f, v], [0.0, 0.0, 1.0]])
 
 
-def _non_flatness(camera: Camera, seen: BoardImages) -> float:
-    """Return how far the corners of boards are from any plane before a camera (rms) [px]."""
-    angle = np.linalg.norm(seen.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
+def _non_flatness(camera: Camera, corners: BoardImages) -> float:
+    """Return the rms residual of the corners from the best homography of each board [px]."""
+    angle = np.linalg.norm(corners.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
     if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _MAX_ANGLE:
         return np.inf
-    xy = camera.undistort(seen.px)
-    off = []
-    for a, b in pairwise(_bounds(seen)):
-        board = seen.points[a:b, :2]
+    xy = camera.undistort(corners.px)
+    residuals = []
+    for a, b in pairwise(_bounds(corners)):
+        board = corners.points[a:b, :2]
         H, _ = cv2.findHomography(board, xy[a:b])
         if H is None:
             return np.inf
         flat = np.column_stack([board, np.ones(b - a)]) @ np.asarray(H, dtype=np.float64).T
-        off.append(camera.distort(flat[:, :2] / flat[:, 2:]) - seen.px[a:b])
-    return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+        residuals.append(camera.distort(flat[:, :2] / flat[:, 2:]) - corners.px[a:b])
+    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
 
 
-def _bounds(seen: BoardImages) -> IntArray:
-    """Return where the corners of each image begin, and where those of the last one end."""
-    return np.searchsorted(seen.image, np.arange(seen.image[-1] + 2))
+def _bounds(corners: BoardImages) -> IntArray:
+    """Return the index of the first corner of each image, and the number of corners."""
+    return np.searchsorted(corners.image, np.arange(corners.image[-1] + 2))
 
 
 def _by_opencv(
-    seen: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the camera that OpenCV calibrates, with two coefficients of distortion.
+    """Return OpenCV's calibration with two coefficients of distortion.
 
-    Boards that are tilted alike leave its own first guess of the focal length open, so that it is
-    asked again with a usual one; the answer with the smaller residuals is taken.
+    OpenCV's own start fails for boards with similar tilts, so a usual focal length is tried as
+    well; the answer with the smaller residuals is taken.
     """
-    pieces = list(pairwise(_bounds(seen)))
-    points = [seen.points[a:b].astype(np.float32) for a, b in pieces]
-    px = [seen.px[a:b].astype(np.float32) for a, b in pieces]
+    pieces = list(pairwise(_bounds(corners)))
+    points = [corners.points[a:b].astype(np.float32) for a, b in pieces]
+    px = [corners.px[a:b].astype(np.float32) for a, b in pieces]
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     answers = []
     for guess in (0, cv2.CALIB_USE_INTRINSIC_GUESS):
@@ -141,11 +141,16 @@ def _by_opencv(
 
 
 def part_of(
-    seen: BoardImages, kept: BoolArray, n_images: int
+    corners: BoardImages, is_kept: BoolArray, n_images: int
 ) -> tuple[BoardImages, tuple[int, ...]]:
-    """Return some of the corners, and the numbers that their images had."""
-    images = sorted(set(seen.image[kept].tolist()))
+    """Return a subset of the corners with renumbered images, and their original numbers."""
+    images = sorted(set(corners.image[is_kept].tolist()))
     new = np.full(n_images, -1, dtype=np.intp)
     new[images] = np.arange(len(images))
-    part = BoardImages(new[seen.image[kept]], seen.points[kept], seen.px[kept], seen.sigma_px[kept])
+    part = BoardImages(
+        new[corners.image[is_kept]],
+        corners.points[is_kept],
+        corners.px[is_kept],
+        corners.sigma_px[is_kept],
+    )
     return part, tuple(images)

@@ -1,5 +1,5 @@
-"""What people do wrong with readings, models and images, found by trying it.
+"""Diagnosis of common mistakes in readings, models and images, by trying their correction.
 
-`mistakes` lists what people do wrong, each as a change of what is taken for true; `diagnosis` tries
-them on the images of a session and names what they agree with.
+`mistakes` lists the mistakes, each as a changed hypothesis of the session; `diagnosis` tries them
+on the images and names the one that explains them best.
 """

@@ -1,4 +1,4 @@
-"""What the poses leave open: refused where other poses of the machine would show it, else fixed."""
+"""Undetermined directions of the frames: refused if other poses determine them, else fixed."""
 
 from __future__ import annotations
 
@@ -28,74 +28,73 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import random_poses
 
-_MAX_SIGMA = 0.1  # [rad], and of the length of the machine: what is known worse is open
-_MACHINE_TOLERANCE = 2e-3  # of the best singular value: what no pose of a machine shows better
-_PART_TOLERANCE = 0.03  # of a unit direction: what is less is not named
-_AXIS_TOLERANCE = 0.02  # of the largest rotations: what is less is about the same axis
-_RESOLVED = 1e-3  # of a unit direction
-_N_POSES, _SEED = 30, 1  # of the workspace
-_WEAK = 25.0  # times worse known than by one measured pose
+_MAX_SIGMA = 0.1  # largest sigma of a determined direction [rad, machine lengths]
+# smallest singular value, relative to the largest, of a direction that the workspace determines
+_MACHINE_TOLERANCE = 2e-3
+_PART_TOLERANCE = 0.03  # smallest component of a unit direction that messages name
+_AXIS_TOLERANCE = 0.02  # smallest spread, relative to the largest, of an independent direction
+_RESOLVED = 1e-3  # smallest motion of the tool along a unit direction that holding it fixes
+_N_POSES, _SEED = 30, 1  # random poses of the workspace
+_WEAK = 25.0  # sigma of a poorly determined direction, relative to that of one measured pose
 _BLOCKS: tuple[tuple[slice, LocatedFrame, PoseComponent], ...] = (
     (slice(0, 3), "base", "position"),
     (slice(3, 6), "base", "orientation"),
     (slice(6, 9), "tool", "position"),
     (slice(9, 12), "tool", "orientation"),
-)  # of a step
+)  # components of a step
 
 
 @dataclass(frozen=True, eq=False)
 class Determinacy:
-    """The most likely frames, and how well each part of them is known."""
+    """The most likely frames with their covariance and their undetermined parts."""
 
-    fit: FrameFit  # at the frames, the open part held
-    # (12, 12): of a step: displacement and rotation of the base about world axes, of the tool about
-    # platform axes [m, rad]; zero along what is held
+    fit: FrameFit  # evaluated at the frames, with the undetermined directions held
+    # (12, 12): covariance of a step: displacement and rotation of the base about world axes, of the
+    # tool about platform axes [m, rad]; zero along held directions
     covariance: Array
-    held: tuple[OpenPart, ...]  # what no pose of the machine determines
-    words: str  # the same for people; "" where everything is determined
-    weak: tuple[str, ...]  # what is known badly, one sentence each
+    held: tuple[OpenPart, ...]  # parts that no pose of the machine determines
+    words: str  # description of the held parts; "" if everything is determined
+    weak: tuple[str, ...]  # one sentence for each poorly determined part
 
 
 def determine(
     measurements: ToolMeasurements,
-    found: FrameFit,
-    # (3,): where the tool is taken in the platform where the machine leaves that open [m]
+    fit: FrameFit,
+    # (3,): position of the tool in the platform, used where the machine does not determine it [m]
     tool_position: Array,
-    name: str,  # what the poses are called in messages
+    name: str,  # name of the poses in messages
 ) -> Determinacy:
-    """Return what a fit determines.
+    """Split a fit into determined, poorly determined and held parts.
 
-    Raises NotIdentifiable if other poses of the machine would determine what these leave open, or
-    if more than the tool would have to be fixed.
+    Raises NotIdentifiable if other poses of the machine would determine more than these, or if
+    holding the tool does not fix all undetermined directions.
     """
     pairs, oriented = measurements.pairs, measurements.is_oriented
-    basis = _open_directions(found.frame_design, oriented=oriented)
+    basis = _open_directions(fit.frame_design, oriented=oriented)
     parts: list[OpenPart] = []
     words = ""
     if basis.shape[1]:
         workspace = _workspace(measurements)
-        _check_machine(measurements, found, basis, workspace, name)
-        found = hold_open_part(measurements, found, tool_position)
-        basis = _open_at(measurements, found, basis.shape[1], found.frames)
-        parts = _open_parts(basis, found.frames)
+        _check_machine(measurements, fit, basis, workspace, name)
+        fit = hold_open_part(measurements, fit, tool_position)
+        basis = _open_at(measurements, fit, basis.shape[1], fit.frames)
+        parts = _open_parts(basis, fit.frames)
         words = _held_words(parts, workspace, tool_position)
     scale = pairs.scale
-    unit = _covariance_with(found.information, basis, oriented=oriented)
+    unit = _covariance_with(fit.information, basis, oriented=oriented)
     covariance = unit * np.outer(scale, scale)
     return Determinacy(
-        found, covariance, tuple(parts), words, _weak(covariance, found, pairs, oriented=oriented)
+        fit, covariance, tuple(parts), words, _weak(covariance, fit, pairs, oriented=oriented)
     )
 
 
-def hold_open_part(
-    measurements: ToolMeasurements, found: FrameFit, tool_position: Array
-) -> FrameFit:
-    """Return a fit moved along what it leaves open until the tool is where it is held."""
-    k = _open_directions(found.frame_design, oriented=measurements.is_oriented).shape[1]
+def hold_open_part(measurements: ToolMeasurements, fit: FrameFit, tool_position: Array) -> FrameFit:
+    """Return the fit moved along its undetermined directions until the tool is at its position."""
+    k = _open_directions(fit.frame_design, oriented=measurements.is_oriented).shape[1]
     if k == 0:
-        return found
+        return fit
     return hold_tool(
-        measurements, found, lambda frames: _open_at(measurements, found, k, frames), tool_position
+        measurements, fit, lambda frames: _open_at(measurements, fit, k, frames), tool_position
     )
 
 
@@ -103,25 +102,25 @@ def _open_directions(
     # (m, 12): whitened derivatives by a step in units of the machine's length and radians
     design: Array,
     *,
-    # whether orientations of the tool were measured at all; without, that of the tool in the
+    # whether any orientation of the tool was measured; if not, the orientation of the tool in the
     # platform is not estimated
     oriented: bool,
 ) -> Array:
-    """Return an orthonormal basis (12, k) of the directions that a design leaves open."""
+    """Return an orthonormal basis (12, k) of the undetermined directions of a design."""
     return _unseen(design, oriented, lambda s: (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0))
 
 
 def _shown_elsewhere(
-    basis: Array,  # (12, k): what the measured poses leave open
+    basis: Array,  # (12, k): undetermined directions of the measured poses
     # (m, 12): derivatives of poses all over the workspace by a step, both in units of the machine's
-    # length and radians: geometry alone, whatever the noise
+    # length and radians; the noise does not enter
     jacobian: Array,
     *,
     oriented: bool,
 ) -> Array:
-    """Return those open directions (12, k) that the machine's workspace would show."""
-    never = _unseen(jacobian, oriented, lambda s: s < _MACHINE_TOLERANCE * s[0])
-    U, s, _ = np.linalg.svd(basis - never @ (never.T @ basis), full_matrices=False)
+    """Return the undetermined directions (12, k) that other poses of the machine determine."""
+    undetermined = _unseen(jacobian, oriented, lambda s: s < _MACHINE_TOLERANCE * s[0])
+    U, s, _ = np.linalg.svd(basis - undetermined @ (undetermined.T @ basis), full_matrices=False)
     return np.asarray(U[:, s > 0.5])
 
 
@@ -130,37 +129,36 @@ def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]
     n = 12 if oriented else 9
     _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
     s = np.concatenate([s, np.zeros(n - len(s))])
-    chosen = is_open(s)
-    basis = np.zeros((12, int(chosen.sum())))
-    basis[:n] = Vt[chosen].T
+    small = is_open(s)
+    basis = np.zeros((12, int(small.sum())))
+    basis[:n] = Vt[small].T
     return basis
 
 
 def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
-    """Return which parts of the frames some open directions (12, k) move."""
+    """Return the parts of the frames that undetermined directions (12, k) move."""
     parts = []
     for block, frame, kind in _BLOCKS:
         rows = basis[block]
         if frame == "base":
             rows = frames[0, :, :3].T @ rows
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
-        found = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
-        if found:
-            parts.append(OpenPart(frame, kind, tuple(found)))
+        directions = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
+        if directions:
+            parts.append(OpenPart(frame, kind, tuple(directions)))
     return parts
 
 
 @dataclass(frozen=True, eq=False)
 class _PoseSpread:
-    """How platform poses differ."""
+    """Independent rotations and displacements of a set of platform poses."""
 
-    # (r, 3): independent axes that they are turned about, in the base link, the first ones first
-    axes: Array
-    n_shifts: int  # independent directions in which they are displaced
+    axes: Array  # (r, 3): independent rotation axes in the base link, by decreasing rotation
+    n_shifts: int  # number of independent directions of displacement
 
     @property
     def words(self) -> str:
-        """How they differ, after "poses that"."""
+        """Description of the differences, to follow "poses that"."""
         turns = (
             "do not turn",
             f"all turn about one axis, {direction_words(self.axes[0])} of the base"
@@ -174,7 +172,7 @@ class _PoseSpread:
 
 
 def _pose_spread(R: Array, t: Array, length: float) -> _PoseSpread:
-    """Return how poses R (n, 3, 3), t (n, 3) [m] differ; a length makes rotations comparable."""
+    """Return the spread of poses R (n, 3, 3), t (n, 3) [m] of a machine of a given length [m]."""
     turns = (Rotation.from_matrix(R) * Rotation.from_matrix(R).mean().inv()).as_rotvec()
     _, s, Vt = np.linalg.svd(turns, full_matrices=False)
     size = np.sqrt(len(t))
@@ -184,15 +182,17 @@ def _pose_spread(R: Array, t: Array, length: float) -> _PoseSpread:
     return _PoseSpread(axes, n_shifts)
 
 
-def _needed_words(found: _PoseSpread, possible: _PoseSpread, scatter: str) -> str:
-    """Return how the poses scatter if that matters, what they need and what to do."""
-    if len(found.axes) < min(2, len(possible.axes)):
-        several = "two axes" if len(possible.axes) > 1 else "an axis"
-        more = "tilted about another axis too" if len(found.axes) else "turned against each other"
+def _needed_words(measured: _PoseSpread, workspace: _PoseSpread, scatter: str) -> str:
+    """Return the end of a message: the missing rotations or displacements, and the remedy."""
+    if len(measured.axes) < min(2, len(workspace.axes)):
+        several = "two axes" if len(workspace.axes) > 1 else "an axis"
+        more = (
+            "tilted about another axis too" if len(measured.axes) else "turned against each other"
+        )
         return f", needed rotations about {several}; add poses that are {more}"
-    if found.n_shifts < possible.n_shifts:
+    if measured.n_shifts < workspace.n_shifts:
         return (
-            f", needed displacements in {possible.n_shifts} directions; add poses that are "
+            f", needed displacements in {workspace.n_shifts} directions; add poses that are "
             "displaced in another direction too"
         )
     return (
@@ -201,10 +201,10 @@ def _needed_words(found: _PoseSpread, possible: _PoseSpread, scatter: str) -> st
     )
 
 
-def _open_at(measurements: ToolMeasurements, found: FrameFit, k: int, frames: Array) -> Array:
-    """Return the k directions (12, k) that are known least at some frames."""
+def _open_at(measurements: ToolMeasurements, fit: FrameFit, k: int, frames: Array) -> Array:
+    """Return the k least determined directions (12, k) at given frames."""
     n = 12 if measurements.is_oriented else 9
-    design = frame_design_at(measurements.pairs, frames, found.noise, measurements.by_model)
+    design = frame_design_at(measurements.pairs, frames, fit.noise, measurements.by_model)
     _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
     basis = np.zeros((12, k))
     basis[:n] = Vt[n - k :].T
@@ -212,7 +212,7 @@ def _open_at(measurements: ToolMeasurements, found: FrameFit, k: int, frames: Ar
 
 
 def _workspace(measurements: ToolMeasurements) -> PosePairs:
-    """Return poses all over the workspace, as if each had been measured."""
+    """Return random poses of the workspace, measured like the actual poses."""
     _, poses = random_poses(measurements.machine, _N_POSES, _SEED)
     matrices = np.array([T.as_matrix() for T in poses])
     return PosePairs(
@@ -226,96 +226,97 @@ def _workspace(measurements: ToolMeasurements) -> PosePairs:
 
 
 def _check_machine(
-    measurements: ToolMeasurements, found: FrameFit, basis: Array, workspace: PosePairs, name: str
+    measurements: ToolMeasurements, fit: FrameFit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
-    """Refuse what other poses would determine, and what holding the tool does not close."""
+    """Refuse directions that other poses would determine or that holding the tool does not fix."""
     pairs = measurements.pairs
-    seen = jacobian(found.frames, workspace) * pairs.unit[:, None] * pairs.scale
-    beyond = _shown_elsewhere(basis, seen.reshape(-1, N_STEP), oriented=measurements.is_oriented)
-    here = _pose_spread(pairs.R, pairs.t, pairs.length)
-    there = _pose_spread(workspace.R, workspace.t, pairs.length)
+    design = jacobian(fit.frames, workspace) * pairs.unit[:, None] * pairs.scale
+    resolvable = _shown_elsewhere(
+        basis, design.reshape(-1, N_STEP), oriented=measurements.is_oriented
+    )
+    measured_spread = _pose_spread(pairs.R, pairs.t, pairs.length)
+    workspace_spread = _pose_spread(workspace.R, workspace.t, pairs.length)
     start = f"{name}: base and tool could not be located, because"
-    if beyond.shape[1]:
+    if resolvable.shape[1]:
         raise NotIdentifiable(
-            f"{start} {open_parts_in_words(_open_parts(beyond, found.frames))} cannot be told from "
-            "the poses: "
-            f"found {len(pairs)} poses that {here.words}"
-            f"{_needed_words(here, there, _scatter(measurements, found))}."
+            f"{start} {open_parts_in_words(_open_parts(resolvable, fit.frames))} cannot be told "
+            f"from the poses: found {len(pairs)} poses that {measured_spread.words}"
+            f"{_needed_words(measured_spread, workspace_spread, _scatter(measurements, fit))}."
         )
     if not _is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
             f"{start} no pose of this machine tells "
-            f"{open_parts_in_words(_open_parts(basis, found.frames))}: "
-            f"found a platform whose poses {there.words}, needed a part that holding the tool in "
-            "the platform closes; measure orientations too, or the base itself."
+            f"{open_parts_in_words(_open_parts(basis, fit.frames))}: "
+            f"found a platform whose poses {workspace_spread.words}, needed a part that holding "
+            "the tool in the platform closes; measure orientations too, or the base itself."
         )
 
 
-def _scatter(measurements: ToolMeasurements, found: FrameFit) -> str:
+def _scatter(measurements: ToolMeasurements, fit: FrameFit) -> str:
     """Return the standard deviations of a measured component."""
-    sigma = found.noise.rms
+    sigma = fit.noise.rms
     turn = f" and {np.degrees(sigma[1]):.2g} deg" if measurements.is_oriented else ""
     return f"{1e3 * sigma[0]:.2g} mm{turn}"
 
 
 def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Array) -> str:
-    """Return what is held and why."""
+    """Return a sentence that names the held parts and the reason."""
     tool = [part for part in parts if part.frame == "tool"]
     base = [part for part in parts if part.frame == "base"]
     machine = _pose_spread(workspace.R, workspace.t, workspace.length)
     if len(machine.axes) == 0:
-        why = "the platform of this machine does not turn"
+        reason = "the platform of this machine does not turn"
     elif len(machine.axes) == 1:
         axis = direction_words(machine.axes[0])
-        why = f"the platform of this machine turns about one axis only, {axis} of the base"
+        reason = f"the platform of this machine turns about one axis only, {axis} of the base"
     else:
-        why = f"the platform of this machine takes poses that {machine.words}"
-    at = ", ".join(f"{x:g}" for x in tool_position)
+        reason = f"the platform of this machine takes poses that {machine.words}"
+    position = ", ".join(f"{x:g}" for x in tool_position)
     with_it = f" from {open_parts_in_words(base)}" if base else ""
-    taken = [
-        f"the tool is taken at ({at}) m in the platform"
+    assumptions = [
+        f"the tool is taken at ({position}) m in the platform"
         if part.kind == "position"
         else "the tool is taken along the axes of the platform"
         for part in tool
     ]
     return (
-        f"No pose tells {open_parts_in_words(tool)} apart{with_it}, because {why}: "
-        f"{' and '.join(taken)} there, "
+        f"No pose tells {open_parts_in_words(tool)} apart{with_it}, because {reason}: "
+        f"{' and '.join(assumptions)} there, "
         "and the base follows; where the tool is in the world does not depend on it."
     )
 
 
-def _weak(
-    covariance: Array, found: FrameFit, pairs: PosePairs, *, oriented: bool
-) -> tuple[str, ...]:
-    """Return which directions are known badly, one sentence for each part of the frames."""
-    position, angle = found.noise.rms.tolist()
-    one = max(position, angle * pairs.length if oriented else 0.0)
+def _weak(covariance: Array, fit: FrameFit, pairs: PosePairs, *, oriented: bool) -> tuple[str, ...]:
+    """Return one sentence for each poorly determined part of the frames."""
+    position, angle = fit.noise.rms.tolist()
+    position_error = max(position, angle * pairs.length if oriented else 0.0)
     sentences = []
     for block, frame, kind in _BLOCKS:
         values, vectors = np.linalg.eigh(covariance[block, block])
         sigma = float(np.sqrt(max(values[-1], 0.0)))
-        limit = _WEAK * (one if kind == "position" else one / pairs.length)
+        limit = _WEAK * (position_error if kind == "position" else position_error / pairs.length)
         if sigma <= limit:
             continue
-        v = vectors[:, -1] if frame == "tool" else found.frames[0, :, :3].T @ vectors[:, -1]
+        v = vectors[:, -1] if frame == "tool" else fit.frames[0, :, :3].T @ vectors[:, -1]
         part = OpenPart(frame, kind, (direction_of(v),))
-        known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
+        uncertainty = (
+            f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
+        )
         sentences.append(
-            f"Poorly determined: {part.words}, {known} (1 sigma); poses that differ more, above "
-            "all in rotations about several axes, would determine it better."
+            f"Poorly determined: {part.words}, {uncertainty} (1 sigma); poses that differ more, "
+            "above all in rotations about several axes, would determine it better."
         )
     return tuple(sentences)
 
 
 def _is_resolved_by_the_tool(basis: Array) -> bool:
-    """Say whether every open direction (12, k) moves the tool, so that holding it closes all."""
+    """Return whether holding the tool fixes all undetermined directions (12, k)."""
     s = np.linalg.svd(basis[6:], compute_uv=False)
     return bool(np.all(s > _RESOLVED)) and len(s) >= basis.shape[1]
 
 
 def _kept_directions(basis: Array) -> Array:
-    """Return the directions (12, 12 - k) that do not move the held part of the tool."""
+    """Return a basis (12, 12 - k) of the steps that leave the held part of the tool at rest."""
     held = basis.copy()
     held[:6] = 0.0
     U, s, _ = np.linalg.svd(held, full_matrices=True)
@@ -323,12 +324,12 @@ def _kept_directions(basis: Array) -> Array:
 
 
 def _covariance_with(
-    information: Array,  # (12, 12): of a step in the same units
-    basis: Array,  # (12, k): open directions
+    information: Array,  # (12, 12): inverse covariance of a step in the same units
+    basis: Array,  # (12, k): undetermined directions
     *,
     oriented: bool,  # whether the orientation of the tool is known; else its rows are zero
 ) -> Array:
-    """Return the covariance (12, 12) of a step, what is held counted as known."""
+    """Return the covariance (12, 12) of a step; zero along held directions."""
     Z = _kept_directions(basis) if basis.shape[1] else np.eye(N_STEP)
     if not oriented:
         U, s, _ = np.linalg.svd(Z[:9], full_matrices=False)

@@ -32,7 +32,7 @@ _WHAT = "location file"
 _KEY = "legcal_location"
 LOCATION_FILE = OutputFile("the location", _WHAT, _KEY, "a new file or an earlier location")
 _SYMMETRY_TOLERANCE = 1e-9  # relative
-_NEGATIVE_TOLERANCE = 1e-12  # of eigenvalues below zero, relative
+_NEGATIVE_TOLERANCE = 1e-12  # size of a negative eigenvalue, relative to the largest entry
 _Vector = Annotated[
     tuple[Number, Number, Number], BeforeValidator(lambda v: tuple(v) if type(v) is list else v)
 ]
@@ -58,29 +58,29 @@ class Location:
     covariance : (12, 12) array
         Covariance of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about
         world axes and of the tool about platform axes, T_true = (exp r, t + x) applied from the
-        left. What is held, and an orientation that is not known, counts as zero.
+        left. Zero along held directions and for an orientation that was not measured.
     held : tuple of OpenPart
         The directions that no pose of this machine determines.
     held_at : tuple of float
         Position of the tool in the platform, used where it is not determined [m].
     held_words : str
-        The same for people; "" where everything is determined.
+        Description of the held directions; "" if everything is determined.
     noise : MeasurementNoise
         Standard deviations of the measurement.
     rows : tuple of RowResidual
         In the order of the file.
     chi2, dof, p_value : float, int, float or None
         Sum of squared residuals in standard deviations, degrees of freedom, and the probability of
-        a larger sum; None where all standard deviations come from the residuals.
+        a larger sum; None if all standard deviations come from the residuals.
     tool_position_sigma, tool_angle_sigma : float, float or None
-        How well both frames together put the tool in the world at the measured poses: one standard
-        deviation of the vector, rms over the poses [m], [rad].
+        Standard deviation of the tool pose in the world from both frames at the measured poses,
+        of the vector, rms over the poses [m], [rad].
     status : {"located", "located in part", "doubtful"}
         The verdict in a word.
     sentence : str
         The verdict.
     notes : tuple of str
-        What else a reader should know.
+        Further remarks.
     """
 
     model: str
@@ -120,56 +120,54 @@ class Location:
 
     @property
     def rms_angle(self) -> float | None:
-        """The same of orientations [rad]; None where none was measured."""
+        """Root mean square of the rotation residuals of the rows used [rad]; None without any."""
         turns = [row.rotation for row in self.rows if row.used and row.rotation is not None]
         return _rms(turns) if turns else None
 
 
 @dataclass(frozen=True)
 class RowResidual:
-    """A row of the measured poses, and how far it is from the located frames."""
+    """Residuals of a row of the measured poses."""
 
-    row: int  # its number in the file, from 1
+    row: int  # number of the row in the file, from 1
     # measured minus predicted position of the tool, in the world [m]
     position: tuple[float, float, float]
-    # the same of its orientation as a rotation vector about world axes [rad]; None where it was not
-    # measured
+    # residual of the orientation as a rotation vector about world axes [rad]; None if the
+    # orientation was not measured
     rotation: tuple[float, float, float] | None
-    reason: str = ""  # why it was left out; "" if it was used
+    reason: str = ""  # reason for leaving the row out; "" if it was used
 
     @property
     def used(self) -> bool:
-        """Whether the frames rest on it."""
+        """Whether the row was used in the fit."""
         return not self.reason
 
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """How precise the measured poses are."""
+    """Standard deviations of the measured poses."""
 
-    # position, angle: standard deviation of a component [m], [rad], rms over the rows; None of
-    # orientations that were not measured
-    position: float
-    angle: float | None
-    # position_stated, angle_stated: whether it was stated or comes from the residuals
+    position: float  # standard deviation of a component, rms over the rows [m]
+    angle: float | None  # the same [rad]; None if no orientations were measured
+    # position_stated, angle_stated: whether the standard deviation was stated, rather than
+    # estimated from the residuals
     position_stated: bool
     angle_stated: bool
-    reading: float  # standard deviation of a reading that was stated [m or rad]; zero if none was
-    model: bool  # whether the covariance of a calibrated model was counted in
+    reading: float  # stated standard deviation of a reading [m or rad]; zero if none was stated
+    model: bool  # whether the covariance of a calibrated model is included
 
 
 @dataclass(frozen=True)
 class OpenPart:
-    """A part of the frames that poses do not determine, or hardly."""
+    """An undetermined or poorly determined part of the frames."""
 
-    frame: LocatedFrame  # {"base", "tool"}: whose
-    kind: PoseComponent  # {"position", "orientation"}: of what
-    # unit vectors: of the base in the base link, of the tool in the platform link
-    directions: tuple[Direction, ...]
+    frame: LocatedFrame  # {"base", "tool"}
+    kind: PoseComponent  # {"position", "orientation"}
+    directions: tuple[Direction, ...]  # unit vectors in the base link or in the platform link
 
     @property
     def words(self) -> str:
-        """What is open, for people."""
+        """Description of the part in words."""
         whose = "the base in the world" if self.frame == "base" else "the tool in the platform"
         link = "the base" if self.frame == "base" else "the platform"
         start = f"the {self.kind} of {whose}"
@@ -184,13 +182,13 @@ class OpenPart:
 
 
 def open_parts_in_words(parts: list[OpenPart]) -> str:
-    """Return parts in one phrase, the tool's first."""
+    """Return one phrase for all parts, the tool's first."""
     words = [part.words for part in sorted(parts, key=lambda part: part.frame != "tool")]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def direction_words(v: Array | tuple[float, ...]) -> str:
-    """Return a direction with two digits."""
+    """Return a direction as text with two digits."""
     v = _signed(np.asarray(v) / np.linalg.norm(v))
     return "(" + ", ".join(f"{x:.3g}" for x in np.round(v, 2) + 0.0) + ")"
 
@@ -219,7 +217,7 @@ class _FrameEntry(MotionEntry):
 
 
 class _OpenPartEntry(FileSchema):
-    """A part that the machine leaves open."""
+    """A part that no pose of the machine determines."""
 
     frame: Literal["base", "tool"]
     kind: Literal["position", "orientation"]
@@ -237,7 +235,7 @@ class _Determined(FileSchema):
 
 
 class _Noise(FileSchema):
-    """How precise the measured poses are."""
+    """Standard deviations of the measured poses."""
 
     position: _Size
     angle: _Size | None
@@ -268,7 +266,7 @@ class _ResidualsEntry(FileSchema):
 
 
 class _Tool(FileSchema):
-    """How well the frames put the tool in the world."""
+    """Standard deviations of the tool pose in the world from both frames."""
 
     position: _Size
     angle: _Size | None
@@ -300,7 +298,7 @@ class LocationFile(FileSchema):
 
 
 def location_document(location: Location) -> dict[str, Any]:
-    """Return a location as its file has it."""
+    """Return the content of a location file."""
     sigma = [[float(s) for s in part] for part in location.sigma.reshape(4, 3)]
     base, tool = (
         dict[str, Any](motion_to_xyz_quat(T))
@@ -359,7 +357,7 @@ def write_location(location: Location, file: str | Path) -> None:
     Parameters
     ----------
     location : Location
-        What was located.
+        The location.
     file : str or Path
         The YAML.
 
@@ -394,13 +392,13 @@ def load_location(file: str | Path) -> Location:
         If it is missing or damaged.
     """
     path = Path(file)
-    found = read_yaml(path, _WHAT)
-    if _KEY not in found:
+    content = read_yaml(path, _WHAT)
+    if _KEY not in content:
         raise DatasetError(
             f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
             "legcal locate wrote; give that file."
         )
-    document = validate(LocationFile, found, path)
+    document = validate(LocationFile, content, path)
     determined, residuals = document.determined, document.residuals
     return Location(
         model=document.model,
@@ -425,12 +423,12 @@ def load_location(file: str | Path) -> Location:
     )
 
 
-def _matrix(path: Path, found: _Covariance) -> Array:
-    """Return the covariance; refuse a matrix that is not one."""
+def _matrix(path: Path, entry: _Covariance) -> Array:
+    """Return the covariance; refuse a matrix that is not symmetric and positive semidefinite."""
     n = len(NAMES)
-    is_square = len(found.matrix) == n and all(len(row) == n for row in found.matrix)
-    if tuple(found.names) == NAMES and is_square:
-        matrix = np.array(found.matrix)
+    is_square = len(entry.matrix) == n and all(len(row) == n for row in entry.matrix)
+    if tuple(entry.names) == NAMES and is_square:
+        matrix = np.array(entry.matrix)
         largest = float(np.abs(matrix).max())
         symmetric = np.abs(matrix - matrix.T).max() <= _SYMMETRY_TOLERANCE * largest
         if symmetric and float(np.linalg.eigvalsh(matrix)[0]) >= -_NEGATIVE_TOLERANCE * largest:

@@ -1,12 +1,12 @@
-"""The most likely frames, how precise the measurement is, and which rows are inliers.
+"""The most likely frames, the noise of the measurement, and the inliers among the rows.
 
-Frames and variances are estimated in turn: frames by least squares with the covariance of the rows;
-the standard deviations that nobody stated, and errors of the model that all rows share, so that
-residuals are most likely given what the frames take away (restricted maximum likelihood).
+Frames and variances are estimated in turn: frames, and errors of the model that all rows share, by
+least squares with the covariance of the rows; standard deviations that were not stated by
+restricted maximum likelihood, which accounts for the degrees of freedom of the frames.
 
-Outliers are found from the inside out (forward search): the search starts at the rows that agree
-best and takes in one after the other, the next best first, as long as it lies where those inside
-predict it, at the scatter that they show. One wrong row never decides about another.
+Outliers are found by forward search: it starts at the rows that agree best and adds the next best
+row as long as its residual is compatible with the fit of the rows inside and their scatter. One
+wrong row never decides about another.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from legcal.estimation.problem import (
 from legcal.estimation.solver import minimise
 from legcal.geometry.types import Array, BoolArray, IntArray
 
-RANK_TOLERANCE = 1e-9  # of the largest singular value: what is below is open
-_MAX_ROUNDS = 30  # of frames and variances in turn
-_READING_ROUNDS = 3  # of frames and what errors of the readings do to the tool
+RANK_TOLERANCE = 1e-9  # smallest singular value of a determined direction, relative to the largest
+_MAX_ROUNDS = 30  # alternations of frames and variances
+_READING_ROUNDS = 3  # alternations of frames and the effect of reading errors on the tool
 _MAX_REML_ITERATIONS = 300
 _FACTOR_TOLERANCE = 1e-7
 _MAX_STEP = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # turn [rad], displacement [m]
-_TURN_FIRST = [3, 4, 5, 0, 1, 2]  # components of a step as those of estimation.Frames
+_TURN_FIRST = [3, 4, 5, 0, 1, 2]  # components of a step in the order of estimation.Frames
 _MAX_HOLD_ROUNDS = 60
 _HOLD_TOLERANCE = 1e-12
 FALSE_ALARM = 1e-3  # probability that a row of a good file is left out
-_LIKELY = 0.05  # rows at least as likely come in together
-_UNKNOWN = 1e-15  # of the largest information: of directions that those inside do not know
-_MIN_DOF = 1.0  # for a scatter
+_LIKELY = 0.05  # rows of at least this probability are added together
+_UNKNOWN = 1e-15  # information added to undetermined directions, relative to the largest
+_MIN_DOF = 1.0  # smallest degrees of freedom for an estimated scatter
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,14 @@ class FrameFit:
     """The most likely frames."""
 
     frames: Array  # (2, 3, 4)
-    noise: PoseNoise  # with the factors that were stated or estimated
-    whitened: Array  # (n, 6): residuals in standard deviations, errors of the model taken out
+    noise: PoseNoise  # standard deviations with the stated or estimated factors
+    whitened: Array  # (n, 6): residuals in standard deviations, errors of the model subtracted
     # (n * 6 + k, 12 + k): whitened derivative by a step in units of ``pairs.scale``, and by the k
     # errors of the model, whose priors are the last rows
     design: Array
     chi2: float  # sum of the squares of whitened residuals and errors of the model
-    dof: int  # measured numbers less those estimated
-    # (2,): degrees of freedom that the variances of positions and of orientations rest on
-    kind_dof: Array
+    dof: int  # degrees of freedom
+    kind_dof: Array  # (2,): degrees of freedom of the variances of positions and orientations
 
     @property
     def frame_design(self) -> Array:
@@ -86,26 +85,25 @@ class FrameFit:
 def fit_measurements(measurements: ToolMeasurements, start: Array) -> FrameFit:
     """Return the most likely frames of measurements, from a start.
 
-    Errors of the readings move the tool through the frames that are estimated: their covariance
-    follows the frames.
+    The covariance by errors of the readings depends on the frames and is updated with them.
     """
-    o = measurements
-    found = fit(o.pairs, start, o.noise_at(start), o.by_model)
-    for _ in range(_READING_ROUNDS if o.by_readings is not None else 0):
-        found = fit(o.pairs, found.frames, o.noise_at(found.frames), o.by_model)
-    return found
+    pairs, by_model = measurements.pairs, measurements.by_model
+    result = fit(pairs, start, measurements.noise_at(start), by_model)
+    for _ in range(_READING_ROUNDS if measurements.by_readings is not None else 0):
+        result = fit(pairs, result.frames, measurements.noise_at(result.frames), by_model)
+    return result
 
 
 def fit(
     pairs: PosePairs,
-    # within the basin of the answer; where the rows leave a direction open it stays there
+    # within the basin of convergence; undetermined directions stay there
     start: Array,
-    noise: PoseNoise,  # standard deviations; factors of kinds that are not stated are estimated
+    noise: PoseNoise,  # standard deviations; factors that were not stated are estimated
     motions: Array | None = None,  # (n, 6, k): platform motions by errors of the model
 ) -> FrameFit:
     """Return the most likely frames near a start.
 
-    Raises DidNotConverge if the steps do not end.
+    Raises DidNotConverge if the steps do not converge.
     """
     frames = start
     for _ in range(_MAX_ROUNDS):
@@ -123,20 +121,20 @@ def fit(
 def fit_at(
     pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None = None
 ) -> FrameFit:
-    """Return the fit at frames and noise that are most likely already."""
+    """Return the fit at frames and noise that have converged."""
     y, A = _whitened(
         *_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented)
-    )  # errors of the model are not yet known
-    left = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
+    )  # residuals at errors of the model of zero
+    remaining = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
     _, dof = _variances(pairs, frames, replace(noise, stated=(True, True)), motions)
     s = np.linalg.svd(A, compute_uv=False)
     rank = int(np.sum(s > RANK_TOLERANCE * s[0])) - (A.shape[1] - N_STEP)
     return FrameFit(
         frames=frames,
         noise=noise,
-        whitened=left[: 6 * len(pairs)].reshape(-1, 6),
+        whitened=remaining[: 6 * len(pairs)].reshape(-1, 6),
         design=A,
-        chi2=float(left @ left),
+        chi2=float(remaining @ remaining),
         dof=3 * len(pairs) + 3 * int(pairs.oriented.sum()) - rank,
         kind_dof=dof,
     )
@@ -156,9 +154,9 @@ def _most_likely(
     frames: Array,
     noise: PoseNoise,
     motions: Array | None,
-    fixed: Array | None = None,  # (12, k): directions in units of ``pairs.scale`` that do not move
+    fixed: Array | None = None,  # (12, k): held directions in units of ``pairs.scale``
 ) -> Array:
-    """Return the frames of least squares at given variances; open directions stay."""
+    """Return the least-squares frames at given variances; undetermined directions stay."""
     n = len(pairs)
     k = 0 if motions is None else motions.shape[-1]
 
@@ -166,14 +164,14 @@ def _most_likely(
         return frames_from(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
 
     def rows_of(state: _State) -> Residuals:
-        there = frames_in(state)
-        J = jacobian(there, pairs)
-        by_model = np.zeros((n, 6, 0)) if motions is None else tool_motions(motions, there, pairs)
+        current = frames_in(state)
+        J = jacobian(current, pairs)
+        by_model = np.zeros((n, 6, 0)) if motions is None else tool_motions(motions, current, pairs)
         blocks = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST], by_model
-        r = by_model @ state.errors - residuals(there, pairs)
+        r = by_model @ state.errors - residuals(current, pairs)
         return Residuals.of(r, np.concatenate(blocks, axis=-1))
 
-    one, whole = np.zeros(n, dtype=np.intp), slice(None)
+    first, all_elements = np.zeros(n, dtype=np.intp), slice(None)
     errors = np.arange(k, dtype=np.intp)
     held = np.zeros((0, N_STEP))
     if fixed is not None:
@@ -192,9 +190,9 @@ def _most_likely(
                 "poses",
                 rows_of,
                 (
-                    ("base", one, whole),
-                    ("tool", one, whole),
-                    ("errors", np.tile(errors, (n, 1)), whole),
+                    ("base", first, all_elements),
+                    ("tool", first, all_elements),
+                    ("errors", np.tile(errors, (n, 1)), all_elements),
                 ),
                 n,
                 6,
@@ -212,11 +210,11 @@ def _most_likely(
 def _variances(
     pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
 ) -> tuple[Array, Array]:
-    """Return the factors of restricted likelihood (2,), and their degrees of freedom (2,).
+    """Return the factors of restricted maximum likelihood (2,) and their degrees of freedom (2,).
 
-    With P = S^-1 - S^-1 A (A^T S^-1 A)^-1 A^T S^-1 a variance v of kind D is where
-    y^T P D P y = tr(P D): v is multiplied with the ratio of both until that is one. Stated ones
-    stay.
+    With P = S^-1 - S^-1 A (A^T S^-1 A)^-1 A^T S^-1 the estimate of a variance v with dS/dv = D
+    satisfies y^T P D P y = tr(P D): v is multiplied by the ratio of both sides until it is one.
+    Stated factors stay.
     """
     factor, dof = noise.factor, np.zeros(2)
     base = np.repeat(noise.sigma, 3, axis=1)
@@ -226,10 +224,10 @@ def _variances(
         y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s[0]]
-        left = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
-        back = np.swapaxes(W, 1, 2)
-        Py = (back @ left[:, :, None])[:, :, 0] * base
-        spread = back @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
+        remaining = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
+        W_T = np.swapaxes(W, 1, 2)
+        Py = (W_T @ remaining[:, :, None])[:, :, 0] * base
+        spread = W_T @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
         diagonal = (W**2).sum(axis=1) * base**2 - (spread**2).sum(axis=2)
         squares = (Py**2).reshape(-1, 2, 3).sum(axis=(0, 2))
         traces = diagonal.reshape(-1, 2, 3).sum(axis=(0, 2))
@@ -254,7 +252,7 @@ def frame_design_at(
 
 
 def frame_design(design: Array) -> Array:
-    """Return the columns (m, 12) of the frames without what errors of the model can explain."""
+    """Return the columns (m, 12) of the frames, projected off the errors of the model."""
     F, E = design[:, :N_STEP], design[:, N_STEP:]
     if E.shape[1] == 0:
         return F
@@ -282,46 +280,46 @@ def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
 
 def hold_tool(
     measurements: ToolMeasurements,
-    found: FrameFit,
-    open_at: Callable[[Array], Array],  # returns the open directions (12, k) at frames
-    tool_position: Array,  # (3,): in the platform [m]
+    frame_fit: FrameFit,
+    open_at: Callable[[Array], Array],  # returns the undetermined directions (12, k) at frames
+    tool_position: Array,  # (3,): position of the tool in the platform [m]
 ) -> FrameFit:
-    """Return the most likely frames whose open part is that of a tool at a given position.
+    """Return the most likely frames with the tool held at a given position.
 
-    Along open directions the tool is brought as near to the given position, and to the axes of the
-    platform, as they allow; all else stays most likely.
+    Along undetermined directions the tool is moved as near to the given position, and to the axes
+    of the platform, as possible; all other directions stay most likely.
     """
-    pairs, frames = measurements.pairs, found.frames
+    pairs, frames = measurements.pairs, frame_fit.frames
     for _ in range(_MAX_HOLD_ROUNDS):
         basis = open_at(frames)
         turn = Rotation.from_matrix(frames[1, :, :3]).inv().as_rotvec()
-        away = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
-        slide = basis @ np.linalg.lstsq(basis[6:], away, rcond=None)[0]
+        offset = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
+        slide = basis @ np.linalg.lstsq(basis[6:], offset, rcond=None)[0]
         size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
         frames = frames_after(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
         of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
-        frames = _most_likely(pairs, frames, found.noise, measurements.by_model, of_tool)
+        frames = _most_likely(pairs, frames, frame_fit.noise, measurements.by_model, of_tool)
         if np.abs(slide).max() < _HOLD_TOLERANCE:
             break
-    return fit_at(pairs, frames, found.noise, measurements.by_model)
+    return fit_at(pairs, frames, frame_fit.noise, measurements.by_model)
 
 
 @dataclass(frozen=True, eq=False)
 class Inliers:
-    """Which rows agree, and how far off the others are."""
+    """Inliers among the rows, and the residuals of all rows from their fit."""
 
-    is_inlier: BoolArray  # (n,): the rows to use
-    # distance, angle: (n,): how far each row is from where the inliers predict it [m, rad]
+    is_inlier: BoolArray  # (n,)
+    # distance, angle: (n,): residual of each row from the prediction by the inliers [m, rad]
     distance: Array
     angle: Array
-    frames: Array  # by the inliers
+    frames: Array  # frames estimated from the inliers
     factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`PoseNoise`
 
 
 def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
-    """Return which rows agree with each other, from frames that most rows agree with.
+    """Return the inliers by forward search from frames that most rows agree with.
 
-    A row is never left out for what stated standard deviations allow.
+    A row is never left out if the stated standard deviations explain its residual.
     """
     pairs, noise = measurements.pairs, measurements.noise
     n = len(pairs)
@@ -330,12 +328,12 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
     inside[np.argsort(distance, kind="stable")[: kept_rows(n, measurements.fewest)]] = True
     frames = start
     while True:
-        found = _fit_to(pairs.of(inside), frames, noise.of(inside))
-        frames = found.frames
+        frame_fit = _fit_to(pairs.of(inside), frames, noise.of(inside))
+        frames = frame_fit.frames
         outside: IntArray = np.flatnonzero(~inside)
         if not len(outside):
             break
-        likely = _probability(pairs.of(outside), noise.of(outside), found, noise.stated)
+        likely = _probability(pairs.of(outside), noise.of(outside), frame_fit, noise.stated)
         best = int(np.argmax(likely))
         if likely[best] < FALSE_ALARM / n:
             break
@@ -347,37 +345,37 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
         np.linalg.norm(r[:, :3], axis=1),
         np.linalg.norm(r[:, 3:], axis=1),
         frames,
-        found.noise.factor,
+        frame_fit.noise.factor,
     )
 
 
 def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
-    """Return the fit of some rows at the scatter that they show, at least at the stated one."""
-    found = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
-    least = np.where(noise.stated, noise.factor, 0.0)
-    return replace(found, noise=found.noise.scaled(np.maximum(found.noise.factor, least)))
+    """Return the fit of rows with their estimated scatter, or the stated one if it is larger."""
+    result = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
+    min_factor = np.where(noise.stated, noise.factor, 0.0)
+    return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, min_factor)))
 
 
 def _probability(
-    pairs: PosePairs, noise: PoseNoise, found: FrameFit, stated: tuple[bool, bool]
+    pairs: PosePairs, noise: PoseNoise, frame_fit: FrameFit, stated: tuple[bool, bool]
 ) -> Array:
-    """Return how probable rows as far off as these are, given those of a fit, (n,)."""
-    sigma = noise.scaled(found.noise.factor).standard_deviations()
-    H = found.information
+    """Return the probability of residuals as large as those of the given rows, (n,)."""
+    sigma = noise.scaled(frame_fit.noise.factor).standard_deviations()
+    H = frame_fit.information
     H = H + _UNKNOWN * float(np.linalg.norm(H, 2)) * np.eye(len(H))
-    J = jacobian(found.frames, pairs) * pairs.scale
+    J = jacobian(frame_fit.frames, pairs) * pairs.scale
     covariance = J @ np.linalg.solve(H, np.swapaxes(J, 1, 2))
     covariance[:, range(6), range(6)] += sigma**2
-    r = residuals(found.frames, pairs)
-    least = np.ones(len(pairs))
+    r = residuals(frame_fit.frames, pairs)
+    smallest = np.ones(len(pairs))
     for kind, rows in enumerate((slice(0, 3), slice(3, 6))):
-        dof = float(found.kind_dof[kind])
-        at_stated = stated[kind] and bool(found.noise.factor[kind] <= noise.factor[kind])
+        dof = float(frame_fit.kind_dof[kind])
+        at_stated = stated[kind] and bool(frame_fit.noise.factor[kind] <= noise.factor[kind])
         if dof < _MIN_DOF and not at_stated:
             continue
         part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
         distance = (part * r[:, rows]).sum(axis=1)
         # Not F with infinite degrees of freedom: SciPy has no number for that.
-        here = chdtrc(3, distance) if at_stated else fdtrc(3, dof, distance / 3.0)
-        least = np.minimum(least, np.where(pairs.oriented | (kind == 0), here, 1.0))
-    return np.minimum(1.0, 2.0 * least)
+        probability = chdtrc(3, distance) if at_stated else fdtrc(3, dof, distance / 3.0)
+        smallest = np.minimum(smallest, np.where(pairs.oriented | (kind == 0), probability, 1.0))
+    return np.minimum(1.0, 2.0 * smallest)

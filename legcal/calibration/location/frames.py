@@ -25,28 +25,28 @@ class PosePairs:
 
     R: Array  # R, t: (n, 3, 3) and (n, 3): T_base_platform [m]
     t: Array
-    # M, p: (n, 3, 3) and (n, 3): T_world_tool as measured [m]; M is the identity where it is not
+    # M, p: (n, 3, 3) and (n, 3): measured T_world_tool [m]; M is the identity if not measured
     M: Array
     p: Array
     oriented: BoolArray  # (n,): whether the orientation of the tool was measured
-    length: float  # of the machine, which rotations are weighed against [m]
+    length: float  # length of the machine, equivalent to a rotation by one radian [m]
 
     def __len__(self) -> int:
         return len(self.t)
 
     def of(self, rows: BoolArray | IntArray) -> PosePairs:
-        """Return some of the pairs."""
+        """Return the pairs of selected rows."""
         R, t, M, p = (x[rows] for x in (self.R, self.t, self.M, self.p))
         return PosePairs(R, t, M, p, self.oriented[rows], self.length)
 
     @property
     def scale(self) -> Array:
-        """What one unit of each component of a step means, (12,): the length, or one radian."""
+        """Unit of each component of a step, (12,): the length [m], or one radian."""
         return np.tile(np.repeat([self.length, 1.0], 3), 2)
 
     @property
     def unit(self) -> Array:
-        """What residuals (..., 6) are multiplied with to have no unit, (6,)."""
+        """Factors that make residuals (..., 6) dimensionless, (6,)."""
         return np.repeat([1.0 / self.length, 1.0], 3)
 
 
@@ -92,8 +92,8 @@ def residuals(frames: Array, pairs: PosePairs) -> Array:
     Both are along world axes; a rotation that was not measured counts as zero.
     """
     M, p = predicted(frames, pairs)
-    away = pairs.M @ np.swapaxes(M, -1, -2)
-    turn = Rotation.from_matrix(away.reshape(-1, 3, 3)).as_rotvec().reshape(p.shape)
+    rotation = pairs.M @ np.swapaxes(M, -1, -2)
+    turn = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(p.shape)
     turn[..., ~pairs.oriented, :] = 0.0
     return np.concatenate([pairs.p - p, turn], axis=-1)
 
@@ -114,7 +114,9 @@ def jacobian(frames: Array, pairs: PosePairs) -> Array:
 
 
 def tool_motions(motions: Array, frames: Array, pairs: PosePairs) -> Array:
-    """Return how platform motions move the tool in the world, (n, 6, k): displacement, rotation.
+    """Return the motions of the tool in the world by platform motions, (n, 6, k).
+
+    Displacements [m] come first, then rotation vectors [rad].
 
     *motions* (n, 6, k) are rotation vectors [rad] and displacements of the platform link [m] in the
     base link.

@@ -37,16 +37,16 @@ from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 
-_MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
-_LARGE_RESIDUAL = 0.05  # residuals in parts of the spread of positions, and [rad]
-_MAX_RESIDUAL = 0.2  # the same
-_MIN_DOF = 1.0  # for a scatter
+_MAX_OUTLIERS = 4  # rows per outlier at least; one outlier is always allowed
+# residuals that suggest a mistake, and that are refused [spreads of positions, rad]
+_LARGE_RESIDUAL, _MAX_RESIDUAL = 0.05, 0.2
+_MIN_DOF = 1.0  # smallest degrees of freedom for an estimated scatter
 _MAX_SIGMA, _MAX_TOOL = 2.5, 250.0  # mean leg lengths
-_SAME_CHI2 = 30.0  # two answers that explain the poses alike
-_SAME_COST = 25.0  # times the cost of the best
+_SAME_CHI2 = 30.0  # largest difference in chi2 of two answers that explain the poses equally well
+_SAME_COST = 25.0  # largest cost of another answer, relative to the best
 _ROUNDING = 1e-20
-_SAME_FRAMES = 0.02  # [rad], and of the length
-_MIN_P, _MAX_P = 1e-3, 1.0 - 1e-4  # probabilities of residuals as large as these
+_SAME_FRAMES = 0.02  # largest difference of frames that are the same [rad, machine lengths]
+_MIN_P, _MAX_P = 1e-3, 1.0 - 1e-4  # range of the probability of larger residuals without a remark
 _FIXED_TOLERANCE = 2.5e-12  # mean leg lengths, [rad]
 _KINDS = ("positions", "orientations")
 
@@ -60,7 +60,7 @@ def locate(
     encoder_sigma: float | str = 0.0,
     tool_position: Sequence[float] | None = None,
 ) -> Location:
-    """Return where the base stands in the world and the tool in the platform.
+    """Estimate the base in the world and the tool in the platform from measured tool poses.
 
     The frames make the measured poses T_world_tool = T_world_base T_base_platform(q)
     T_platform_tool most likely. Rows that disagree with the others are left out and named.
@@ -68,19 +68,19 @@ def locate(
     Parameters
     ----------
     model : str, Path or Machine
-        The machine, as for :func:`legcal.load_mechanism`. Where it lies in the result folder of a
-        calibration, the covariance of its parameters counts.
+        The machine, as for :func:`legcal.load_mechanism`. If the file is in the result folder of a
+        calibration, the covariance of its parameters is included.
     poses : str, Path or ToolPoses
         The table of measured tool poses.
     position_sigma, angle_sigma : float, optional
-        Standard deviations of the measurement, a component [m], [rad]; where neither they nor the
-        table are given, they are estimated from the residuals.
+        Standard deviations of the measurement, a component [m], [rad]; estimated from the residuals
+        if neither the option nor the column of the table is given.
     encoder_sigma : float or str
-        Standard deviation of a reading: a number [m, of motors that turn rad], or a text with its
-        unit ('0.01deg'), which is that of the motors that slide, or turn; the others are exact.
+        Standard deviation of a reading: a number [m, for revolute motors rad], or a text with a
+        unit ('0.01deg'), which applies to motors of that unit; the others are exact.
     tool_position : (3,) sequence of float, optional
-        Position of the tool in the platform [m], taken where the machine leaves it open; the
-        origin without it.
+        Position of the tool in the platform [m], used where the machine does not determine it; the
+        origin by default.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def locate(
     DatasetError
         If the table is malformed, or contradicts the machine.
     NotIdentifiable
-        If the poses leave open what other poses of the machine would determine.
+        If the poses do not determine the frames but other poses of the machine would.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_numbers(position_sigma, angle_sigma, tool_position, machine.size)
@@ -111,16 +111,16 @@ def locate(
     inliers = find_inliers(measurements, candidates.frames[0])
     _check_outliers(measurements, candidates, inliers, name)
     used = measurements.of(inliers.is_inlier)
-    found = fit_measurements(used, inliers.frames)
-    _check_scatter(used, found, name)
-    at = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
-    determined = determine(used, found, at, name)
-    _check_unique(used, determined, candidates, at, name)
-    return _judge(measurements, name, inliers, determined, at, is_given=tool_position is not None)
+    frame_fit = fit_measurements(used, inliers.frames)
+    _check_scatter(used, frame_fit, name)
+    tool = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
+    determined = determine(used, frame_fit, tool, name)
+    _check_unique(used, determined, candidates, tool, name)
+    return _judge(measurements, name, inliers, determined, tool, is_given=tool_position is not None)
 
 
 def _sigmas_of_readings(stated: float | str, machine: Machine) -> dict[str, float]:
-    """Return what is stated of readings by motor [m or rad]: nothing where they are exact."""
+    """Return the stated standard deviations of readings by motor [m or rad]; {} if exact."""
     if (split_quantity(stated)[0] if isinstance(stated, str) else stated) == 0.0:
         return {}
     return sigmas_of(stated, machine.legs)
@@ -130,18 +130,18 @@ def _check_numbers(
     position_sigma: float | None,
     angle_sigma: float | None,
     tool_position: Sequence[float] | None,
-    size: float,  # of the machine [m]
+    size: float,  # size of the machine [m]
 ) -> None:
-    """Refuse numbers that cannot be meant."""
+    """Refuse implausible options."""
     most_sigma, most_tool = _MAX_SIGMA * size, _MAX_TOOL * size
-    for what, value, least, most, unit in (
+    for name, value, lower, upper, unit in (
         ("position sigma", position_sigma, MIN_SIGMA, most_sigma, "m"),
         ("angle sigma", angle_sigma, MIN_SIGMA, MAX_ANGLE_SIGMA, "rad"),
     ):
-        if value is not None and not least <= value <= most:
+        if value is not None and not lower <= value <= upper:
             raise UsageError(
-                f"The {what} could not be used: found {value:g} {unit}, needed {least:g} to "
-                f"{most:.3g} {unit}; correct it."
+                f"The {name} could not be used: found {value:g} {unit}, needed {lower:g} to "
+                f"{upper:.3g} {unit}; correct it."
             )
     if tool_position is not None and not (
         len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= most_tool))
@@ -155,20 +155,20 @@ def _check_numbers(
 def _check_plausible(
     measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
-    """Refuse poses that no frames explain, with the mistake that would explain them.
+    """Refuse poses that no frames explain, naming the likeliest mistake.
 
-    The rows that agree best are looked at: most are right, or all are wrong in one way.
+    Only the rows that agree best are considered: most rows are right, or all share one mistake.
     """
     pairs = measurements.pairs
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
-    left = float(np.sqrt(candidates.cost[0]))  # in lengths of the machine, and [rad]
-    part = left / min(1.0, spread / pairs.length + 1e-12)
-    if part <= _LARGE_RESIDUAL:
+    rms = float(np.sqrt(candidates.cost[0]))  # [machine lengths, rad]
+    relative = rms / min(1.0, spread / pairs.length + 1e-12)
+    if relative <= _LARGE_RESIDUAL:
         return
     _refuse_mistakes(measurements, candidates, name)
-    if part > _MAX_RESIDUAL:
-        size = f"{1e3 * left * pairs.length:.3g} mm"
-        turn = f" or {np.degrees(left):.3g} deg" * measurements.is_oriented
+    if relative > _MAX_RESIDUAL:
+        size = f"{1e3 * rms * pairs.length:.3g} mm"
+        turn = f" or {np.degrees(rms):.3g} deg" * measurements.is_oriented
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses about {size}{turn} from "
             "where the readings put them, whatever the frames, needed poses measured at these "
@@ -179,7 +179,7 @@ def _check_plausible(
 def _refuse_mistakes(
     measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
-    """Refuse poses that a common mistake explains."""
+    """Refuse poses that a common mistake in the table explains."""
     mistake = likely_mistake(measurements.pairs, float(candidates.cost[0]), measurements.fewest)
     if mistake is not None:
         raise DatasetError(
@@ -192,31 +192,31 @@ def _refuse_mistakes(
 def _check_outliers(
     measurements: ToolMeasurements, candidates: FrameCandidates, inliers: Inliers, name: str
 ) -> None:
-    """Refuse poses of which too many disagree."""
+    """Refuse a table with too many outliers."""
     n, n_out = len(measurements.pairs), int(np.sum(~inliers.is_inlier))
-    most = max(1, n // _MAX_OUTLIERS)
-    if n_out <= most:
+    max_outliers = max(1, n // _MAX_OUTLIERS)
+    if n_out <= max_outliers:
         return
     _refuse_mistakes(measurements, candidates, name)
     rows = ", ".join(str(i) for i in measurements.poses.numbers[~inliers.is_inlier])
     raise DatasetError(
         f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
-        f"the others ({rows}), needed at most {most}; check that readings and poses of these rows "
-        "belong together."
+        f"the others ({rows}), needed at most {max_outliers}; check that readings and poses of "
+        "these rows belong together."
     )
 
 
-def _check_scatter(measurements: ToolMeasurements, found: FrameFit, name: str) -> None:
-    """Refuse to estimate a scatter from rows that leave nothing over."""
-    for kind, (what, option) in enumerate(
+def _check_scatter(measurements: ToolMeasurements, frame_fit: FrameFit, name: str) -> None:
+    """Refuse to estimate a scatter without degrees of freedom."""
+    for kind, (kind_name, option) in enumerate(
         (("positions", "--position-sigma"), ("orientations", "--angle-sigma"))
     ):
-        if not measurements.noise.stated[kind] and found.kind_dof[kind] < _MIN_DOF:
+        if not measurements.noise.stated[kind] and frame_fit.kind_dof[kind] < _MIN_DOF:
             raise NotIdentifiable(
-                f"{name}: the uncertainty could not be estimated: found {what} of "
-                f"{len(measurements.pairs)} rows that leave {found.kind_dof[kind]:.2g} degrees of "
-                f"freedom, needed at least {_MIN_DOF:g}; measure more poses, or state how precise "
-                f"they are with {option}."
+                f"{name}: the uncertainty could not be estimated: found {kind_name} of "
+                f"{len(measurements.pairs)} rows that leave {frame_fit.kind_dof[kind]:.2g} degrees "
+                f"of freedom, needed at least {_MIN_DOF:g}; measure more poses, or state how "
+                f"precise they are with {option}."
             )
 
 
@@ -224,10 +224,10 @@ def _check_unique(
     measurements: ToolMeasurements,
     determined: Determinacy,
     candidates: FrameCandidates,
-    at: Array,
+    tool: Array,
     name: str,
 ) -> None:
-    """Refuse where other frames explain the poses as well."""
+    """Refuse poses that other frames explain equally well."""
     best = determined.fit
     noise = replace(best.noise, stated=(True, True))
     for i in range(1, len(candidates.cost)):
@@ -238,7 +238,7 @@ def _check_unique(
             continue
         try:
             other = fit(measurements.pairs, start, noise, measurements.by_model)
-            other = hold_open_part(measurements, other, at)
+            other = hold_open_part(measurements, other, tool)
         except (DidNotConverge, np.linalg.LinAlgError):
             continue
         is_other = not _are_one(best.frames, other.frames, measurements.pairs.length)
@@ -252,32 +252,32 @@ def _check_unique(
             )
 
 
-def _are_one(one: Array, other: Array, length: float) -> bool:
-    """Say whether the frames of two answers are the same but for noise."""
-    shift, turn = _apart(one, other)
+def _are_one(frames: Array, other: Array, length: float) -> bool:
+    """Return whether two answers agree up to noise."""
+    shift, turn = _apart(frames, other)
     return shift <= _SAME_FRAMES * length and turn <= _SAME_FRAMES
 
 
-def _apart(one: Array, other: Array) -> tuple[float, float]:
-    """Return how far the frames of two answers are apart, the worse of base and tool [m, rad]."""
-    both = zip(transforms(one), transforms(other), strict=True)
-    shifts, turns = zip(*(pose_distance(a, b) for a, b in both), strict=True)
+def _apart(frames: Array, other: Array) -> tuple[float, float]:
+    """Return the distance of two answers, the larger one of base and tool [m, rad]."""
+    pairs = zip(transforms(frames), transforms(other), strict=True)
+    shifts, turns = zip(*(pose_distance(a, b) for a, b in pairs), strict=True)
     return max(shifts), max(turns)
 
 
 def _judge(
     measurements: ToolMeasurements,
-    name: str,  # what the poses are called
-    inliers: Inliers,  # the rows that the frames rest on
+    name: str,  # name of the poses in messages
+    inliers: Inliers,
     determined: Determinacy,
-    at: Array,  # (3,): the tool position in the platform that was held where it is open [m]
+    held_at: Array,  # (3,): position of the tool in the platform where it is not determined [m]
     *,
     is_given: bool,
 ) -> Location:
     """Return the location with its verdict."""
-    found = determined.fit
-    p_value, too_large, too_small = _tested(found)
-    base, tool = transforms(found.frames)
+    frame_fit = determined.fit
+    p_value, too_large, too_small = _tested(frame_fit)
+    base, tool = transforms(frame_fit.frames)
     if not measurements.is_oriented:
         tool = RigidTransform.from_translation(tool.translation)
     tool_position, tool_angle = _at_the_tool(measurements, determined)
@@ -293,12 +293,12 @@ def _judge(
         has_tool_orientation=measurements.is_oriented,
         covariance=0.5 * (determined.covariance + determined.covariance.T),
         held=determined.held,
-        held_at=(float(at[0]), float(at[1]), float(at[2])),
+        held_at=(float(held_at[0]), float(held_at[1]), float(held_at[2])),
         held_words=determined.words,
-        noise=_noise(measurements, found),
-        rows=tuple(_rows(measurements, inliers, found)),
-        chi2=found.chi2,
-        dof=found.dof,
+        noise=_noise(measurements, frame_fit),
+        rows=tuple(_rows(measurements, inliers, frame_fit)),
+        chi2=frame_fit.chi2,
+        dof=frame_fit.dof,
         p_value=p_value,
         tool_position_sigma=tool_position,
         tool_angle_sigma=tool_angle,
@@ -308,30 +308,30 @@ def _judge(
     )
 
 
-def _tested(found: FrameFit) -> tuple[float | None, str, str]:
-    """Return the probability of larger residuals, and what is too large or too small in words."""
-    noise = found.noise
-    kinds = [k for k in range(2) if noise.stated[k] and found.kind_dof[k] > 0.5]
+def _tested(frame_fit: FrameFit) -> tuple[float | None, str, str]:
+    """Return the probability of larger residuals, and phrases for too large or small scatter."""
+    noise = frame_fit.noise
+    kinds = [k for k in range(2) if noise.stated[k] and frame_fit.kind_dof[k] > 0.5]
     if not kinds:
         return None, "", ""
-    squares = (found.whitened**2).reshape(-1, 2, 3).sum(axis=(0, 2))
-    if len(kinds) == 2 or found.kind_dof.min() <= 0.5:
-        total, dof = found.chi2, float(found.dof)
+    squares = (frame_fit.whitened**2).reshape(-1, 2, 3).sum(axis=(0, 2))
+    if len(kinds) == 2 or frame_fit.kind_dof.min() <= 0.5:
+        total, dof = frame_fit.chi2, float(frame_fit.dof)
     else:
-        total, dof = float(squares[kinds[0]]), float(found.kind_dof[kinds[0]])
+        total, dof = float(squares[kinds[0]]), float(frame_fit.kind_dof[kinds[0]])
     p_value = float(chdtrc(dof, total))
     large, small = list[str](), list[str]()
     for k in kinds:
-        ratio = float(np.sqrt(squares[k] / found.kind_dof[k]))
+        ratio = float(np.sqrt(squares[k] / frame_fit.kind_dof[k]))
         words = f"{_KINDS[k]} scatter {ratio:.2g} times as much as was stated of them"
         (large if ratio > 1.0 else small).append(words)
     too_small = " and ".join(small) if p_value > _MAX_P else ""
     return p_value, " and ".join(large) if p_value < _MIN_P else "", too_small
 
 
-def _noise(measurements: ToolMeasurements, found: FrameFit) -> MeasurementNoise:
-    """Return what was stated or found of the measurement."""
-    rms = found.noise.rms
+def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNoise:
+    """Return the stated or estimated standard deviations of the measurement."""
+    rms = frame_fit.noise.rms
     oriented = measurements.is_oriented
     return MeasurementNoise(
         position=float(rms[0]),
@@ -343,10 +343,12 @@ def _noise(measurements: ToolMeasurements, found: FrameFit) -> MeasurementNoise:
     )
 
 
-def _rows(measurements: ToolMeasurements, inliers: Inliers, found: FrameFit) -> list[RowResidual]:
-    """Return the residuals of all rows; errors of the model are not taken out of them."""
+def _rows(
+    measurements: ToolMeasurements, inliers: Inliers, frame_fit: FrameFit
+) -> list[RowResidual]:
+    """Return the residuals of all rows; errors of the model are not subtracted."""
     pairs = measurements.pairs
-    r = residuals(found.frames, pairs)
+    r = residuals(frame_fit.frames, pairs)
     rows = []
     for i, number in enumerate(measurements.poses.numbers.tolist()):
         reason = "" if inliers.is_inlier[i] else _off(measurements, inliers, i)
@@ -362,20 +364,20 @@ def _rows(measurements: ToolMeasurements, inliers: Inliers, found: FrameFit) -> 
 
 
 def _off(measurements: ToolMeasurements, inliers: Inliers, i: int) -> str:
-    """Return how far a row is from where the others predict it."""
+    """Return the distance of a row from its prediction by the others, in words."""
     sigma = inliers.factor * measurements.noise.sigma[i]
-    found = f"{1e3 * inliers.distance[i]:.3g} mm"
+    distance = f"{1e3 * inliers.distance[i]:.3g} mm"
     scatter = f"{1e3 * sigma[0]:.2g} mm"
     if measurements.pairs.oriented[i]:
-        found += f" and {np.degrees(inliers.angle[i]):.3g} deg"
+        distance += f" and {np.degrees(inliers.angle[i]):.3g} deg"
         scatter += f" and {np.degrees(sigma[1]):.2g} deg"
-    return f"{found} from where the other rows predict it, which scatter {scatter}"
+    return f"{distance} from where the other rows predict it, which scatter {scatter}"
 
 
 def _at_the_tool(
     measurements: ToolMeasurements, determined: Determinacy
 ) -> tuple[float, float | None]:
-    """Return how well the frames put the tool in the world, rms over the poses [m], [rad]."""
+    """Return the standard deviations of the tool in the world, rms over the poses [m], [rad]."""
     J = jacobian(determined.fit.frames, measurements.pairs)
     variance = np.einsum("nij,jk,nik->ni", J, determined.covariance, J)
     position = float(np.sqrt(variance[:, :3].sum(axis=1).mean()))
@@ -393,12 +395,12 @@ def _sentence(
     sigma = np.sqrt(np.maximum(np.diagonal(determined.covariance), 0.0)).reshape(4, 3)
     size = np.linalg.norm(sigma, axis=1)
     base = f"{1e3 * size[0]:.2g} mm and {np.degrees(size[1]):.2g} deg"
-    known = [
+    uncertainties = [
         f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _FIXED_TOLERANCE * measurements.machine.size),
         f"{np.degrees(size[3]):.2g} deg"
         * bool(measurements.is_oriented and size[3] > _FIXED_TOLERANCE),
     ]
-    tool = " and ".join(words for words in known if words)
+    tool = " and ".join(words for words in uncertainties if words)
     tool = f", the tool in the platform to {tool}" if tool else ""
     tool += "" if measurements.is_oriented else " (its position only)"
     rows = f"{used} of {len(measurements.poses)} poses" if left_out else f"{used} poses"
@@ -431,7 +433,7 @@ def _notes(
     *,
     is_given: bool,
 ) -> list[str]:
-    """Return what else a reader should know."""
+    """Return further remarks."""
     notes = [*measurements.poses.notes, *determined.weak]
     if measurements.by_model is None:
         notes.append(

@@ -1,7 +1,7 @@
 """The frames without a start: closed forms on subsets of rows, and robust descent from them.
 
-Where no frames explain the poses, common mistakes (units, mirrored axes, orders) are undone one by
-one, to say which of them would.
+If no frames explain the poses, common mistakes (units, mirrored axes, orders) are undone one by one
+to name the likeliest.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from legcal.geometry.rotations import nearest_rotation
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.solver import solve
 
-_MAX_ROWS = 40  # that starts are tried on
+_MAX_ROWS = 40  # rows used in the search
 _SUBSETS = 30
 _SUBSET = 4  # rows
-_FIRST_ITERATIONS = 8  # on the rows that a start came from, and for all starts
-_N_CONTINUED = 12  # starts that go on
+_FIRST_ITERATIONS = 8  # iterations of all starts, each on the rows of its subset
+_N_CONTINUED = 12  # best starts, which are continued
 _MAX_ITERATIONS = 30
 _MAX_TURN = 0.5  # [rad] in one step
-_MAX_STALLED = 4  # iterations that hardly lower the cost
+_MAX_STALLED = 4  # iterations without a clear decrease of the cost
 # Mistakes
-_BETTER = 10.0  # times smaller residuals
-_CLEAR = 0.01  # of the spread of positions: below, no further mistake is tried
+_BETTER = 10.0  # ratio of residuals before and after a mistake is undone
+_CLEAR = 0.01  # residual, relative to the spread of positions, that ends the search for mistakes
 _MISTAKE_ROWS, _MISTAKE_SUBSETS = 12, 8
 _LENGTHS = (
     (1e-3, "millimetres", "divide x, y and z by 1000"),
@@ -54,10 +54,10 @@ _MIRRORS = (
 
 
 class FrameCandidates(NamedTuple):
-    """Where the search has ended, the best first."""
+    """End points of the search, the best first."""
 
     frames: Array  # (k, 2, 3, 4)
-    # (k,): mean square over the rows that agree best, lengths in units of ``pairs.length``
+    # (k,): mean square residual of the best rows, lengths in units of ``pairs.length``
     cost: Array
 
 
@@ -65,9 +65,9 @@ def search(
     pairs: PosePairs,
     fewest: int,  # rows that determine the frames
     *,
-    subsets: int = _SUBSETS,  # how many starts come from a few rows each
+    subsets: int = _SUBSETS,  # number of starts from small subsets of rows
 ) -> FrameCandidates:
-    """Return the frames that agree best with most rows, from starts all over the rotations."""
+    """Return the frames that agree best with most rows, from starts all over SO(3)."""
     if len(pairs) > _MAX_ROWS:
         pairs = pairs.of(np.linspace(0, len(pairs) - 1, _MAX_ROWS).astype(np.intp))
     n_kept = kept_rows(len(pairs), fewest)
@@ -81,12 +81,12 @@ def search(
 
 
 def kept_rows(n: int, fewest: int) -> int:
-    """Return how many of n rows a start must agree with: more than half of what can be spared."""
+    """Return the number of n rows that must agree: the fewest and half of the redundant rows."""
     return max(min(n, fewest), (n + fewest + 1) // 2)
 
 
 def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Array, BoolArray]:
-    """Return starts and the rows (k, n) that each came from."""
+    """Return k starts and a mask (k, n) of the rows of each."""
     n = len(pairs)
     rng = np.random.default_rng(0)
     everywhere = Rotation.create_group("O").as_matrix()
@@ -98,11 +98,11 @@ def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Array, BoolArr
     size = max(_SUBSET, fewest)
     for k in range(subsets if n > size else 0):
         chosen = np.sort(rng.choice(n, size, replace=False)).astype(np.intp)
-        some, R_base = pairs.of(chosen), everywhere[k % len(everywhere)]
-        if some.oriented.sum() >= 3:
-            starts.append(solve_by_kronecker(some))
+        subset, R_base = pairs.of(chosen), everywhere[k % len(everywhere)]
+        if subset.oriented.sum() >= 3:
+            starts.append(solve_by_kronecker(subset))
         else:
-            starts.append(with_positions(R_base, _tool_orientation(R_base, some), some))
+            starts.append(with_positions(R_base, _tool_orientation(R_base, subset), subset))
         rows.append(np.isin(np.arange(n), chosen))
     return np.array(starts), np.array(rows)
 
@@ -110,14 +110,14 @@ def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Array, BoolArr
 def solve_by_opencv(
     pairs: PosePairs,  # rows without an orientation are left out
 ) -> Array | None:
-    """Return the frames that OpenCV finds, or None where it finds none or has no solver."""
+    """Return the frames of OpenCV's robot-world/hand-eye solver, or None if it fails."""
     solver = getattr(cv2, "calibrateRobotWorldHandEye", None)
     rows = pairs.of(pairs.oriented)
     if solver is None or len(rows) < 3:
         return None
     A, B = np.swapaxes(rows.M, 1, 2), np.swapaxes(rows.R, 1, 2)
     try:
-        found = solver(
+        solution = solver(
             list(A),
             [-a @ p for a, p in zip(A, rows.p, strict=True)],
             list(B),
@@ -126,7 +126,7 @@ def solve_by_opencv(
         )
     except cv2.error:
         return None
-    R_X, t_X, R_Z, t_Z = (np.asarray(part, dtype=np.float64) for part in found)
+    R_X, t_X, R_Z, t_Z = (np.asarray(part, dtype=np.float64) for part in solution)
     if not all(np.isfinite(part).all() for part in (R_X, t_X, R_Z, t_Z)):
         return None
     R_tool = nearest_rotation(R_Z).T
@@ -139,8 +139,8 @@ def solve_by_kronecker(
 ) -> Array:
     """Return the frames by the largest singular pair of sum_i R_i (x) M_i.
 
-    From M_i R_tool^T R_i^T = R_base follows (R_i (x) M_i) vec(R_tool^T) = vec(R_base). Where
-    rotations leave the orientations open, some solution among many is returned.
+    From M_i R_tool^T R_i^T = R_base follows (R_i (x) M_i) vec(R_tool^T) = vec(R_base). If the
+    rotations do not determine the orientations, one of many solutions is returned.
     """
     rows = pairs.of(pairs.oriented)
     K = np.einsum("nij,nkl->ikjl", rows.R, rows.M).reshape(9, 9)
@@ -154,8 +154,7 @@ def solve_by_kronecker(
 def with_positions(
     R_base: Array,  # R_base, R_tool: (..., 3, 3): orientations of T_world_base and T_platform_tool
     R_tool: Array,
-    # what the positions are to agree with; the smallest ones where these leave some open
-    pairs: PosePairs,
+    pairs: PosePairs,  # undetermined positions get the minimum norm
 ) -> Array:
     """Return frames of known orientations with the positions of linear least squares."""
     batch, n = R_base.shape[:-2], len(pairs)
@@ -179,7 +178,7 @@ def _tool_orientation(R_base: Array, pairs: PosePairs) -> Array:
 
 
 def _descended(pairs: PosePairs, frames: Array, rows: Array | int, max_iterations: int) -> Array:
-    """Return each start after damped steps on given rows (k, n), or on so many of its best."""
+    """Return the starts after damped steps on given rows (k, n), or on a number of best rows."""
 
     def equations(frames: Array) -> tuple[Array, Array]:
         r = residuals(frames, pairs) * pairs.unit
@@ -206,41 +205,43 @@ def _descended(pairs: PosePairs, frames: Array, rows: Array | int, max_iteration
 
 
 def _trimmed_cost(frames: Array, pairs: PosePairs, n_kept: int) -> Array:
-    """Return the sums of squares of the best rows, (k,)."""
+    """Return the sums of squares over the best rows, (k,)."""
     r = residuals(frames, pairs) * pairs.unit
     return np.asarray(np.einsum("kni,kni,kn->k", r, r, _best(r, n_kept)))
 
 
 def _best(r: Array, n_kept: int) -> Array:
-    """Return one for the rows of each start with the smallest residuals, else zero, (k, n)."""
+    """Return weights (k, n): one for the rows of each start with the smallest residuals."""
     rank: IntArray = np.argsort(np.argsort((r**2).sum(axis=2), axis=1, kind="stable"), axis=1)
     return (rank < n_kept).astype(np.float64)
 
 
 def likely_mistake(
     pairs: PosePairs,
-    cost: float,  # of the best candidate for them
+    cost: float,  # cost of the best candidate
     fewest: int,  # rows that determine the frames
 ) -> tuple[str, str] | None:
-    """Return what the poses look like and what to do, or None."""
-    best, likely = cost / _spread(pairs) / _BETTER**2, None
-    few = pairs.of(np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp))
-    for changed, looks_like, remedy in _alternatives(few):
+    """Return a description of the likeliest mistake and its remedy, or None."""
+    best, mistake = cost / _spread(pairs) / _BETTER**2, None
+    selected = pairs.of(
+        np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp)
+    )
+    for changed, looks_like, remedy in _alternatives(selected):
         other = float(search(changed, fewest, subsets=_MISTAKE_SUBSETS).cost[0]) / _spread(changed)
         if other < best:
-            best, likely = other / _BETTER**2, (looks_like, remedy)
+            best, mistake = other / _BETTER**2, (looks_like, remedy)
             if other < _CLEAR**2:
                 break
-    return likely
+    return mistake
 
 
 def _spread(pairs: PosePairs) -> float:
-    """Return how far positions are apart, squared, in units of ``pairs.length``."""
+    """Return the total variance of the positions in units of ``pairs.length``."""
     return float(pairs.p.var(axis=0).sum()) / pairs.length**2 + 1e-300
 
 
 def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
-    """Yield the poses with each mistake undone, what they look like with it, and what to do."""
+    """Yield the poses with each mistake undone, a description of the mistake, and its remedy."""
     has_orientations = bool(pairs.oriented.any())
     reordered = _reordered(pairs.M)
     wrong_order = "quaternions in the order w, x, y, z", "write qx, qy, qz, qw under their names"
@@ -248,9 +249,9 @@ def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
         metres = replace(pairs, p=size * pairs.p)
         yield metres, f"positions in {unit}", remedy
         if has_orientations:
-            both = replace(metres, M=reordered)
+            corrected = replace(metres, M=reordered)
             yield (
-                both,
+                corrected,
                 f"positions in {unit} and {wrong_order[0]}",
                 f"{remedy}, and {wrong_order[1]}",
             )
@@ -274,6 +275,6 @@ def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
 
 
 def _reordered(M: Array) -> Array:
-    """Return orientations whose quaternions were read as x, y, z, w and are w, x, y, z."""
+    """Return orientations with quaternions w, x, y, z that were read as x, y, z, w."""
     quaternions = Rotation.from_matrix(M).as_quat()
     return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()

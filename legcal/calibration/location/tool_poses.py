@@ -1,13 +1,12 @@
-"""Measured tool poses: the table, and what is known of the errors of its rows.
+"""Measured tool poses: the table, and the noise of its rows.
 
-The table is a CSV file that is read strictly. Its header has the actuated joints, ``x,y,z`` and,
-where orientations are measured, ``qx,qy,qz,qw``, in any order; optional are ``name``,
-``position_sigma`` and ``angle_sigma``.
+The table is a CSV file. Its header has the actuated joints, ``x,y,z`` and, if orientations are
+measured, ``qx,qy,qz,qw``, in any order; ``name``, ``position_sigma`` and ``angle_sigma`` are
+optional.
 
-The errors of a row are those of the measurement, the same in all directions: one standard
-deviation for positions and one for orientations, times a factor that may be unknown; those of the
-readings, which move position and orientation together; and those of a calibrated model, which all
-rows share.
+A row has three sources of error: the measurement, which is isotropic, with one standard deviation
+for positions and one for orientations, times a factor that may be unknown; the readings, which move
+position and orientation together; and a calibrated model, whose errors all rows share.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import first_rods, readings_of_rods
 
-MIN_SIGMA = 1e-9  # [m, rad]; nobody measures better, and files round
-MAX_ANGLE_SIGMA = 0.2  # [rad]; a larger one is none of a measured orientation
-FEWEST = 3  # poses, where orientations are measured
-FEWEST_POSITIONS = 4
+MIN_SIGMA = 1e-9  # [m, rad]; no measurement is better, and files round
+MAX_ANGLE_SIGMA = 0.2  # [rad]; with a larger one the orientation was not measured
+FEWEST = 3  # poses with orientation that determine the frames
+FEWEST_POSITIONS = 4  # poses without orientation
 _MAX_POSITION = 1e6  # [m]; squares of far larger positions overflow
-_NORM_TOLERANCE = 1e-5  # of a quaternion: less is not worth a note
-_NEGLIGIBLE = 1e-12  # of the largest eigenvalue of the covariance
-_RADIAN = 0.25  # leg lengths that a radian is compared with
-_FIRST_FACTOR = 1e-2  # of the length, and [rad]: where the estimate of unknown scatter starts
+_NORM_TOLERANCE = 1e-5  # deviation of the norm of a quaternion from one that is worth a note
+_NEGLIGIBLE = 1e-12  # negligible eigenvalue of the covariance, relative to the largest
+_RADIAN = 0.25  # mean leg lengths equivalent to a radian
+_FIRST_FACTOR = 1e-2  # start of the estimate of an unknown scatter [machine lengths, rad]
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _COLUMNS = (
@@ -93,18 +92,18 @@ _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNOREC
 @brief
 @dataclass(frozen=True, eq=False)
 class ToolPoses:
-    """What a laser tracker, a CMM or a camera measured, one row a pose."""
+    """Tool poses measured by a laser tracker, a CMM or a camera, one row a pose."""
 
     q: Array  # (n, n_legs): readings in the order of the legs [m or rad]; NaN without a motor
-    position: Array  # (n, 3): of the tool in the world [m]
-    rotation: Array  # (n, 3, 3): T_world_tool; the identity where only the position was measured
-    oriented: BoolArray  # (n,): where the orientation was measured too
+    position: Array  # (n, 3): position of the tool in the world [m]
+    rotation: Array  # (n, 3, 3): T_world_tool; the identity if only the position was measured
+    oriented: BoolArray  # (n,): whether the orientation was measured too
     # position_sigma, angle_sigma: (n,): standard deviation of each component [m], [rad]; None if
     # not stated
     position_sigma: Array | None
     angle_sigma: Array | None
-    numbers: IntArray  # (n,): of the rows in the file, from 1
-    notes: tuple[str, ...] = ()  # what is odd but allowed
+    numbers: IntArray  # (n,): numbers of the rows in the file, from 1
+    notes: tuple[str, ...] = ()  # warnings about the table
 
     def __len__(self) -> int:
         return len(self.position)
@@ -113,7 +112,7 @@ class ToolPoses:
 def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     """Return the measured tool poses of a file.
 
-    Raises DatasetError with one sentence for each thing that is wrong, naming row and column.
+    Raises DatasetError with one sentence for each problem, naming row and column.
     """
     table = read_table(
         path,
@@ -128,17 +127,19 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     rotation, oriented, worst = _orientations(table)
     if "angle_sigma" in table:
         if "qx" not in table:
-            found, needed = "angle_sigma and no quaternions", "qx, qy, qz, qw beside it"
+            actual, needed = "angle_sigma and no quaternions", "qx, qy, qz, qw beside it"
             table.refuse_file(
-                header_problem(path, found, needed, "add the columns", Code.MISSING_COLUMN)
+                header_problem(path, actual, needed, "add the columns", Code.MISSING_COLUMN)
             )
         table.need(["angle_sigma"], oriented)
     joints = [column.name for column in reading_columns(machine.legs)]
-    same = table.numbers([*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)])
+    numbers = table.numbers(
+        [*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)]
+    )
     table.once(
         [
             tuple(row) if np.all(np.isfinite(row[: len(joints) + 3])) else None
-            for row in np.where(np.isnan(same), math.inf, same).tolist()
+            for row in np.where(np.isnan(numbers), math.inf, numbers).tolist()
         ],
         "the same readings and the same pose",
     )  # one measurement would count as two
@@ -165,25 +166,25 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
 
 
 def _about_angles(path: Path, name: str) -> Problem | None:
-    """Return what is wrong with a column that looks like an angle."""
+    """Return the problem of a column that looks like an angle."""
     if not _ANGLES.fullmatch(name):
         return None
-    found, needed = f"'{name}', which looks like an angle", "orientations as quaternions "
+    actual, needed = f"'{name}', which looks like an angle", "orientations as quaternions "
     needed += ", ".join(_QUATERNION)
-    return header_problem(path, found, needed, "convert the angles", Code.UNKNOWN_COLUMN)
+    return header_problem(path, actual, needed, "convert the angles", Code.UNKNOWN_COLUMN)
 
 
 def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
-    """Return orientations (n, 3, 3), where there are any, and how far norms are off at most."""
+    """Return orientations (n, 3, 3), a mask (n,) of measured ones, the largest error of a norm."""
     rotation = np.tile(np.eye(3), (len(table), 1, 1))
     quaternions = table.numbers(_QUATERNION)
     norms = np.linalg.norm(quaternions, axis=1)
     error = np.abs(norms - 1.0)
     for i in np.flatnonzero(error > QUATERNION_TOLERANCE).tolist():
         hint = "; these look like angles in degrees" if norms[i] > 2.0 else ""
-        found = f"a quaternion of norm {norms[i]:.6g}"
+        actual = f"a quaternion of norm {norms[i]:.6g}"
         needed, remedy = f"1 within {QUATERNION_TOLERANCE:g}{hint}", "check its four numbers"
-        table.refuse(i, found, needed, *_QUATERNION, remedy=remedy, what="orientation")
+        table.refuse(i, actual, needed, *_QUATERNION, remedy=remedy, what="orientation")
     oriented = error <= QUATERNION_TOLERANCE
     if np.any(oriented):
         rotation[oriented] = Rotation.from_quat(quaternions[oriented]).as_matrix()
@@ -194,26 +195,27 @@ def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
 class PoseNoise:
     """Standard deviations of the rows."""
 
-    sigma: Array  # (n, 2): of position [m] and orientation [rad] of each row, up to ``factor``
-    factor: Array  # (2,): what all of a kind are multiplied with
-    # whether the standard deviations of positions and of orientations were stated; the factor of
-    # those that were not is estimated
+    # (n, 2): standard deviation of position [m] and orientation [rad] of each row, up to ``factor``
+    sigma: Array
+    factor: Array  # (2,): common factors of all positions and all orientations
+    # whether the standard deviations of positions and of orientations were stated; otherwise their
+    # factor is estimated
     stated: tuple[bool, bool]
     # (n, 6, 6): covariance of the tool pose by errors of the readings [m, rad]; None without any
     readings: Array | None = None
 
     def of(self, rows: BoolArray | IntArray) -> PoseNoise:
-        """Return that of some rows."""
+        """Return the noise of selected rows."""
         readings = None if self.readings is None else self.readings[rows]
         return replace(self, sigma=self.sigma[rows], readings=readings)
 
     def scaled(self, factor: Array) -> PoseNoise:
-        """Return the same with other factors."""
+        """Return a copy with other factors."""
         return replace(self, factor=factor)
 
     @property
     def min_factor(self) -> Array:
-        """The smallest factor of each kind that can be meant, (2,)."""
+        """The smallest plausible factor of each kind, (2,)."""
         return np.asarray(MIN_SIGMA / self.sigma.min(axis=0))
 
     @property
@@ -222,11 +224,11 @@ class PoseNoise:
         return np.asarray(self.factor * np.sqrt((self.sigma**2).mean(axis=0)))
 
     def standard_deviations(self) -> Array:
-        """Return those of each row and component without the readings', (n, 6) [m, rad]."""
+        """Return the standard deviations without errors of the readings, (n, 6) [m, rad]."""
         return np.repeat(self.sigma * self.factor, 3, axis=1)
 
     def whitening(self, oriented: BoolArray) -> Array:
-        """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero where unmeasured."""
+        """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero if not measured."""
         sigma = self.standard_deviations()
         if self.readings is None:
             W = np.zeros((*sigma.shape, 6))
@@ -242,21 +244,21 @@ class PoseNoise:
 
 @dataclass(frozen=True, eq=False)
 class ToolMeasurements:
-    """Measured tool poses with all that is known of their errors."""
+    """Measured tool poses with the platform poses at their readings and all sources of noise."""
 
     machine: Machine
     poses: ToolPoses  # as measured
-    pairs: PosePairs  # beside the platform poses at the readings
-    noise: PoseNoise  # of the measurement
-    encoder_sigma: float  # the largest of a reading [m or rad]; zero if none was stated
+    pairs: PosePairs
+    noise: PoseNoise  # standard deviations of the measurement
+    encoder_sigma: float  # largest standard deviation of a reading [m or rad]; zero if none stated
     # by_readings, by_model: (n, 6, k): platform motions (see tool_motions) by independent errors of
-    # one standard deviation; None if nothing is known of them
+    # one standard deviation; None without such errors
     by_readings: Array | None
     by_model: Array | None
-    fewest: int  # poses that can determine the frames
+    fewest: int  # smallest number of poses that determines the frames
 
     def of(self, rows: BoolArray) -> ToolMeasurements:
-        """Return some rows, with the measured poses as they were."""
+        """Return the measurements of selected rows; ``poses`` keeps all of them."""
         return replace(
             self,
             pairs=self.pairs.of(rows),
@@ -266,7 +268,7 @@ class ToolMeasurements:
         )
 
     def noise_at(self, frames: Array) -> PoseNoise:
-        """Return the noise with what errors of the readings do to the tool at some frames."""
+        """Return the noise including the effect of reading errors on the tool at given frames."""
         if self.by_readings is None:
             return self.noise
         moved = tool_motions(self.by_readings, frames, self.pairs)
@@ -281,18 +283,18 @@ class ToolMeasurements:
 def tool_measurements(
     machine: Machine,
     poses: ToolPoses,
-    name: str,  # what they are called in messages
+    name: str,  # name of the poses in messages
     *,
-    # position_sigma, angle_sigma: standard deviations of all rows [m], [rad]; None where the table
-    # has them or residuals are to give them
+    # position_sigma, angle_sigma: standard deviations of all rows [m], [rad]; None if the table
+    # states them or they are to be estimated from the residuals
     position_sigma: float | None,
     angle_sigma: float | None,
-    encoder_sigma: Mapping[str, float],  # by motor [m or rad], of those that are not exact
+    encoder_sigma: Mapping[str, float],  # by motor [m or rad], without exact ones
 ) -> ToolMeasurements:
-    """Return measured poses beside those of the platform, with what is known of their errors.
+    """Return measured poses with the platform poses at their readings and their noise.
 
     Raises NotIdentifiable if there are too few poses, or the motors do not determine the pose;
-    DidNotConverge if the machine cannot have some readings; UsageError if a standard deviation is
+    DidNotConverge if the machine cannot reach some readings; UsageError if a standard deviation is
     stated twice.
     """
     fewest = FEWEST if poses.oriented.any() else FEWEST_POSITIONS
@@ -324,19 +326,19 @@ def tool_measurements(
 
 
 def _check_count(poses: ToolPoses, name: str, fewest: int) -> None:
-    """Refuse too few poses, and poses that are all one."""
+    """Refuse too few poses or too few different readings."""
     n = len(poses)
     columns = ~np.isnan(poses.q).any(axis=0)
     n_different = len(np.unique(poses.q[:, columns], axis=0))
     if n_different >= fewest:
         return
-    what = "measured with orientation" if poses.oriented.any() else "of which only positions"
-    found = f"{n} pose{'s' * (n != 1)}" if n == n_different else (
+    kind = "measured with orientation" if poses.oriented.any() else "of which only positions"
+    actual = f"{n} pose{'s' * (n != 1)}" if n == n_different else (
         f"{n} rows at {n_different} different reading{'s' * (n_different != 1)}"
     )  # fmt: skip
     raise NotIdentifiable(
-        f"{name}: base and tool could not be located: found {found}, needed at least {fewest} "
-        f"poses {what}{' were measured' * (not poses.oriented.any())}, with rotations about two "
+        f"{name}: base and tool could not be located: found {actual}, needed at least {fewest} "
+        f"poses {kind}{' were measured' * (not poses.oriented.any())}, with rotations about two "
         "axes where the machine has them; measure more poses."
     )
 
@@ -348,18 +350,18 @@ def _noise(
     length: float,
     name: str,
 ) -> PoseNoise:
-    """Return the standard deviations that were stated, and a start for the others."""
+    """Return the stated standard deviations, and a start for the others."""
     sigma = np.ones((len(poses), 2))
     factor, stated = np.array([_FIRST_FACTOR * length, _FIRST_FACTOR]), [False, False]
-    given = (
+    sources = (
         ("position", poses.position_sigma, position_sigma),
         ("angle", poses.angle_sigma, angle_sigma),
     )
-    for kind, (what, column, number) in enumerate(given):
+    for kind, (name_of_kind, column, number) in enumerate(sources):
         if column is not None and number is not None:
             raise UsageError(
-                f"{name}: the {what} sigma could not be used: found it in the column "
-                f"{what}_sigma and as an option, needed it once; leave one of them out."
+                f"{name}: the {name_of_kind} sigma could not be used: found it in the column "
+                f"{name_of_kind}_sigma and as an option, needed it once; leave one of them out."
             )
         if column is None and number is None:
             continue
@@ -376,7 +378,7 @@ def motions_by_readings(
     poses: Sequence[RigidTransform],
     sigma: Mapping[str, float],  # standard deviations of readings by motor [m or rad]
 ) -> Array:
-    """Return the platform motions (n, 6, k) by an error of each reading at some poses."""
+    """Return the platform motions (n, 6, k) by an error of each reading at given poses."""
     R, t = _joint_frames(machine, poses)
     legs = geometries(machine)
     equations = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
@@ -384,11 +386,11 @@ def motions_by_readings(
     inverse = np.linalg.pinv(equations.by_pose[:, :, columns])
     of_leg = np.array([sigma.get(str(leg.prismatic), 0.0) for leg in machine.legs])
     hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
-    own = equations.measured & ~hangs[equations.leg]
-    moved = np.zeros((len(poses), 6, own.sum() + equations.by_q.shape[2]))
+    is_rod = equations.measured & ~hangs[equations.leg]
+    moved = np.zeros((len(poses), 6, is_rod.sum() + equations.by_q.shape[2]))
     moved[:, columns] = np.concatenate(  # the sign of a reading does not matter
         [
-            inverse[:, :, own] * of_leg[equations.leg[own]],
+            inverse[:, :, is_rod] * of_leg[equations.leg[is_rod]],
             inverse @ equations.by_q * of_leg[first_rods(legs)],
         ],
         axis=2,
@@ -397,15 +399,15 @@ def motions_by_readings(
 
 
 def _of_table(problem: Problem, name: str) -> Problem:
-    """Return what is wrong with the poses of a table at a machine, which may name its file."""
-    what = f"{problem.file}: {problem.what}" if problem.file else problem.what
-    return replace(problem, what=what, file=name)
+    """Return a problem of the kinematics as one of the table of poses."""
+    sentence = f"{problem.file}: {problem.what}" if problem.file else problem.what
+    return replace(problem, what=sentence, file=name)
 
 
 def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Array | None:
     """Return the platform motions (n, 6, k) by the errors of a calibrated model.
 
-    None where the model does not lie in the result folder of a calibration.
+    None if the model is not in the result folder of a calibration.
     """
     path = Path(machine.yaml_path)
     if path.name != RESULT_YAML or not os.path.isfile(path.parent / RESULT_NAME):
@@ -416,13 +418,13 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
         raise DatasetError(
             [f"The covariance of the model could not be used: {p}" for p in error.problems]
         ) from error
-    known = parametrization_of(machine, twists=True)
+    parametrization = parametrization_of(machine, twists=True)
     R, t = _joint_frames(machine, poses)
-    by_parameters = pose_sensitivity(geometries(machine), known, machine.frame_legs, R, t)
+    by_parameters = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, R, t)
     values, vectors = np.linalg.eigh(result.covariance)
-    kept = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
-    root = vectors[:, kept] * np.sqrt(values[kept])
-    columns = [known.names.index(name) for name in result.names]
+    significant = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
+    root = vectors[:, significant] * np.sqrt(values[significant])
+    columns = [parametrization.names.index(name) for name in result.names]
     return _of_link(machine, poses, by_parameters[:, :, columns] @ root)
 
 
@@ -433,7 +435,7 @@ def _joint_frames(machine: Machine, poses: Sequence[RigidTransform]) -> tuple[Ar
 
 
 def _of_link(machine: Machine, poses: Sequence[RigidTransform], moved: Array) -> Array:
-    """Return motions of R_e in R_b (n, 6, k) as those of the platform link in the base link."""
+    """Return motions of R_e in R_b (n, 6, k) as motions of the platform link in the base link."""
     to_base = machine.T_base_Rb.rotation.as_matrix()
     turn = to_base @ moved[:, :3]
     origin = machine.T_platform_Re.translation

@@ -1,7 +1,7 @@
-"""World and tool in the URDF: two links, held by fixed joints; all else stays.
+"""World and tool in the URDF: two links on fixed joints; all else stays.
 
-A ``world`` link above the root carries the machine, a ``tool`` link hangs on the platform. Where
-they are there already, as an earlier location leaves them, their origins are changed.
+A ``world`` link above the root carries the machine, a ``tool`` link is a child of the platform. If
+the links exist, as after an earlier location, only their origins are changed.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from legcal.machine.urdf import Urdf, UrdfPatch
 
 WORLD = "world"
 TOOL = "tool"
-_TOLERANCE = 2.5e-12  # mean leg lengths: rounding of the analysis
+_TOLERANCE = 2.5e-12  # rounding of the analysis [mean leg lengths]
 
 
 def write_located_model(
     machine: Machine,  # the machine that was located
     location: Location,
-    folder: Path,  # gets ``models`` and ``urdf``; nothing there is replaced
+    folder: Path,  # parent of ``models`` and ``urdf``; existing files are not replaced
     *,
     world: str = WORLD,
     tool: str = TOOL,
@@ -90,7 +90,7 @@ def with_frames(
 
 
 def _from_root(urdf: Urdf, base: str) -> RigidTransform:
-    """Return T_root_base, refused where a joint between them moves."""
+    """Return T_root_base; refuse a moving joint between them."""
     above = {joint.child: joint for joint in urdf.joints.values()}
     T, link = RigidTransform.identity(), base
     while link != urdf.root:
@@ -106,7 +106,7 @@ def _from_root(urdf: Urdf, base: str) -> RigidTransform:
 
 
 def _joint_of_world(machine: Machine, world: str) -> str:
-    """Return the fixed joint below a world link that carries all the rest."""
+    """Return the fixed joint below a world link that carries the whole machine."""
     urdf = machine.urdf
     below = [joint for joint in urdf.joints.values() if joint.parent == world]
     if world == urdf.root != machine.base and len(below) == 1 and not below[0].moves:
@@ -119,7 +119,7 @@ def _joint_of_world(machine: Machine, world: str) -> str:
 
 
 def _joint_of_tool(machine: Machine, tool: str) -> str:
-    """Return the fixed joint between the platform and a tool link that carries nothing."""
+    """Return the fixed joint between the platform and a tool link without children."""
     urdf = machine.urdf
     joint = next((joint for joint in urdf.joints.values() if joint.child == tool), None)
     frames = {name for c in machine.chain.closures for name in (c.frame_1, c.frame_2)}
@@ -152,14 +152,14 @@ def check_same(before: Machine, after: Machine) -> None:
 
     Raises ModelError if its analysis differs by more than rounding.
     """
-    same = (
+    is_same = (
         before.leg_names == after.leg_names
         and before.motors == after.motors
         and before.mobility == after.mobility
         and before.frame_legs == after.frame_legs
         and all(
-            np.abs(one - other).max() <= _TOLERANCE * before.size
-            for one, other in (
+            np.abs(a - b).max() <= _TOLERANCE * before.size
+            for a, b in (
                 (before.A_base, after.A_base),
                 (before.B_platform, after.B_platform),
                 (before.q0, after.q0),
@@ -167,7 +167,7 @@ def check_same(before: Machine, after: Machine) -> None:
             )
         )
     )
-    if not same:
+    if not is_same:
         raise ModelError(
             f"{before.urdf_path}: the frames could not be written: found another machine after "
             "it, needed the same one; give other names (--world-link, --tool-link)."

@@ -1,5 +1,5 @@
-"""What the pages of the jobs say: sections and blocks of :mod:`legcal.pages`, made of results.
+"""The contents of the pages of the jobs: sections and blocks of :mod:`legcal.pages`.
 
-``calibration_page`` is the page of a calibration, ``text_page`` that of any job whose text says
-all: ``writing`` renders them and writes the files.
+``calibration_page`` is the page of a calibration, ``text_page`` the page of other jobs, made from
+their text; ``writing`` renders them and writes the files.
 """

@@ -32,7 +32,7 @@ def calibration_page(
 ) -> Page:
     """Return the page of a calibration whose result folder this is, made by a command.
 
-    *against* are the blocks of a section on the truth, where that is given.
+    *against* are the blocks of a section on the truth, if it is given.
     """
     machine = calibration.dataset.machine
     when = time_of_page()
@@ -42,7 +42,7 @@ def calibration_page(
         ("truth", "Against the truth", against),
         ("parameters", "Parameters", [*parameter_tables(calibration), *change_charts(calibration)]),
         ("machine", "The machine", [machine_scene(calibration)]),
-        *_of_outlines(calibration),
+        *_outline_sections(calibration),
         ("identifiability", "Identifiability", identifiability_blocks(calibration)),
         ("correlation", "Correlations", correlation_blocks(calibration)),
         ("holdout", "Held-out images", held_out_blocks(calibration)),
@@ -57,8 +57,8 @@ def calibration_page(
     )
 
 
-def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
-    """Return the sections on residuals and on the outlines that are furthest off."""
+def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
+    """Return the sections on residuals and on the outlines with the largest ones."""
     if not len(calibration.residuals):
         return []
     crops = outline_crops(calibration, calibration.overlays)
@@ -66,25 +66,25 @@ def _of_outlines(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]
     missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
     lines = Text(
         [
-            "Green is the outline as measured, red if the fit rejected it, dashed orange where the "
-            "fit has it. A click enlarges; then scroll to zoom and drag to move."
+            "Green: measured outline, red if rejected by the fit; dashed orange: predicted by the "
+            "fit. Click to enlarge, scroll to zoom, drag to move."
         ],
         dim=True,
     )
     galleries = [
-        Gallery(found, title)
-        for found, title in (
+        Gallery(gallery, title)
+        for gallery, title in (
             (
                 crops.worst,
                 f"The worst {len(crops.worst)}, by their distance in standard deviations",
             ),
-            (crops.median, f"{len(crops.median)} in the middle"),
+            (crops.median, f"{len(crops.median)} typical ones (median distance)"),
         )
-        if found
+        if gallery
     ]
-    found: list[tuple[str, str, Sequence[Any]]] = [
+    sections: list[tuple[str, str, Sequence[Any]]] = [
         ("residuals", "Residuals", [Row(residual_plots(calibration, crops.links))])
     ]
     if galleries or missing:
-        found.append(("outlines", "Outlines", [*missing, lines, *galleries]))
-    return found
+        sections.append(("outlines", "Outlines", [*missing, lines, *galleries]))
+    return sections

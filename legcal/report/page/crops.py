@@ -1,4 +1,4 @@
-"""Pieces of photographs about single outlines, with the outline as measured and by the fit."""
+"""Crops of photographs around single outlines, with the measured and the predicted outline."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
 N_WORST, N_MEDIAN = 30, 10
-MAX_BYTES = 1_300_000  # of all pictures as they are written: pages of any size stay below 9 MB
-_MARGIN = 18  # about an outline [px]
-_ASPECT = 0.8  # of its sides, the shorter to the longer, at least
-_SIDE = 360  # longer side of a picture; what is larger is reduced [px]
-_QUALITY = 78  # of JPEG [percent]
-_N_POINTS = 12  # of a line
-_SMALLER = 0.7  # each attempt to keep to MAX_BYTES
+MAX_BYTES = 1_300_000  # largest total size of the pictures, so that pages stay below 9 MB
+_MARGIN = 18  # margin around an outline [px]
+_ASPECT = 0.8  # smallest ratio of the shorter to the longer side
+_SIDE = 360  # largest longer side of a picture [px]
+_QUALITY = 78  # JPEG quality [percent]
+_N_POINTS = 12  # points along a line
+_SMALLER = 0.7  # scale factor of each attempt to keep to MAX_BYTES
 
 
 @dataclass(frozen=True)
 class Crops:
-    """The pieces that a page shows."""
+    """The crops on a page."""
 
     worst: list[Crop]
     median: list[Crop]
-    links: dict[int, str]  # where the outlines of the table are shown, by their row
+    links: dict[int, str]  # targets of links to outlines, by row of the table
     missing: tuple[str, ...]  # images that could not be read any more
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """A piece of an image before it is a picture."""
+    """A crop of an image before encoding."""
 
     outline: int
     grey: Image
@@ -50,9 +50,9 @@ class _Piece:
 
 
 def outline_crops(calibration: Calibration, overlays: Mapping[int, str]) -> Crops:
-    """Return the worst outlines and those in the middle, by their distance in sigmas.
+    """Return the outlines with the largest and with median residuals in sigmas.
 
-    *overlays* are pictures of whole images beside the page, by row of the measurements.
+    *overlays* are pictures of whole images in the folder of the page, by row of the measurements.
     """
     residuals, outlines = calibration.residuals, calibration.solution.outlines
     dataset = calibration.dataset
@@ -99,7 +99,7 @@ def outline_crops(calibration: Calibration, overlays: Mapping[int, str]) -> Crop
 
 
 def _cut(outline: int, image: Image, ends: Array) -> _Piece:
-    """Return the piece of an image about an outline."""
+    """Return the crop of an image around an outline."""
     middle, half = ends.mean(axis=0), 0.5 * np.ptp(ends, axis=0) + _MARGIN
     half = np.maximum(half, _ASPECT * half.max())
     low, high = np.floor(middle - half).astype(int), np.ceil(middle + half).astype(int) + 1
@@ -110,7 +110,7 @@ def _cut(outline: int, image: Image, ends: Array) -> _Piece:
 
 
 def _picture(piece: _Piece, scale: float, quality: int) -> str:
-    """Return a piece as a data URL."""
+    """Encode a crop as a data URL."""
     grey = np.clip(np.rint(piece.grey), 0, 255).astype(np.uint8)
     factor = scale * min(1.0, _SIDE / max(grey.shape))
     if factor < 1.0:
@@ -124,7 +124,7 @@ def _picture(piece: _Piece, scale: float, quality: int) -> str:
 def _crop(
     calibration: Calibration, piece: _Piece, picture: str, k: int, overlays: Mapping[int, str]
 ) -> Crop:
-    """Return a piece with what is drawn over it."""
+    """Return a crop with its lines and caption."""
     residuals, outlines = calibration.residuals, calibration.solution.outlines
     dataset, solution = calibration.dataset, calibration.solution
     i, measurements = piece.outline, dataset.measurements
@@ -149,7 +149,7 @@ def _crop(
         ),
         ("predicted", _points(_curve(solution.cameras[v], fit, outlines.ends[i]) - origin)),
     ]
-    off, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
+    offset, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
     name = dataset.machine.leg_names[j]
     rejected = "" if outlines.used[i] else f"; rejected: {outlines.reason[i]}"
     height, width = piece.grey.shape
@@ -159,14 +159,14 @@ def _crop(
         width=width,
         height=height,
         lines=lines,
-        caption=f"{name}, edge {outlines.edge[i]}: {off[0]:+.3f} and {off[1]:+.3f} px",
+        caption=f"{name}, edge {outlines.edge[i]}: {offset[0]:+.3f} and {offset[1]:+.3f} px",
         detail=f"{sigmas:.1f} sigma, {row_names(measurements)[row]}{rejected}",
         link=overlays.get(row, ""),
     )
 
 
 def _curve(camera: Camera, h: Array, ends: Array) -> Array:
-    """Return points in the image of a line (3,) of the sensor plane between two places [px]."""
+    """Return points of the image of a line (3,) of the sensor plane between two ends [px]."""
     xy = camera.undistort(ends)
     normal = h[:2] / (h[:2] @ h[:2])
     feet = xy - (xy @ h[:2] + h[2])[:, None] * normal

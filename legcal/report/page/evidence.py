@@ -1,4 +1,4 @@
-"""What a calibration rests on: counts and ranks, correlations, held-out images, notes, inputs."""
+"""Evidence for a calibration: counts, ranks, correlations, held-out images, notes, inputs."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from legcal.report.identify import CONDITIONS
 from legcal.report.page.parameter_rows import correlation
 from legcal.version import __version__
 
-MAX_HASHED = 400_000_000  # of images [bytes]: more would be waited for
+MAX_HASHED = 400_000_000  # largest total size of hashed images [bytes]; more would take long
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Any]:
-    """Return counts, ranks, and the directions that are known worst."""
+    """Return counts, ranks, and the least certain directions."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
     n_held = len(calibration.solution.kinematic.held_basis)
@@ -66,16 +66,20 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         ranks: list[list[Cell]] = [[number(full.rank, 0), number(full.of, 0), enough]]
         blocks += [
             Table(("condition of the paper", ">equations", ">unknowns", ""), rows),
-            Table((">rank before any image was searched", ">of", ""), ranks),
+            Table((">predicted rank", ">of", ""), ranks),
         ]
     weak: list[list[Cell]] = [
-        [row.in_words, number(1e3 * row.sigma_m, 4), _parts(one.parameters, one.components)]
+        [
+            row.in_words,
+            number(1e3 * row.sigma_m, 4),
+            _parts(components.parameters, components.components),
+        ]
         for row in result.weakest
-        for one in (row.links or row,)
+        for components in (row.links or row,)
     ]
     if weak:
-        columns = ("known worst", ">1 sigma [mm]", "as a unit vector")
-        note = "The machine above shows them as motions: choose one under Show."
+        columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
+        note = "Select one under Show in the machine above to see it as a motion."
         blocks.append(Table(columns, weak, note=note))
     if result.held:
         blocks.append(Items(result.held, title="Held at nominal, without effect on the platform"))
@@ -87,7 +91,7 @@ def _parts(names: Any, components: Any) -> str:
 
 
 def correlation_blocks(calibration: Calibration) -> list[Any]:
-    """Return the correlation matrix and the pairs that are correlated most."""
+    """Return the correlation matrix and the most correlated pairs."""
     names, values = correlation(calibration)
     if len(names) < 2:
         return []
@@ -100,44 +104,45 @@ def correlation_blocks(calibration: Calibration) -> list[Any]:
     caption = "Filled squares are positive correlations, outlines negative; the area is the size."
     return [
         Drawing(matrix(names, values, "Correlations of the estimated parameters"), caption),
-        Table(("correlated most", "with", ">correlation"), rows),
+        Table(("most correlated", "with", ">correlation"), rows),
     ]
 
 
 def held_out_blocks(calibration: Calibration) -> list[Any]:
-    """Return how well the fit predicts images that it has not seen."""
-    found = calibration.result.holdout
-    if found is None:
-        return [Text(["No images were kept aside; --holdout 0.2 keeps a fifth."], dim=True)]
-    if found.rms_px is None:
-        return [Text(["The images that were kept aside show no outline that could be compared."])]
+    """Return the prediction errors in held-out images."""
+    holdout = calibration.result.holdout
+    if holdout is None:
+        return [Text(["No held-out images (use --holdout 0.2)."], dim=True)]
+    if holdout.rms_px is None:
+        return [Text(["The held-out images show no outline that could be compared."])]
     facts = {
-        "Kept aside": f"{found.images} images of {found.poses} poses, {found.outlines} outlines, "
-        f"{found.wrong} of them far off and left out",
-        "Off by": f"{found.rms_px:.3f} px (rms); {found.expected_px or 0.0:.3f} px were expected",
+        "Held out": f"{holdout.images} images of {holdout.poses} poses, {holdout.outlines} "
+        f"outlines, {holdout.wrong} of them far off and left out",
+        "Prediction error": f"{holdout.rms_px:.3f} px (rms); {holdout.expected_px or 0.0:.3f} px "
+        "were expected",
     }
-    if found.platform is not None:
-        pair = found.platform
+    if holdout.platform is not None:
+        pair = holdout.platform
         facts["At the platform"] = (
             f"{1e3 * pair.dX_m:.3f} mm / {np.degrees(pair.dE_rad):.4f} deg (rms over {pair.poses} "
             f"poses); {1e3 * pair.expected_dX_m:.3f} mm / {np.degrees(pair.expected_dE_rad):.4f} "
             "deg were expected"
         )
-    rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in found.views.items()]
+    rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in holdout.views.items()]
     return [Facts(facts), Table(("view", ">rms [px]"), rows)]
 
 
 def note_blocks(calibration: Calibration) -> list[Any]:
-    """Return the diagnosis, and the notes by what they are about."""
+    """Return the diagnosis, and the notes by topic."""
     blocks: list[Any] = []
     diagnosis: list[list[Cell]] = [
-        [one.what, "; ".join(one.same_as), number(one.images_before, 0),
-         number(one.images_after, 0), one.remedy]
-        for one in calibration.result.diagnosis or ()
+        [d.what, "; ".join(d.same_as), number(d.images_before, 0), number(d.images_after, 0),
+         d.remedy]
+        for d in calibration.result.diagnosis or ()
     ]  # fmt: skip
     if diagnosis:
-        columns = ("what looks wrong", "cannot be told from", ">images that agree", ">without it",
-                   "remedy")  # fmt: skip
+        columns = ("likely mistake", "indistinguishable from", ">images that agree",
+                   ">with correction", "remedy")  # fmt: skip
         blocks.append(Table(columns, diagnosis, "Diagnosis"))
     for topic in Topic:
         if topic is Topic.DIAGNOSIS:
@@ -145,14 +150,15 @@ def note_blocks(calibration: Calibration) -> list[Any]:
         notes = [note for note in calibration.notes if topic_of(note) is topic]
         blocks += [Items(notes, title=topic)] * bool(notes)
     steps = calibration.result.stages.staged
-    said = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
-    if any(said):
-        blocks.append(Items([one for one in said if one], title="The four steps alone"))
+    remarks = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
+    if any(remarks):
+        remarks_of_steps = [remark for remark in remarks if remark]
+        blocks.append(Items(remarks_of_steps, title="The four steps alone"))
     return blocks
 
 
 def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
-    """Return version, command, settings, and the hashes of all files that went in."""
+    """Return version, command, settings, and the hashes of all input files."""
     dataset, problem = calibration.dataset, calibration.solution.posterior.problem
     settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(problem.settings).items()}
     facts = {
@@ -172,27 +178,27 @@ def reproducibility_blocks(calibration: Calibration, command: str, when: str) ->
     }
     rows, note = _hashes(calibration)
     columns = ("file", ">bytes", "SHA-256")
-    return [Facts(facts), Table(columns, rows, "Files that went in", note, folded=True)]
+    return [Facts(facts), Table(columns, rows, "Input files", note, folded=True)]
 
 
 def _encoder_sigma(dataset: Dataset) -> str:
-    """Return the standard deviation of readings, by motor where they differ."""
+    """Return the standard deviation of readings, by motor if they differ."""
     machine = dataset.machine
     sigma = dataset.measurements.sigma_of(machine.legs)
-    found = {
+    sigma_in_words = {
         str(machine.legs[j].prismatic): f"{np.degrees(sigma[j]):.3g} deg"
         if machine.legs[j].reads_angle
         else f"{1e6 * sigma[j]:g} um"
         for j in machine.motors
     }
-    alike = set(found.values())
-    if len(alike) < 2:
-        return next(iter(alike), "no encoder")
-    return ", ".join(f"{name} {words}" for name, words in found.items())
+    distinct = set(sigma_in_words.values())
+    if len(distinct) < 2:
+        return next(iter(distinct), "no encoder")
+    return ", ".join(f"{name} {words}" for name, words in sigma_in_words.items())
 
 
 def _chosen(calibration: Calibration) -> str:
-    """Return which parameters were chosen to be fixed, free, or to have a prior."""
+    """Return the parameters that were fixed, freed or given a prior by choice."""
     choices = calibration.solution.posterior.problem.choices
     units = {row.name: row.unit for row in calibration.result.parameters}
 
@@ -200,16 +206,20 @@ def _chosen(calibration: Calibration) -> str:
         scale, unit, digits = UNITS[units.get(name, "")]
         return " +- ".join(f"{scale * value:.{digits}f}" for value in values) + f" {unit}".rstrip()
 
-    found = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
-    found += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]
-    found += [f"{name} free" for name in sorted(choices.free)]
-    found += [f"{k} {shown(k, p.mean, p.sigma)}" for k, p in sorted(choices.priors.items())]
-    found += [f"camera of {view} from an earlier result" for view in sorted(choices.cameras)]
-    return ", ".join(found)
+    choices_in_words = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
+    choices_in_words += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]
+    choices_in_words += [f"{name} free" for name in sorted(choices.free)]
+    choices_in_words += [
+        f"{k} {shown(k, p.mean, p.sigma)}" for k, p in sorted(choices.priors.items())
+    ]
+    choices_in_words += [
+        f"camera of {view} from an earlier result" for view in sorted(choices.cameras)
+    ]
+    return ", ".join(choices_in_words)
 
 
 def _hashes(calibration: Calibration) -> tuple[list[list[Cell]], str]:
-    """Return the files that went in with their digests, and what is said of images without."""
+    """Return the input files with their digests, and a note on images without."""
     dataset = calibration.dataset
     machine = dataset.machine
     files = [dataset.yaml_path, dataset.table_path, *dict.fromkeys(dataset.camera_paths),

@@ -15,12 +15,12 @@ from legcal.machine.parameter_id import ParameterId
 from legcal.pages.document import Cell, Drawing, Table, number
 from legcal.pages.svg import change_bars
 
-_BY_PRIOR = 0.7  # of the standard deviation of a prior: beyond it the images say little
+_BY_PRIOR = 0.7  # sigma of a parameter that its prior determines, relative to that of the prior
 _PARALLEL = 1e-9
 _STATUS = {
-    "estimated": "by images and readings",
+    "estimated": "estimated",
     "fixed": "fixed",
-    "weak": "in a combination that nothing determines, held at nominal",
+    "weak": "undetermined combination, kept nominal",
 }
 _JOINT = {"base": "A", "platform": "B"}
 
@@ -35,16 +35,16 @@ class _Row:
     sigma: float | None
     unit: str
     prior: float | None
-    how: str
+    determination: str
 
     @property
     def parameter(self) -> ParameterId:
-        """What its name says."""
+        """The parsed name."""
         return ParameterId.parse(self.name)
 
     @property
     def cells(self) -> list[Cell]:
-        """The cells of its row."""
+        """The cells of the table."""
         scale, unit, digits = UNITS[self.unit]
         sigma, prior = (None if s is None else scale * s for s in (self.sigma, self.prior))
         return [
@@ -55,35 +55,35 @@ class _Row:
             number(sigma, digits),
             unit,
             number(prior, digits),
-            self.how,
+            self.determination,
         ]
 
 
 def parameter_tables(calibration: Calibration) -> list[Table]:
-    """Return joints in the links with all other parameters, and those of ``result.json``."""
+    """Return joints in the links with all other parameters, and the rows of ``result.json``."""
     columns = ("parameter", ">nominal", ">calibrated", ">change", ">sigma", "unit", ">prior sigma",
                "how determined")  # fmt: skip
-    of_links, rows = _of_links(calibration), _parameters(calibration)
-    if not of_links:
+    link_rows, rows = _link_rows(calibration), _parameters(calibration)
+    if not link_rows:
         return [Table(columns, [row.cells for row in rows], note=_IN_FRAMES)]
     links = [block.link for block in (calibration.result.links or {}).values()]
     others = [row for row in rows if not row.parameter.is_joint_coordinate]
     machine = calibration.dataset.machine
     motors = ""
     if any(motor.turns for motor in machine.actuators):
-        motors = "; axis_point is how far the axis of an arm has moved across itself"
+        motors = "; axis_point: lateral displacement of the arm axis"
         if any(motor.arm is not None for motor in machine.actuators):
-            motors += ", arm_point how far its own line has"
+            motors += ", arm_point: lateral displacement of the line of the arm"
     elif machine.actuators:
         motors = "; directions of carriages too"
     note = (
         f"A are joints of the base in the link {links[0]}{machine.at_zero}, B those of the "
         f"platform in {links[-1]}, as in calibrated.urdf; axes are turns from the nominal ones"
-        f"{motors}. Sigma is one standard deviation; coordinates without one define where R_b or "
-        "R_e stands, which cannot be seen in photographs of legs. A click on a heading sorts."
+        f"{motors}. Sigma is one standard deviation; coordinates without sigma fix the frame R_b "
+        "or R_e, which photographs of legs cannot determine. Click a heading to sort."
     )
     return [
-        Table(columns, [row.cells for row in (*of_links, *others)], note=note),
+        Table(columns, [row.cells for row in (*link_rows, *others)], note=note),
         Table(columns, [row.cells for row in rows], "The same in R_b and R_e, as in result.json",
               _IN_FRAMES, folded=True),
     ]  # fmt: skip
@@ -94,17 +94,19 @@ _IN_FRAMES = "Joints of the base in R_b, those of the platform in R_e; axes are 
 
 def change_charts(calibration: Calibration) -> list[Drawing]:
     """Return the changes of the parameters as bars, a chart for each unit."""
-    of_links, rows = _of_links(calibration), _parameters(calibration)
-    if of_links:
+    link_rows, rows = _link_rows(calibration), _parameters(calibration)
+    if link_rows:
         rows = [
-            *of_links,
+            *link_rows,
             *(row for row in rows if not row.parameter.is_joint_coordinate),
         ]
     charts = []
-    for of in ("m", "rad"):
-        shown = [r for r in rows if r.unit == of and r.sigma and r.parameter.kind != "radius"]
+    for unit_of_chart in ("m", "rad"):
+        shown = [
+            r for r in rows if r.unit == unit_of_chart and r.sigma and r.parameter.kind != "radius"
+        ]
         if shown:
-            scale, unit, _ = UNITS[of]
+            scale, unit, _ = UNITS[unit_of_chart]
             svg = change_bars(
                 [row.name for row in shown],
                 [scale * (row.value - row.nominal) for row in shown],
@@ -116,9 +118,9 @@ def change_charts(calibration: Calibration) -> list[Drawing]:
     return charts
 
 
-def _of_links(calibration: Calibration) -> list[_Row]:
-    """Return the coordinates of joints in the links of the model."""
-    found, priors = [], _prior_sigmas(calibration)
+def _link_rows(calibration: Calibration) -> list[_Row]:
+    """Return the rows of joint coordinates in the links of the model."""
+    rows, priors = [], _prior_sigmas(calibration)
     for side, block in (calibration.result.links or {}).items():
         turn = np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
         for joint in block.joints:
@@ -131,14 +133,14 @@ def _of_links(calibration: Calibration) -> list[_Row]:
                     else None
                 )
                 how = (
-                    _how(status, sigma, prior)
+                    _determination(status, sigma, prior)
                     if status in _STATUS
                     else f"the joint defines the {joint.defines} of the frame"
                 )
                 name = f"{joint.leg} {_JOINT[side]} {axis}"
                 values = joint.nominal[k], joint.xyz[k], sigma
-                found.append(_Row(name, *values, "m", prior, how))
-    return found
+                rows.append(_Row(name, *values, "m", prior, how))
+    return rows
 
 
 def _parameters(calibration: Calibration) -> list[_Row]:
@@ -147,7 +149,7 @@ def _parameters(calibration: Calibration) -> list[_Row]:
     return [
         _Row(row.name, row.nominal, row.value, row.sigma, row.unit,
              priors.get(row.name) if row.status == "estimated" else None,
-             _how(row.status, row.sigma, priors.get(row.name)))
+             _determination(row.status, row.sigma, priors.get(row.name)))
         for row in calibration.result.parameters
         if row.is_shown
     ]  # fmt: skip
@@ -158,11 +160,11 @@ def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
     problem = calibration.solution.posterior.problem
     priors, named = problem.priors, problem.named
     numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    found = {named[i]: sigma for i, sigma in numbers if i < len(named)}
-    return found | dict(calibration.solution.estimates.prior_sigma)
+    sigma_by_name = {named[i]: sigma for i, sigma in numbers if i < len(named)}
+    return sigma_by_name | dict(calibration.solution.estimates.prior_sigma)
 
 
-def _how(status: str, sigma: float | None, prior: float | None) -> str:
+def _determination(status: str, sigma: float | None, prior: float | None) -> str:
     if status != "estimated" or sigma is None or prior is None:
         return _STATUS[status]
     if sigma > _BY_PRIOR * prior:

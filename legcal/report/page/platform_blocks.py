@@ -1,4 +1,4 @@
-"""What a calibration means at the platform: before and after, at poses and over the workspace."""
+"""Platform errors before and after a calibration, at poses and over the workspace."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from legcal.pages.document import Drawing, Plot, Row, Table, Text, number
 from legcal.pages.svg import histogram, number_grid
 from legcal.report.page.residual_plots import FONT
 
-_FLAT = 1e-3  # of its extent: the height of a workspace in a plane
+_FLAT = 1e-3  # height of a planar workspace, relative to its extent
 _IN_SPACE = {
     "aspectmode": "data",
     "camera": {"eye": {"x": 1.1, "y": -1.6, "z": 1.1}, "center": {"z": -0.2}},
 }
 _IN_A_PLANE = {
-    "aspectmode": "manual",  # by the data a flat scene is drawn as large as it is flat
+    "aspectmode": "manual",  # "data" would make a flat scene tiny
     "aspectratio": {"x": 1.0, "y": 1.0, "z": 0.01},
     "camera": {"eye": {"x": 0.0, "y": 0.0, "z": 1.6}, "up": {"x": 0.0, "y": 1.0, "z": 0.0}},
 }
@@ -29,39 +29,38 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
     """Return figures, histograms and maps of the error of the platform."""
     platform = calibration.result.platform
     if platform is None or calibration.platform is None:
-        why = calibration.dataset.machine.undetermined
-        return [Text([f"No error of the platform is predicted, because {why}."])]
+        reason = calibration.dataset.machine.undetermined
+        return [Text([f"No error of the platform is predicted, because {reason}."])]
     change, sigma = calibration.platform.change, calibration.platform.sigma
     rows = [
-        _figures("before: nominal model against the calibrated one", change.displacement,
-                 change.rotation),
+        _figures("before: nominal vs. calibrated model", change.displacement, change.rotation),
         _figures("after: predicted error of the calibrated model, 1 sigma", sigma.displacement,
                  sigma.rotation),
     ]  # fmt: skip
-    found = platform_map(calibration)
-    if found is not None:
-        n = len(found.position)
+    workspace = platform_map(calibration)
+    if workspace is not None:
+        n = len(workspace.position)
         rows += [
-            _figures(f"before, {n} places of the workspace", found.change.displacement,
-                     found.change.rotation),
-            _figures(f"after, {n} places of the workspace", found.sigma.displacement,
-                     found.sigma.rotation),
+            _figures(f"before, {n} places of the workspace", workspace.change.displacement,
+                     workspace.change.rotation),
+            _figures(f"after, {n} places of the workspace", workspace.sigma.displacement,
+                     workspace.sigma.rotation),
         ]  # fmt: skip
     columns = ("", ">mean [mm]", ">largest [mm]", ">mean [deg]", ">largest [deg]")
-    what = "The first two rows" if found is not None else "Both rows"
+    scope = "The first two rows" if workspace is not None else "Both rows"
     note = (
-        f"{what} are at the {platform.poses} poses of the images. Both models get the "
+        f"{scope} are at the {platform.poses} poses of the images. Both models get the "
         "same readings; errors of the readings themselves are not in sigma."
     )
     histograms = [
-        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm], how many poses"),
+        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm] (number of poses)"),
                 wide=False),
-        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm], how many poses"),
+        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm] (number of poses)"),
                 wide=False),
     ]  # fmt: skip
     blocks: list[Any] = [Table(columns, rows, note=note), Row(histograms)]
-    if found is not None:
-        blocks += _maps(found)
+    if workspace is not None:
+        blocks += _maps(workspace)
     return blocks
 
 
@@ -76,18 +75,18 @@ def _figures(name: str, displacement: Array, rotation: Array) -> list[Any]:
     ]
 
 
-def _maps(found: PlatformMap) -> list[Any]:
-    """Return slices of constant z, where there is a grid, and all places in space."""
+def _maps(workspace: PlatformMap) -> list[Any]:
+    """Return slices of constant z, if there is a grid, and all positions in space."""
     blocks: list[Any] = []
-    before, after = 1e3 * found.change.displacement, 1e3 * found.sigma.displacement
-    if found.index.size:
+    before, after = 1e3 * workspace.change.displacement, 1e3 * workspace.sigma.displacement
+    if workspace.index.size:
         for name, values in (("Before", before), ("After, 1 sigma", after)):
             digits = int(np.clip(np.ceil(1.5 - np.log10(max(values.max(), 1e-9))), 0, 5))
             slices = [
                 Drawing(
                     number_grid(
-                        (1e3 * found.x).tolist(),
-                        (1e3 * found.y).tolist(),
+                        (1e3 * workspace.x).tolist(),
+                        (1e3 * workspace.y).tolist(),
                         np.where(level >= 0, values[level], np.nan),
                         f"{name} [mm], z = {1e3 * z:z.0f} mm",
                         float(values.max()),
@@ -95,19 +94,19 @@ def _maps(found: PlatformMap) -> list[Any]:
                     ),
                     wide=False,
                 )
-                for z, level in zip(found.z.tolist(), found.index, strict=True)
+                for z, level in zip(workspace.z.tolist(), workspace.index, strict=True)
             ]
             blocks.append(Row(slices))
         blocks.append(
-            Text(["Slices at the orientation of home; empty fields are out of reach."], dim=True)
+            Text(["Slices at the orientation of home; empty cells are out of reach."], dim=True)
         )
-    blocks.append(_in_space(found, before, after))
+    blocks.append(_in_space(workspace, before, after))
     return blocks
 
 
-def _in_space(found: PlatformMap, before: Array, after: Array) -> Plot:
-    is_flat = np.ptp(found.position[:, 2]) < _FLAT * np.ptp(found.position, axis=0).max()
-    x, y, z = np.round(1e3 * found.position, 1).T.tolist()
+def _in_space(workspace: PlatformMap, before: Array, after: Array) -> Plot:
+    is_flat = np.ptp(workspace.position[:, 2]) < _FLAT * np.ptp(workspace.position, axis=0).max()
+    x, y, z = np.round(1e3 * workspace.position, 1).T.tolist()
     data = [
         {
             "type": "scatter3d",

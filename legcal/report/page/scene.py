@@ -1,4 +1,4 @@
-"""The machine in space: nominal and calibrated, with what is uncertain, and its cameras."""
+"""The machine in space: nominal and calibrated, with its uncertainty, and the cameras."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from legcal.report.page.residual_plots import FONT
 from legcal.scene.motions import FACTORS, PlacedModel, directions, placed_model
 from legcal.scene.shapes import around, ellipsoids, enlargement, pyramid
 
-MAX_POSES = 60  # of the slider
+MAX_POSES = 60  # largest number of poses of the slider
 MAX_CAMERAS = 60
-_ROOM = 0.8  # of the size of the machine: about it
-_RING = 0.06  # of it: the median ellipsoid
-_EYE = np.array([1.3, -1.5, 0.8])  # where it is looked at from, in its size, at least
-_FURTHER = 2.0  # times that, at most, to see cameras as well
-_SLOPE = 0.4  # of what is seen, to the line of sight
+_ROOM = 0.8  # margin around the machine, relative to its size
+_RING = 0.06  # size of the median ellipsoid, relative to the machine
+_EYE = np.array([1.3, -1.5, 0.8])  # nearest position of the eye, relative to the machine
+_FURTHER = 2.0  # largest factor of that position to include cameras
+_SLOPE = 0.4  # slope of the field of view to the line of sight
 _N_RING = 20  # points of a ring
 _GREY, _BLUE, _AMBER, _GREEN = "#9aa1ab", "#1f5fa8", "#b26a00", "#1e7d46"
 _NO_LINES = np.zeros((0, 2, 3))
 
 
 def machine_scene(calibration: Calibration) -> Plot:
-    """Return the machine, its sliders moving pose and exaggeration of what is shown."""
+    """Return the machine with sliders for pose and exaggeration."""
     machine, measurements = calibration.dataset.machine, calibration.dataset.measurements
     n = measurements.n_poses
     chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
@@ -42,11 +42,11 @@ def machine_scene(calibration: Calibration) -> Plot:
     def placed(legs: Sequence[Leg]) -> PlacedModel:
         return placed_model(machine, legs, q, T, by_readings=by_readings)
 
-    found = placed(calibration.solution.legs)
-    # What motors stand about is the same for all models that are compared.
-    rim = around(found.anchors) if len(found.anchors) > 2 else []
-    size = float(np.ptp(np.concatenate([found.A[0], found.B[0]]), axis=0).max())
-    modes = _modes(calibration, found, placed, rim, size)
+    calibrated = placed(calibration.solution.legs)
+    # The rim of the motors is the same for all compared models.
+    rim = around(calibrated.anchors) if len(calibrated.anchors) > 2 else []
+    size = float(np.ptp(np.concatenate([calibrated.A[0], calibrated.B[0]]), axis=0).max())
+    modes = _modes(calibration, calibrated, placed, rim, size)
     rings, ring_factor = _rings(calibration, size)
     images = row_names(measurements)
     turn_base = machine.T_base_Rb.rotation.as_matrix()
@@ -59,7 +59,7 @@ def machine_scene(calibration: Calibration) -> Plot:
         "poses": [plain(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "turns": _rounded(turn_base @ components(T)[0] @ turn_platform, 6),
         "rings": rings,
-        "outline": {"base": around(found.A[0]), "platform": around(found.B[0])},
+        "outline": {"base": around(calibrated.A[0]), "platform": around(calibrated.B[0])},
         "traces": {
             "legs": [0, 1],
             "base": [2, 3],
@@ -80,10 +80,10 @@ def machine_scene(calibration: Calibration) -> Plot:
         _lines("nominal motors", _GREY, 4, legend=False),
         _lines("calibrated motors", MOTOR_COLOUR, 8, legend=False),
         cameras,
-        _words([plain(name) for name in machine.leg_names], found.A[0], "#1d2126"),
+        _words([plain(name) for name in machine.leg_names], calibrated.A[0], "#1d2126"),
     ]
-    seen = np.array([[v for v in cameras[a] if v is not None] for a in "xyz"]).T
-    solid = np.concatenate([*found.A, *found.B, *_standing(found, rim)])
+    camera_points = np.array([[v for v in cameras[a] if v is not None] for a in "xyz"]).T
+    solid = np.concatenate([*calibrated.A, *calibrated.B, *_standing(calibrated, rim)])
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
@@ -92,37 +92,39 @@ def machine_scene(calibration: Calibration) -> Plot:
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
-    return Plot("machine-scene", traces, _layout(solid, seen, size), 560, caption, extra)
+    return Plot("machine-scene", traces, _layout(solid, camera_points, size), 560, caption, extra)
 
 
 def _modes(
     calibration: Calibration,
-    found: PlacedModel,
+    calibrated: PlacedModel,
     placed: Callable[[Sequence[Leg]], PlacedModel],
     rim: Sequence[int],
     size: float,
 ) -> list[dict[str, Any]]:
-    """Return the differences that can be shown: of the calibration, and along directions."""
+    """Return the selectable differences: by the calibration, and along directions."""
     solution = calibration.solution
     nominal = placed(geometries(calibration.dataset.machine))
     legend = ("nominal", "calibrated")
-    modes = [_mode("what the calibration changed", legend, nominal, found, rim, size)]
-    length = float(np.mean(np.linalg.norm(found.B[0] - found.A[0], axis=1)))
+    modes = [_mode("change by the calibration", legend, nominal, calibrated, rim, size)]
+    length = float(np.mean(np.linalg.norm(calibrated.B[0] - calibrated.A[0], axis=1)))
     legend = ("calibrated", "moved along the direction")
-    for what, step in directions(calibration.result, solution.kinematic.parametrization, length):
+    for direction, step in directions(
+        calibration.result, solution.kinematic.parametrization, length
+    ):
         moved = placed(moved_legs(solution.legs, solution.kinematic.parametrization.place, step))
-        modes.append(_mode(what, legend, found, moved, rim, size))
+        modes.append(_mode(direction, legend, calibrated, moved, rim, size))
     return modes
 
 
 def _standing(placed: PlacedModel, rim: Sequence[int]) -> Array:
-    """Return the rim of where motors stand, and rails and axes, as lines (m, 2, 3)."""
+    """Return the rim of the motors, and rails and axes, as lines (m, 2, 3)."""
     edges = placed.anchors[np.stack([rim[:-1], rim[1:]], axis=1)] if rim else _NO_LINES
     return np.concatenate([edges, placed.standing])
 
 
 def _layout(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
-    """Return the layout that shows points of a machine, and cameras as far as there is room."""
+    """Return the layout for the points of a machine, and for cameras as far as there is room."""
     hidden = {"showbackground": False, "gridcolor": "#e8ebef", "zeroline": False,
               "title": {"text": ""}, "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
     view = _view(machine, cameras, size)
@@ -141,15 +143,15 @@ def _layout(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
 
 
 def _view(machine: Array, cameras: Array, size: float) -> dict[str, Any]:
-    """Return ranges of the axes that hold machine and cameras, and a look at the machine."""
+    """Return ranges of the axes that include machine and cameras, and the viewpoint."""
     everything = np.concatenate([machine - _ROOM * size, machine + _ROOM * size, cameras])
     low, high = everything.min(axis=0), everything.max(axis=0)
     middle = 0.5 * (machine.min(axis=0) + machine.max(axis=0))
     centre = (middle - 0.5 * (low + high)) / size  # scenes measure from the middle of the ranges
 
-    off = (cameras - middle) / size
-    towards = off @ (_EYE / np.linalg.norm(_EYE))
-    aside = np.sqrt(np.maximum(np.sum(off**2, axis=1) - towards**2, 0.0))
+    offsets = (cameras - middle) / size
+    towards = offsets @ (_EYE / np.linalg.norm(_EYE))
+    aside = np.sqrt(np.maximum(np.sum(offsets**2, axis=1) - towards**2, 0.0))
     needed = (towards + aside / _SLOPE).max(initial=0.0) / np.linalg.norm(_EYE)
     eye = centre + float(np.clip(needed, 1.0, _FURTHER)) * _EYE
 
@@ -174,8 +176,8 @@ def _mode(
     rim: Sequence[int],
     size: float,
 ) -> dict[str, Any]:
-    """Return what is shown of a difference, exaggerated at first so that it is seen."""
-    # Joints at A that no motor moves are given once.
+    """Return the data of a difference, with a visible initial exaggeration."""
+    # Joints at A that no motor moves are included once.
     poses = slice(1 if all(np.ptp(A, axis=0).max() == 0.0 for A in (before.A, after.A)) else None)
     return {
         "name": name,
@@ -188,10 +190,12 @@ def _mode(
         "platform": [
             [_rounded(a, 7), _rounded(b, 7)] for a, b in zip(before.B, after.B, strict=True)
         ],
-        "standing": [_rounded(_standing(one, rim).reshape(-1, 3), 6) for one in (before, after)],
+        "standing": [
+            _rounded(_standing(model, rim).reshape(-1, 3), 6) for model in (before, after)
+        ],
         "motors": [
-            [_rounded(one.reshape(-1, 3), 6) for one in both]
-            for both in zip(before.moving[poses], after.moving[poses], strict=True)
+            [_rounded(model.reshape(-1, 3), 6) for model in pair]
+            for pair in zip(before.moving[poses], after.moving[poses], strict=True)
         ],
     }
 
@@ -201,17 +205,17 @@ def _rounded(values: Array, digits: int) -> Any:
 
 
 def _rings(calibration: Calibration, size: float) -> tuple[dict[str, Any], float]:
-    """Return ellipsoids at joints as rings about their centres [m], and how they are enlarged."""
+    """Return ellipsoids at joints as rings about their centres [m], and their enlargement."""
     turn = np.linspace(0.0, 2.0 * np.pi, _N_RING + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     axes = ellipsoids(calibration.result)
     factor = enlargement(axes, _RING * size)
-    found: dict[str, Any] = {"base": [], "platform": []}
+    rings_by_side: dict[str, Any] = {"base": [], "platform": []}
     for side, of_side in axes.items():
-        for one in factor * of_side:
-            rings = [circle @ one[:, pair].T for pair in ([0, 1], [1, 2], [0, 2])]
-            found[side].append([_rounded(ring, 5) for ring in rings])
-    return found, factor
+        for axes_of_joint in factor * of_side:
+            rings = [circle @ axes_of_joint[:, pair].T for pair in ([0, 1], [1, 2], [0, 2])]
+            rings_by_side[side].append([_rounded(ring, 5) for ring in rings])
+    return rings_by_side, factor
 
 
 def _lines(name: str, colour: str, width: float, *, legend: bool = True) -> dict[str, Any]:
@@ -231,13 +235,13 @@ def _words(words: Sequence[str], at: Array, colour: str) -> dict[str, Any]:
 
 
 def _cameras(calibration: Calibration, depth: float) -> dict[str, Any]:
-    """Return the cameras of views that were used, as pyramids of what they see."""
+    """Return the cameras of used views as pyramids of their field of view."""
     solution, views = calibration.solution, calibration.dataset.measurements.views
-    frame, shown = calibration.dataset.machine.T_base_Rb, calibration.result.views
+    frame, used_views = calibration.dataset.machine.T_base_Rb, calibration.result.views
     x: list[Any] = []
     names: list[str] = []
     for v, view in enumerate(views):
-        if view.name not in shown or len(names) >= MAX_CAMERAS * 13:
+        if view.name not in used_views or len(names) >= MAX_CAMERAS * 13:
             continue
         camera = solution.cameras[v]
         points = pyramid(camera, frame * solution.T_camera_Rb[v].inv(), depth)

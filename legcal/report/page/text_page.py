@@ -1,4 +1,4 @@
-"""The page of a job whose text says all: its tables and sentences, in the style of the others."""
+"""The page of a job without a page of its own: its tables and sentences in the common style."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from legcal.pages.document import (
 from legcal.pages.html import time_of_page
 from legcal.version import __version__
 
-_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # that begins a cell: it sorts by its value
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
 _ITEM = "- "
 
 
@@ -41,14 +41,14 @@ def text_page(
     blocks: Sequence[Any] = (),
     command: str = "",
 ) -> Page:
-    """Return a page with the tables and sentences of a text, and more blocks after them.
+    """Return a page with the tables and sentences of a text, followed by further blocks.
 
-    A sentence that the verdict says stands there alone.
+    The sentence of the verdict is not repeated.
     """
     when = time_of_page()
     record = {"Version": f"legcal {__version__}", "Command": command or "from Python", "Time": when}
-    said = verdict.sentence if verdict is not None else ""
-    sections = [Section("result", "Result", _blocks(text, said))]
+    omitted = verdict.sentence if verdict is not None else ""
+    sections = [Section("result", "Result", _blocks(text, omitted))]
     if blocks:
         sections.append(Section("figures", "Figures", blocks))
     sections.append(Section("record", "Reproducibility", [Facts(record)]))
@@ -61,20 +61,23 @@ def picture(path: Path, caption: str) -> Picture:
     return Picture(Markup(f"data:image/png;base64,{data}"), caption)
 
 
-def _blocks(text: RenderableType, said: str) -> list[Any]:
-    """Return the parts of a text as blocks, without a line that is said already."""
-    found: list[Any] = []
+def _blocks(text: RenderableType, omitted: str) -> list[Any]:
+    """Return the parts of a text as blocks, without an omitted line."""
+    blocks: list[Any] = []
     for part in text.renderables if isinstance(text, Group) else [text]:
         if isinstance(part, TextTable):
-            found.append(_table(part))
+            blocks.append(_table(part))
             continue
-        lines = [line for line in str(part).splitlines() if line.strip() and line != said]
+        lines = [line for line in str(part).splitlines() if line.strip() and line != omitted]
         for is_item, group in groupby(lines, lambda line: line.startswith(_ITEM)):
-            kind, texts = (Items if is_item else Text), [one.removeprefix(_ITEM) for one in group]
-            if found and type(found[-1]) is kind:
-                texts = [*(found.pop().items if is_item else found.pop().paragraphs), *texts]
-            found.append(kind(texts))
-    return found
+            kind, texts = (
+                (Items if is_item else Text),
+                [line_of_group.removeprefix(_ITEM) for line_of_group in group],
+            )
+            if blocks and type(blocks[-1]) is kind:
+                texts = [*(blocks.pop().items if is_item else blocks.pop().paragraphs), *texts]
+            blocks.append(kind(texts))
+    return blocks
 
 
 def _table(table: TextTable) -> Table:
@@ -90,11 +93,11 @@ def _table(table: TextTable) -> Table:
         for row in zip(*by_column, strict=True)
     ]
     title = str(table.title) if isinstance(table.title, str | TextLine) else ""
-    # Rows that belong to one above them, and headings among rows, would lose their place.
+    # Sorting would separate continuation rows and headings from their rows.
     is_flat = all(row[0] and any(row[1:]) for row in zip(*by_column, strict=True))
     return Table(columns, rows, title, sortable=is_flat)
 
 
 def _number(word: str) -> Cell:
-    found = _NUMBER.match(word)
-    return Number(float(found[0]) if found else None, word)
+    match = _NUMBER.match(word)
+    return Number(float(match[0]) if match else None, word)

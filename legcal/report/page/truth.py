@@ -1,4 +1,4 @@
-"""Errors of the parameters where the truth is given: Fig. 4 of the paper, of one calibration.
+"""Errors of the parameters if the truth is given: Fig. 4 of the paper, for one calibration.
 
 The truth is for the page alone: the result was computed before, without it.
 """
@@ -18,7 +18,7 @@ from legcal.pages.svg import error_bars
 
 
 def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Any]:
-    """Return how far the nominal and the calibrated model are from the truth.
+    """Return the errors of the nominal and the calibrated model.
 
     Raises
     ------
@@ -31,19 +31,25 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
     after = evaluate(calibrated, truth)
     sigma = {row.name: row.sigma for row in calibration.result.parameters}
     blocks: list[Any] = [Text([_at_the_platform(before, after), _ORIGIN])]
-    for of in ("m", "rad"):
-        # The truth itself may have coordinates that the frame makes zero: they are no parameters.
-        kept = [i for i, name in enumerate(after.names) if after.units[i] == of and name in sigma]
-        if not kept:
+    for unit_of_chart in ("m", "rad"):
+        # Coordinates that the frame makes zero are not parameters.
+        indices = [
+            i
+            for i, name in enumerate(after.names)
+            if after.units[i] == unit_of_chart and name in sigma
+        ]
+        if not indices:
             continue
-        scale, unit, _ = UNITS[of]
-        off, left = (
-            (scale * np.abs(found.values - found.references))[kept].tolist()
-            for found in (before, after)
+        scale, unit, _ = UNITS[unit_of_chart]
+        before_errors, after_errors = (
+            (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
+            for evaluation in (before, after)
         )
-        names = [after.names[i] for i in kept]
+        names = [after.names[i] for i in indices]
         scaled = [None if sigma[n] is None else scale * float(sigma[n] or 0.0) for n in names]
-        blocks.append(Drawing(error_bars(names, off, left, scaled, unit), _CAPTION))
+        blocks.append(
+            Drawing(error_bars(names, before_errors, after_errors, scaled, unit), _CAPTION)
+        )
     return blocks
 
 
@@ -59,12 +65,12 @@ def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
         return (
             "The motors do not determine the pose of the platform: parameters are compared alone."
         )
-    said = [
-        f"{1e3 * found.displacement.mean():.3f} mm and "
-        f"{np.degrees(found.rotation.mean()):.4f} deg by the {name} model"
-        for name, found in (("nominal", before), ("calibrated", after))
+    errors = [
+        f"{1e3 * evaluation.displacement.mean():.3f} mm and "
+        f"{np.degrees(evaluation.rotation.mean()):.4f} deg by the {name} model"
+        for name, evaluation in (("nominal", before), ("calibrated", after))
     ]
     return (
-        f"At the same readings the platform is off by {said[0]}, and by {said[1]} (means over "
+        f"At the same readings the platform is off by {errors[0]}, and by {errors[1]} (means over "
         f"{len(after.displacement)} poses of the workspace, eq 20)."
     )

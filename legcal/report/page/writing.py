@@ -1,4 +1,4 @@
-"""Pages written as files: complete or not at all, and never over a file of somebody else."""
+"""Pages written as files: atomically, and never over a file of another program."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ def write_report(
     Parameters
     ----------
     calibration : Calibration
-        What :func:`legcal.calibrate` returned.
+        The result of :func:`legcal.calibrate`.
     folder : path
-        Its result folder.
+        The result folder.
     command : str
-        The command that made it, for the record.
+        The command of the calibration, for the record.
     truth : path, name or Machine, optional
-        The true model, of a simulated or measured machine: the page then shows how far the nominal
-        and the calibrated model are from it, as Fig. 4 of the paper does.
+        The true model of a simulated or measured machine: the page then shows the errors of the
+        nominal and the calibrated model, as Fig. 4 of the paper.
     into : path, optional
-        Where the files of the result folder are while it is being written.
+        The folder with the files of the result while it is being written.
 
     Returns
     -------
