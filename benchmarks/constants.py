@@ -1,19 +1,27 @@
 """How much the result depends on each number of a room's ``tuning.py``.
 
-    OMP_NUM_THREADS=1 python benchmarks/constants.py [--room perception] [--only NAME ...]
-        [--independent FOLDER] [--factors 0.5 0.7 1.4 2] [-o benchmarks/constants.jsonl]
+    OMP_NUM_THREADS=1 python benchmarks/constants.py --room perception|calibration
+        [--only NAME ...] [--sessions NAME ...] [--independent FOLDER] [--factors 0.5 0.7 1.4 2]
+    python benchmarks/constants.py --table | --check
 
-Small sessions are calibrated with one number times a factor, the others as they are: nine
-photographs of the example at half their size, a simulated 3-RPS and, with ``--independent``, nine
-photographs of a session with a truth by another renderer. All are without rough camera poses, so
-that recognition counts. A line of JSON for each number, factor and session has the outlines used,
-the error of the platform against the truth [leg lengths], and what the calibration states of it;
-lines that the file has are not measured again. ``--table`` prints them, with the plateau of each
-number: the factors about 1 at which no session loses 5 % of its outlines, gets half again as wrong
-as before (and wronger than it states), or fails.
+Small sessions are calibrated with one number times a factor, the others as they are:
+
+example, 3-rps
+    Nine photographs of the example at half their size, and of a simulated 3-RPS. With
+    ``--independent``, also nine photographs of a session with a truth by another renderer. All are
+    without rough camera poses, so that recognition counts.
+hexapod outlines, tricept outlines, linear-delta outlines
+    For the calibration room also tables of outlines a tenth of which are wrong.
+
+A line of JSON for each number, factor and session has the outlines used, the error of the platform
+against the truth [leg lengths], and the stated error; lines that the file has are not measured
+again. ``--table`` prints all lines, with the plateau of each number: the factors about 1 at which
+no session loses 5 % of its outlines, gets half again as wrong as before (and wronger than it
+states), or fails. ``--check`` says which numbers no code uses.
 """
 
 import argparse
+import ast
 import json
 import shutil
 import subprocess
@@ -30,10 +38,19 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from csv_rows import read_rows, write_rows
 from hexapod_example import write_halved_camera
+from start_dependence import Session as Simulated
+from start_dependence import session_folder
 
 from legcal.machine.loader import load_mechanism
+from legcal.simulation.settings import Level
 
 ROOT = Path(__file__).parents[1]
+ROOMS = ("perception", "calibration")
+OUTLINES = {
+    "hexapod outlines": Simulated("hexapod", Level.OUTLINES, 8, 3, 10),
+    "tricept outlines": Simulated("tricept", Level.OUTLINES, 9, 3, 10),
+    "linear-delta outlines": Simulated("linear-delta", Level.OUTLINES, 10, 3, 6),
+}
 RECORDED = Path(__file__).with_suffix(".jsonl")
 FACTORS = (0.5, 0.7, 1.4, 2.0)
 IMAGES = 3  # of each view
@@ -94,6 +111,16 @@ def numbers(room: str) -> list[str]:
     return [name for name, value in pairs if name.isupper() and _is_number(value)]
 
 
+def unused(room: str) -> list[str]:
+    """Return the numbers of a room that neither its modules nor other numbers of it use."""
+    used = set[str]()
+    for path in (ROOT / f"legcal/{room}").rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        used |= {name.id for name in names if isinstance(name.ctx, ast.Load)}
+    return [name for name in numbers(room) if name not in used]
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -102,8 +129,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def small(source: Path, folder: Path, *, half: bool) -> Path:
-    """Copy the first images of each view of a dataset, without rough camera poses."""
+def small(source: Path, folder: Path) -> None:
+    """Copy the first images of each view at half their size, without rough camera poses."""
     shutil.copytree(source, folder, ignore=shutil.ignore_patterns(".legcal*", "images", "truth"))
     rows, n_of_view = [], dict[str, int]()
     (folder / "images").mkdir(exist_ok=True)
@@ -115,8 +142,7 @@ def small(source: Path, folder: Path, *, half: bool) -> Path:
         if picture is None:
             raise OSError(f"{source / row['image']} is no image")
         row["image"] = f"images/{row['view']}_{n_of_view[row['view']]}.png"
-        if half:
-            picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(folder / row["image"]), picture)
         rows.append(row)
     write_rows(folder / "measurements.csv", rows)
@@ -127,32 +153,40 @@ def small(source: Path, folder: Path, *, half: bool) -> Path:
         view.pop("legs", None)
         cameras.add(view["camera"])
     (folder / "dataset.yaml").write_text(yaml.safe_dump(entry, sort_keys=False), encoding="utf-8")
-    for name in cameras if half else ():
+    for name in cameras:
         write_halved_camera(folder / name, folder / name)
-    return folder
 
 
-def sessions(folder: Path, independent: Path | None) -> list[Session]:
-    """Make the sessions in a folder that may have them already."""
-    truth = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"
-    sources = {"example": (ROOT / "examples/hexapod", truth, True)}
+def sessions(room: str, folder: Path, independent: Path | None) -> list[Session]:
+    """Make the sessions of a room in a folder that may have them already."""
+    made = list[Session]()
+    if room == "calibration":
+        for name, simulated in OUTLINES.items():
+            dataset = session_folder(name, simulated, folder)
+            truth = dataset / f"truth/models/{simulated.model}.yaml"
+            made.append(Session(name, dataset, truth))
+    sources = {
+        "example": (
+            ROOT / "examples/hexapod",
+            ROOT / "tests/data/hexapod-truth/models/hexapod.yaml",
+        )
+    }
     if independent is not None:
-        of_truth = next(independent.with_name(f"{independent.name}-truth").glob("models/*.yaml"))
-        sources[independent.name] = independent, of_truth, True
+        truth = next(independent.with_name(f"{independent.name}-truth").glob("models/*.yaml"))
+        sources[independent.name] = independent, truth
     shot = folder / "3-rps-shot"
     if not shot.exists():
         words = ["simulate", ROOT / "models/3-rps.yaml", "-o", shot, "--poses", IMAGES]
         words += ["--seed", 4, "-q"]
         subprocess.run([sys.executable, "-m", "legcal", *map(str, words)], check=True,
                        capture_output=True)  # fmt: skip
-    sources["3-rps"] = shot, shot / "truth/models/3-rps.yaml", True
-    found = []
-    for name, (source, model, half) in sources.items():
+    sources["3-rps"] = shot, shot / "truth/models/3-rps.yaml"
+    for name, (source, truth) in sources.items():
         dataset = folder / name
         if not dataset.exists():
-            small(source, dataset, half=half)
-        found.append(Session(name, dataset, model))
-    return found
+            small(source, dataset)
+        made.append(Session(name, dataset, truth))
+    return made
 
 
 def trial(room: str, number: str, factor: float, session: Session, size: float) -> Line:
@@ -187,67 +221,89 @@ def is_worse(line: Line, usual: Line) -> bool:
 
 def plateaus(lines: list[Line], room: str) -> Iterator[tuple[str, float, float, list[Line]]]:
     """Return each number with the least and greatest factor about 1 at which nothing is worse."""
-    usual = {line.session: line for line in lines if line.room == room and not line.number}
-    for number in dict.fromkeys(one.number for one in lines if one.room == room and one.number):
-        own = [line for line in lines if line.number == number and line.session in usual]
-        bad = {line.factor for line in own if is_worse(line, usual[line.session])}
-        tried = sorted({line.factor for line in own} | {1.0})
+    of_room = [line for line in lines if line.room == room]
+    usual = {line.session: line for line in of_room if not line.number}
+    for number in dict.fromkeys(line.number for line in of_room if line.number):
+        trials = [line for line in of_room if line.number == number and line.session in usual]
+        bad = {line.factor for line in trials if is_worse(line, usual[line.session])}
+        tried = sorted({line.factor for line in trials} | {1.0})
         low = max((f for f in bad if f < 1.0), default=0.0)
         high = min((f for f in bad if f > 1.0), default=float("inf"))
         within = [factor for factor in tried if low < factor < high]
-        yield number, within[0], within[-1], own
+        yield number, within[0], within[-1], trials
 
 
 def table(lines: list[Line], room: str) -> None:
-    """Print the plateau of each number, and what each session came to."""
+    """Print the plateau of each number, and the outlines and errors of each session."""
     usual = {line.session: line for line in lines if line.room == room and not line.number}
-    for one in usual.values():
-        print(f"{one.session:>10}: {one.used} outlines used, off {1e4 * one.off:.2f} e-4 of a leg "
-              f"({1e4 * one.stated:.2f} stated)")  # fmt: skip
-    print(f"{'':18}plateau      outlines used and error against factor 1")
-    for number, low, high, own in plateaus(lines, room):
+    print(f"{room}: {', '.join(numbers(room))}")
+    for line in usual.values():
+        print(f"{line.session:>22}: {line.used} outlines used, off {1e4 * line.off:.2f} e-4 of a "
+              f"leg ({1e4 * line.stated:.2f} stated)")  # fmt: skip
+    print(f"{'':20}plateau      outlines used and error against factor 1")
+    for number, low, high, trials in plateaus(lines, room):
+        if all((t.used, t.off) == (usual[t.session].used, usual[t.session].off) for t in trials):
+            names = dict.fromkeys(line.session for line in trials)
+            print(f"{number:20}no part in {', '.join(names)}")
+            continue
         words = []
-        for factor in sorted({line.factor for line in own}):
+        for factor in sorted({line.factor for line in trials}):
             each = [
                 "failed"
                 if line.said
                 else f"{100 * (line.used / usual[line.session].used - 1):+.0f}% "
                 f"x{line.off / usual[line.session].off:.2f}"
-                for line in own
+                for line in trials
                 if line.factor == factor
             ]
             words.append(f"{factor:g}: {', '.join(each)}")
-        print(f"{number:18}{low:g} to {high:g}   {'; '.join(words)}")
+        print(f"{number:20}{low:g} to {high:g}   {'; '.join(words)}")
 
 
 def main() -> None:
     """Measure what is missing, then print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--room", default="perception")
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--room", choices=ROOMS, help="both with --table or --check")
     parser.add_argument("--only", nargs="+", help="these numbers alone")
+    parser.add_argument("--sessions", nargs="+", help="these sessions alone")
     parser.add_argument("--independent", type=Path, help="a dataset, its truth in NAME-truth")
     parser.add_argument("--factors", type=float, nargs="+", default=FACTORS)
     parser.add_argument("--keep", type=Path, help="folder for the sessions")
     parser.add_argument("--table", action="store_true", help="measure nothing")
+    parser.add_argument("--check", action="store_true", help="only say which numbers are not used")
     parser.add_argument("-o", "--output", type=Path, default=RECORDED)
-    chosen = parser.parse_args()
-    lines = recorded(chosen.output)
-    if not chosen.table:
-        done = {(line.room, line.number, line.factor, line.session) for line in lines}
-        tried = [("", 1.0)]
-        tried += [(n, f) for n in chosen.only or numbers(chosen.room) for f in chosen.factors]
-        with TemporaryDirectory() as scratch, chosen.output.open("a", encoding="utf-8") as file:
-            every = sessions(chosen.keep or Path(scratch), chosen.independent)
-            for number, factor in tried:
-                for session in every:
-                    if (chosen.room, number, factor, session.name) in done:
-                        continue
-                    size = load_mechanism(session.truth).size
-                    line = trial(chosen.room, number, factor, session, size)
-                    lines.append(line)
-                    file.write(json.dumps(asdict(line)) + "\n")
-                    file.flush()
-    table(lines, chosen.room)
+    options = parser.parse_args()
+    rooms = [options.room] if options.room else list(ROOMS)
+    if options.check:
+        lost = [f"{room}: {name}" for room in rooms for name in unused(room)]
+        print("\n".join(lost) or f"all {sum(len(numbers(room)) for room in rooms)} are used")
+        sys.exit(1 if lost else 0)
+    if not options.table:
+        if options.room is None:
+            parser.error("--room says whose numbers to sweep")
+        measure(options)
+    for room in rooms:
+        table(recorded(options.output), room)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Add the lines that the file does not have."""
+    room, lines = options.room, recorded(options.output)
+    done = {(line.room, line.number, line.factor, line.session) for line in lines}
+    tried = [("", 1.0)]
+    tried += [(name, f) for name in options.only or numbers(room) for f in options.factors]
+    with TemporaryDirectory() as scratch, options.output.open("a", encoding="utf-8") as file:
+        every = sessions(room, options.keep or Path(scratch), options.independent)
+        for number, factor in tried:
+            for session in every:
+                if options.sessions and session.name not in options.sessions:
+                    continue
+                if (room, number, factor, session.name) in done:
+                    continue
+                size = load_mechanism(session.truth).size
+                line = trial(room, number, factor, session, size)
+                file.write(json.dumps(asdict(line)) + "\n")
+                file.flush()
 
 
 if __name__ == "__main__":

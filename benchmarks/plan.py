@@ -38,7 +38,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.goals import workspace_of
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Predictor
-from legcal.planning.places import Place, all_points, places_along, usual_setting
+from legcal.planning.places import Place, all_points, default_setting, places_along
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
 from legcal.planning.poses import surely_reached
@@ -144,7 +144,7 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
         choices = Choices(priors={f"{rod[0].name}.length": known})
     sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
     predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
-    scene = Scene.nominal(Task(predictor, args.images, args.cameras, usual_setting(machine.size)))
+    scene = Scene.nominal(Task(predictor, args.images, args.cameras, default_setting(machine.size)))
     work = workspace_of(machine, predictor.legs)
     if work is None:
         raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")

@@ -150,11 +150,15 @@ class LegcalError(Exception):
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
     diagnosis : tuple of dict
-        What looks wrong with the session, as ``--json`` has it; empty where nothing was found.
+        The likely mistakes of the session, as ``--json`` has them; empty without any.
+    consequences : tuple of Problem
+        Problems that may follow from these mistakes. The message only counts them; documents have
+        them with their codes.
     """
 
     exit_code = 1
     diagnosis: tuple[dict[str, object], ...] = ()
+    consequences: tuple[Problem, ...] = ()
 
     def __init__(self, problems: str | Problem | Sequence[str | Problem]) -> None:
         said = [problems] if isinstance(problems, str | Problem) else problems
@@ -163,18 +167,26 @@ class LegcalError(Exception):
         super().__init__("\n".join(_shortened(self.facts, self.problems)))
 
     def __reduce__(self) -> tuple[type, tuple[tuple[Problem, ...]], dict[str, object]]:
-        return type(self), (self.facts,), {"diagnosis": self.diagnosis}
+        state: dict[str, object] = {"diagnosis": self.diagnosis}
+        state["consequences"] = self.consequences
+        return type(self), (self.facts,), state
 
     def documents(self) -> list[dict[str, Any]]:
-        """Return the facts as ``--json`` has them, each with its code."""
-        kind = re.sub(r"\B(?=[A-Z])", "-", type(self).__name__).lower()
-        return [{"code": kind, **fact.document()} for fact in self.facts]
+        """Return facts and consequences as ``--json`` has them, each with its code."""
+        code = code_of_kind(type(self).__name__)
+        return [{"code": code, **fact.document()} for fact in (*self.facts, *self.consequences)]
 
     def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
         """Return an error of the same kind whose problems are changed."""
         error = type(self)([change(problem) for problem in self.facts])
         error.diagnosis = self.diagnosis
+        error.consequences = tuple(map(change, self.consequences))
         return error
+
+
+def code_of_kind(kind: str) -> str:
+    """Return the code of a problem that has no other: ``not-visible`` for ``NotVisible``."""
+    return re.sub(r"\B(?=[A-Z])", "-", kind).lower()
 
 
 def printable(text: str) -> str:

@@ -277,7 +277,7 @@ def _use() -> Iterable[Refusal]:
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
-        ("two-datasets", "calibrate a b -o out", ("needed one dataset", "docs/python.md")),
+        ("two-datasets", "calibrate a b -o out", ("Expected one dataset", "docs/python.md")),
     ]
     yield from _worded("use", "", rows)
     existing = [text("thesis.tex", "years of work")]

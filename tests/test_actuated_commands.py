@@ -71,7 +71,7 @@ def test_commands_know_that_joints_at_A_move(
         free = ["--set", "*.radius.*=free"]
         assert run(monkeypatch, "calibrate", session, "-o", tmp_path / "never", "-q", *free) == 1
         refusal = " ".join(capsys.readouterr().err.split())
-        assert "carry no length" in refusal
+        assert "the overall scale is undetermined" in refusal
         assert "--length leg1.base:leg1.platform=MEASURED" in refusal
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)

@@ -431,7 +431,7 @@ def test_a_second_run_searches_no_image_and_gives_the_same(example_run: Run) -> 
 
 
 def test_good_photographs_give_no_notes(example_run: Run) -> None:
-    exact = "The intrinsics of the camera of views c1, c2, c3 are taken as exact, since its file "
+    exact = "The intrinsics of the camera of views c1, c2, c3 are taken as exact, because its file "
     usual = ("From the ", "The gamma of ", exact)
     assert sum(note.startswith(exact) for note in example_run.calibration.notes) == 1
     assert [note for note in example_run.calibration.notes if not note.startswith(usual)] == []

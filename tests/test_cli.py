@@ -11,7 +11,7 @@ from command_line import run
 from hexapod_example import Run, copy_of_the_example
 from simulated import simulated
 
-from legcal.errors import Code, DatasetError, ModelError, NotVisible, Problem
+from legcal.errors import Code, DatasetError, LegcalError, ModelError, NotVisible, Problem
 from legcal.simulation.settings import ParameterErrors
 
 
@@ -85,13 +85,27 @@ def test_a_model_that_was_right_already_is_not_called_an_improvement(
     assert "Do not load this into the controller" in " ".join(capsys.readouterr().out.split())
 
 
+def _diagnosed() -> LegcalError:
+    """A refusal whose message counts the consequences of a mistake."""
+    error = NotVisible("columns a and b appear to be swapped; 2 further problems")
+    error.consequences = Problem("no leg"), Problem("the number", code=Code.BAD_CELL)
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "kind", "said", "problems"),
     [
-        (ZeroDivisionError("division by zero"), 3, "InternalError", "a mistake in legcal", []),
-        (KeyboardInterrupt(), 130, "Interrupted", "Stopped before the end", []),
+        (
+            ZeroDivisionError("division by zero"),
+            3,
+            "InternalError",
+            "a mistake in legcal",
+            ["internal-error"],
+        ),
+        (KeyboardInterrupt(), 130, "Interrupted", "Stopped before the end", ["interrupted"]),
         (ModelError(["one", "two"]), 2, "ModelError", "one\ntwo", ["model-error"] * 2),
         (NotVisible("no leg"), 1, "NotVisible", "no leg", ["not-visible"]),
+        (_diagnosed(), 1, "NotVisible", "2 further", ["not-visible"] * 2 + ["bad-cell"]),
     ],
 )
 def test_failures_have_their_exit_code_and_are_said_once(
@@ -179,6 +193,10 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
     (line,) = capsys.readouterr().err.splitlines()
     assert found in line
     assert f"; legcal {words[0]} --help lists" in line
+    assert run(monkeypatch, *words, "--json") == 2
+    (problem,) = json.loads(capsys.readouterr().out)["error"]["problems"]
+    assert problem["code"] == "usage-error"
+    assert found in problem["what"]
 
 
 @pytest.mark.parametrize(

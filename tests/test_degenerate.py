@@ -157,7 +157,9 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
     leg = header.index("leg")
     with observations.open("w", newline="") as file:
         csv.writer(file).writerows([header, *(row for row in rows if row[leg] != "leg6")])
-    with pytest.raises(NotVisible, match=r"found no used outline of leg6 .* name the legs of each"):
+    with pytest.raises(
+        NotVisible, match=r"no image has a usable outline of leg6; .* list the visible legs of each"
+    ):
         calibrate(folder)
     text = (folder / "dataset.yaml").read_text()
     text = re.sub(r"    legs: .*\n", "", text)

@@ -136,7 +136,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.images == 12
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
-    assert ("To tell these apart" in found.sentence) == bool(found.same_as)
+    assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
 
 @pytest.mark.system
@@ -271,7 +271,7 @@ def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     assert len([one for one in found.same_as if one.startswith("columns")]) == 2
     told = found.sentence.partition(": with the columns swapped,")[0]
     assert "or the outlines appear to be mirrored, or the model appears mirrored" in told
-    assert "or 2 more that are alike" in told
+    assert "or 2 similar mistakes" in told
 
 
 def test_a_row_from_which_on_readings_are_late_is_named(

@@ -135,7 +135,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     fits_schema(["doctor"], document)
     said = [one["what"] for one in document["findings"]]
     assert said[0] == mistake.sentence
-    assert any(what.startswith("1 more thing that images contradict may come") for what in said)
+    assert any(what.startswith("1 further problem may have the same cause") for what in said)
     assert not any("T_base_camera is wrong" in what for what in said)
     assert document["diagnosis"] == [mistake.document().document()]
     assert not document["ready"]

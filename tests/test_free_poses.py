@@ -18,7 +18,7 @@ from simulated import settings, small_camera
 import legcal
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.scale import naming_missing_lengths
+from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
@@ -376,7 +376,7 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
 def test_of_arms_one_length_is_to_be_measured() -> None:
     session = machine_session("servo-hexapod", n_views=1, n_poses=1)
     problem = build_fit(session.legs, session.measurements, session.outlines)
-    with pytest.raises(NotIdentifiable) as refusal, naming_missing_lengths(problem):
+    with pytest.raises(NotIdentifiable) as refusal, explaining_missing_scale(problem):
         raise NotIdentifiable("It is not determined.")
     assert "state it (--length)" in refusal.value.problems[0]
 

@@ -37,7 +37,7 @@ from thinned import thinned
 
 from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
@@ -242,7 +242,7 @@ def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
     problem = build_fit(*everything, choices=Choices(fixed=known))
     state = problem.begin(session.truth)
     linear = linearize(problem, state)
-    held = open_directions(problem, state, information(problem, state, linear))
+    held = undetermined_directions(problem, state, information(problem, state, linear))
     assert len(held.directions) == ranks.of - ranks.rank
     assert set(held.names) == open_to_identify
 
@@ -390,7 +390,7 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
         assert found.start == "nominal"
         said = (*found.notes, *found.details)
         assert any("the four steps" in note for note in said)
-        start = "From the nominal model, the joint fit reached a cost of"
+        start = "Starting from the nominal model, the joint fit reached a cost of"
         assert any(note.startswith(start) for note in found.details)
         assert not any(note.startswith(start) for note in found.notes)
     equal = replace(disturbed_start(small, seed=9), label="staged")

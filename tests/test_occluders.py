@@ -16,7 +16,7 @@ from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.occluders import PlacedOccluders
 from legcal.machine.parameters import geometries
-from legcal.planning.sight import Bodies, what_is_seen
+from legcal.planning.sight import Bodies, visible_parts
 from legcal.simulation.solids import PosedMachine, pose_machine, solids_of
 from legcal.simulation.visibility import legs_in_image
 from legcal.vision.camera import sample_camera
@@ -135,7 +135,7 @@ def test_plans_see_of_legs_what_the_simulation_shows_of_them(
     np.testing.assert_allclose(bodies.A[0], poses[0].A, atol=1e-9)
     for place in ([1.0, 0.3, 0.3], [-0.5, 0.9, 0.2], [0.2, -1.0, 0.5]):
         T = look_at(np.array(place), np.array([0.0, 0.0, 0.2]))
-        seen = what_is_seen(camera, T, bodies)
+        seen = visible_parts(camera, T, bodies)
         shown = [legs_in_image(machine.legs, here, camera, T, samples=400) for here in poses]
         for image, leg, part, ends in zip(seen.image, seen.leg, seen.part, seen.ends, strict=True):
             [stretch] = [s for s in shown[image][leg].stretches if s.part == part]

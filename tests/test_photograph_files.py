@@ -222,7 +222,8 @@ def test_a_refusal_names_what_may_be_its_cause(
         calibrate(folder.path)
     first, follow, last = refused.value.problems
     assert (first, last) == (mistake.sentence, note)
-    assert follow.startswith(f"{n} more thing")
+    assert follow.startswith(f"{n} further problem")
+    assert len(refused.value.consequences) == n
 
 
 @pytest.mark.parametrize(

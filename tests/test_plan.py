@@ -32,7 +32,7 @@ from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
 from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
-from legcal.planning.places import Place, Setting, parse_bounds, usual_setting
+from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.poses import candidate_poses as draw_poses
@@ -42,7 +42,7 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
-FEW = replace(usual_setting(load_mechanism("3-rpr").size), draws=3)
+FEW = replace(default_setting(load_mechanism("3-rpr").size), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 
@@ -318,7 +318,7 @@ FAR: dict[str, Any] = {"images": 4, "setting": FEW}
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 0}, UsageError, "--images 0"),
     ({"images": 401}, UsageError, "1 to 400"),
-    ({"images": 9, "images_per_view": 3}, UsageError, "images per view"),
+    ({"images": 9, "images_per_view": 3}, UsageError, "--images-per-view"),
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
     ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
@@ -341,8 +341,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
         DidNotConverge,
         "; plan with a smaller length",
     ),
-    (FAR | {"bounds": np.array([[5.0, 6.0]] * 3)}, NotVisible, "bounds, nearer"),
-    (FAR | {"bounds": np.array([[0.3, 0.31]] * 3)}, NotVisible, "bounds, farther"),
+    (FAR | {"bounds": np.array([[5.0, 6.0]] * 3)}, NotVisible, "bounds towards"),
+    (FAR | {"bounds": np.array([[0.3, 0.31]] * 3)}, NotVisible, "bounds away"),
 ]
 
 
@@ -441,7 +441,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     for listed, remedy in (
         (tripods(a=[0.0, 90.0, 90.0]), "move a nearer"),
         (tripods(a=[0.0, 0.0, 0.2]), "move a further away"),
-        (away, "0 of 1 camera places .* turn a to the machine"),
+        (away, "0 of 1 camera positions .* point a at the machine"),
     ):
         refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
@@ -449,7 +449,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     refused(UsageError, "found 1 place for 2", places=away, cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=around(1.4))  # fmt: skip
-    refused(NotVisible, "; use a board of larger squares", board="chessboard:9x6:5mm")
+    refused(NotVisible, "; use a board with larger squares", board="chessboard:9x6:5mm")
     refused(NotIdentifiable, "plan .* --images or more", images=1, places=around(1.4))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))

@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path, PurePath
 
 import pytest
+from constants import ROOMS, numbers, unused
 from evidence import page_text
 from format_schemas import FOLDER, NAMES, schema_text
 from hexapod_example import Run
@@ -153,3 +154,9 @@ def _plain(requirement: str) -> str:
 def test_the_page_of_evidence_has_the_recorded_figures() -> None:
     page = (ROOT / "docs/evidence.md").read_text(encoding="utf-8")
     assert page_text(page) == page, "python benchmarks/evidence.py writes its tables"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_number_that_is_swept_is_used(room: str) -> None:
+    assert numbers(room)
+    assert unused(room) == []

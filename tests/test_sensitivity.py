@@ -196,8 +196,8 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     ("camera", "wrong", "start", "words"),
     thinned(
         [
-            (LENS, {"k1": 0.0}, "The distortion of c1", "had not been removed"),
-            (PINHOLE, {"k1": -0.1}, "The distortion of c1", "had been removed"),
+            (LENS, {"k1": 0.0}, "The distortion of c1", "appears not to have been removed"),
+            (PINHOLE, {"k1": -0.1}, "The distortion of c1", "appears to have been removed"),
             (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
             (
                 LENS,

@@ -9,10 +9,14 @@ from thinned import thinned
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 from start_dependence import (
+    OFF,
+    RECORDED,
+    RECORDED_SESSIONS,
     TOLERANCE,
     Session,
     calibrated,
     difference,
+    needs_steps,
     session_folder,
     with_other_model,
 )
@@ -36,3 +40,24 @@ def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> No
     for end in (other, moved):
         assert difference(first, end)[0] < TOLERANCE
         assert end.solution.outlines.used_keys() == first.solution.outlines.used_keys()
+
+
+@pytest.mark.parametrize("name", thinned(RECORDED_SESSIONS, ["arms", "passive", "planar"]))
+def test_recorded_sessions_give_one_result_from_every_start(name: str) -> None:
+    folder = RECORDED / name
+    steps = needs_steps(folder)
+    first = calibrated(folder, "nominal", steps=steps)
+    staged = calibrated(folder, "staged")
+    assert steps or staged.solution.start == "staged"
+    B = {leg.name: leg.B for leg in staged.solution.legs}
+    values = staged.solution.estimates.values
+    assert all(
+        values[f"{leg}.platform.{axis}"] == pytest.approx(x, abs=1e-12)
+        for leg, ends in B.items()
+        for axis, x in zip("xyz", ends, strict=True)
+        if f"{leg}.platform.{axis}" in values
+    )
+    off = calibrated(folder, "nominal", steps=steps, off=OFF)
+    for other in (staged, off):
+        assert difference(first, other)[0] < TOLERANCE
+        assert other.solution.outlines.used_keys() == first.solution.outlines.used_keys()

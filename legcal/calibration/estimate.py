@@ -19,6 +19,7 @@ from legcal.calibration.joint_fit.solution import Solution, in_file_order
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.outlier_images import outlier_images
+from legcal.calibration.tuning import LIMB_BIAS_PX
 from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
@@ -29,7 +30,7 @@ from legcal.perception.placement import Placement
 
 # Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
 # a change of the radii, so that residuals never show it.
-LIMB_BIAS = {"bias of many edges": 0.02}
+LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
 # Settings for a session with a suspected mistake: other starts and more iterations would not help,
 # and contradictions to stated values are expected.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
@@ -122,9 +123,9 @@ def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
     if unseen:
         raise NotVisible(
-            f"{fitted.dataset.folder}: the machine could not be calibrated: found no used outline "
-            f"of {', '.join(unseen)} in any image, needed some of every leg; add images that show "
-            "it, or name the legs of each view in dataset.yaml to leave it to the readings."
+            f"{fitted.dataset.folder}: the machine could not be calibrated: no image has a usable "
+            f"outline of {', '.join(unseen)}; add images that show it, or list the visible legs of "
+            "each view in dataset.yaml, so that it relies on readings."
         )
 
 

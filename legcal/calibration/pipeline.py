@@ -41,6 +41,7 @@ from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
+from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.calibration.verdict import judge
 from legcal.data.cache import fingerprint, plan_dataset, store_outlines
 from legcal.data.dataset import Dataset, load_dataset
@@ -72,8 +73,6 @@ from legcal.perception.photographs import (
 from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
-
-TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 
 
 def calibrate(
@@ -112,16 +111,16 @@ def calibrate(
         must be safe to import (``if __name__ == "__main__":``). Or on a Dask cluster: the address
         of its scheduler, a client, or another object with ``submit``, as executors have it.
     priors : mapping or sequence of str
-        What is known of parameters: (value, sigma) in SI units or pixels, or text such as
-        ``420±0.1 mm``, by name or pattern; or texts that begin with ``NAME=``. These three
-        win over what ``dataset.yaml`` says.
+        Priors: (value, sigma) in SI units or pixels, or text such as ``420±0.1 mm``, by name or
+        pattern; or texts that begin with ``NAME=``. These three win over ``dataset.yaml``.
     fixed : sequence of str
         Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
     free : sequence of str
         Names or patterns of parameters to estimate that are fixed otherwise (intrinsics), and of
         radii, twists and intrinsics with a covariance to estimate without a prior.
     holdout : float, optional
-        Hold out this part of the images, and compare them with what the fit of the others predicts.
+        Hold out this fraction of the images, and compare them with the prediction of the fit to the
+        others.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
     beside : callable, optional
@@ -208,8 +207,8 @@ def calibrate(
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
-    A refusal also has what looks wrong with the session, in place of what follows from that, and
-    what files of photographs say against their camera: they may be the cause.
+    A refusal names the likely mistakes of the session before their consequences, and also notes on
+    files of photographs that contradict their camera: they may be the cause.
 
     Raises
     ------
@@ -235,7 +234,9 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         if diagnosis:
             refused = notes_beside(diagnosis, error.problems, "legcal calibrate")
         refusal = type(error)([*(one.sentence for one in diagnosis), *refused, *notes])
-        refusal.diagnosis = tuple(one.document().document() for one in diagnosis)
+        if diagnosis:
+            refusal.diagnosis = tuple(mistake.document().document() for mistake in diagnosis)
+            refusal.consequences = error.facts
         raise refusal from error
 
 
@@ -311,7 +312,7 @@ def _leaves_out_many(estimate: Estimate) -> bool:
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
-    """Return rough camera poses that the fit contradicts, and images that contradict the fit."""
+    """Return notes on rough camera poses and on images that contradict the fit."""
     fitted, o = estimate.fitted, estimate.solution.outlines
     shown = set(fitted.measurements.view[o.row[o.used]].tolist())
     views = fitted.measurements.views
@@ -342,7 +343,7 @@ def _refuse_too_few(
 
 
 def outline_key(dataset: Dataset, choices: Choices) -> str:
-    """Return the fingerprint of all that the outlines of a dataset depend on.
+    """Return the fingerprint of everything that outlines of a dataset depend on.
 
     Images that disagree are searched again near the fit, which depends on the choices.
     """
@@ -360,10 +361,10 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
 
 
 def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
-    """Return what dataset and call choose of the parameters.
+    """Return the choices of dataset and call for the parameters.
 
-    Twists that nobody chooses anything of are estimated with a prior: no leg is built without an
-    error of its twist, and one that was left at nominal would bias the others.
+    Twists without an explicit choice get a prior: every leg has an error of its twist, and a twist
+    fixed at nominal would bias the others.
     """
     known = known_parameters(
         dataset.machine,
@@ -373,7 +374,7 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     )
     choices = resolve([*dataset.overrides, *overrides], known)
     twists = {
-        name: Prior(parameter.nominal, TWIST_SIGMA)
+        name: Prior(parameter.nominal, float(np.radians(TWIST_SIGMA_DEG)))
         for name, parameter in known.by_name.items()
         if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)
@@ -383,27 +384,25 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
 
 
 def _split(dataset: Dataset, holdout: float | None) -> tuple[IntArray, IntArray]:
-    """Return the rows of images to fit and of held-out ones."""
+    """Return the rows of fitted and of held-out images."""
     if holdout is None:
         rows = np.arange(dataset.measurements.n_rows)
         return rows, rows[:0]
     if dataset.axes is not None:
         raise UsageError(
-            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
-            "images or outlines, in which a fit is compared with what it did not see; leave out "
-            "--holdout."
+            f"{dataset.folder}: --holdout needs images or outlines, and this dataset has a table "
+            "of axes; leave it out."
         )
     if not dataset.machine.is_determined:
         raise UsageError(
-            f"{dataset.folder}: no images could be kept aside: found that "
-            f"{dataset.machine.undetermined}, needed readings that give the poses of images that a "
-            "fit has not seen; leave out --holdout."
+            f"{dataset.folder}: --holdout needs readings that determine the pose of an image, but "
+            f"{dataset.machine.undetermined}; leave it out."
         )
     return split_images(dataset, holdout)
 
 
 def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> HeldOut:
-    """Return how well the fit predicts the held-out images."""
+    """Compare the held-out images with the prediction of the fit."""
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
@@ -412,17 +411,16 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return which files hold the cameras that the measurements contradict."""
+    """Return a note on the file of each camera that the measurements contradict."""
     names = [view.name for view in dataset.measurements.views]
     return [
-        f"The camera of {view} that does not agree is that of "
-        f"{dataset.camera_paths[names.index(view)]}."
+        f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in solution.camera_doubts.views
     ]
 
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
-    """Return a note on cameras that are taken as exact because nothing says how well they are."""
+    """Return a note on cameras taken as exact because no covariance is stated."""
     if dataset.axes is not None:
         return []
     views = dataset.measurements.views
@@ -438,6 +436,6 @@ def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     if len(set(exact.values())) > 1:
         whose, state = "cameras", "their camera files state"
     return [
-        f"The intrinsics of the {whose} of {few_views(list(exact))} are taken as exact, since "
-        f"{state} no covariance; calibrate with legcal camera, or state what is known with a prior."
+        f"The intrinsics of the {whose} of {few_views(list(exact))} are taken as exact, because "
+        f"{state} no covariance; calibrate with legcal camera, or add a prior (--set)."
     ]

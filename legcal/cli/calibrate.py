@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from legcal.data.dataset import Dataset
     from legcal.machine.model import Machine
 
-_TESTS = "Tests of a result"
+_TESTS = "Validation"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
 
@@ -43,25 +43,25 @@ def calibrate(
     as_json: JsonOption = False,
     verbose: Annotated[
         bool,
-        typer.Option("--verbose", "-v", help="Also say how the fit went, and terms that are zero."),
+        typer.Option("--verbose", "-v", help="Print all tables and details of the fit."),
     ] = False,
     criteria: Annotated[
         Criteria,
         typer.Option(
-            help="The weights of the four steps: from the covariances of the axes, or one as the "
-            "paper has them."
+            help="The weights of the four steps: from the covariances of the axes, or all one as "
+            "in the paper (literal)."
         ),
     ] = "default",
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
+        bool, typer.Option("--fresh", help="Measure the images again, even if cached outlines fit.")
     ] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="NAME[=VALUE[±SIGMA]]",
-            help="NAME holds a parameter at its nominal value, NAME=VALUE at that one, "
-            "NAME=VALUE±SIGMA (or +-) says how well it is known (leg1.length=420±0.1mm), NAME=free "
+            help="NAME fixes a parameter at its nominal value, NAME=VALUE at a value, "
+            "NAME=VALUE±SIGMA (or +-) gives it a prior (leg1.length=420±0.1mm), NAME=free "
             "estimates it without a prior (c1.f?, *.radius.*).",
             rich_help_panel=_PARAMETERS,
         ),
@@ -70,18 +70,17 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="JOINT:JOINT=VALUE+-SIGMA",
-            help="A distance of two joints that was measured by hand: "
-            "leg1.base:leg3.base=400+-0.05mm, or both ends of a rod. Motors that turn carry no "
-            "length: one fixes the scale.",
+            help="A measured distance of two joints: leg1.base:leg3.base=400+-0.05mm, or of both "
+            "ends of a rod. Rotary motors do not determine the scale; one distance does.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
     holdout: Annotated[
         float | None,
         typer.Option(
-            metavar="PART",
-            help="Hold out this fraction of the images (0.2: a fifth) and report how well the fit "
-            "of the others predicts them.",
+            metavar="FRACTION",
+            help="Hold out this fraction of the images (0.2: a fifth), and compare them with the "
+            "prediction of the fit to the others.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -89,8 +88,8 @@ def calibrate(
         Path | None,
         typer.Option(
             metavar="RESULT",
-            help="Change detection: test the result folder of an earlier calibration with the "
-            "images of DATASET; with --output a page is written. Exit 1 if something has moved.",
+            help="Change detection: test the result of an earlier calibration with the images of "
+            "DATASET; with --output a page is written. Exit 1 if something has moved.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -119,9 +118,8 @@ def calibrate(
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
     if len(datasets) > 1:
         raise UsageError(
-            f"The command could not be run: found {len(datasets)} datasets, needed one dataset; "
-            "run legcal calibrate for each of them, or a loop in Python (docs/python.md, Many "
-            "machines)."
+            f"Expected one dataset, found {len(datasets)}; run legcal calibrate for each of them, "
+            "or a loop in Python (docs/python.md, Many machines)."
         )
     dataset = datasets[0]
     if check is not None:
@@ -137,8 +135,8 @@ def calibrate(
         named = [name for name, value in others.items() if value is not None]
         if named:
             raise UsageError(
-                f"The command could not be run: found {', '.join(named)} beside --check, which "
-                "takes all of it from the earlier result; leave one of them out."
+                f"{', '.join(named)} cannot be combined with --check, which uses the settings of "
+                "the earlier result; leave one of them out."
             )
         page = None if output is None or not with_report else _page_of_check(output)
         on = image_workers(cluster, workers)
@@ -146,13 +144,13 @@ def calibrate(
         return
     if output is None:
         raise UsageError(
-            "The calibration could not be run: found no --output (-o), needed the result folder to "
-            "write; name one, or the result to test with --check."
+            "--output (-o) is missing: name the result folder to write, or a result to test with "
+            "--check."
         )
     if truth is not None and not with_report:
         raise UsageError(
-            "The truth could not be used: found --truth beside --no-report, needed the page, which "
-            "alone compares the result with it; leave one of them out."
+            "--truth cannot be combined with --no-report, because only the page compares the "
+            "result with it; leave one of them out."
         )
     from legcal.calibration import pipeline
     from legcal.calibration.result_folder import REPORT_NAME

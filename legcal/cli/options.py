@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from legcal.errors import LegcalError, OutOfResources, UsageError, printable
+from legcal.errors import LegcalError, OutOfResources, UsageError, code_of_kind, printable
 from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
@@ -247,13 +247,15 @@ def print_failure(
     problems: Sequence[dict[str, object]] = (),
     diagnosis: Sequence[dict[str, object]] = (),
 ) -> None:
-    """Print why a command failed, on stderr, or in JSON on stdout."""
+    """Print why a command failed, on stderr, or in JSON on stdout.
+
+    Without *problems*, the message is the one problem.
+    """
     message = "\n".join(map(printable, message.split("\n")))
     if as_json:
         with suppress(OutOfResources):
             error: dict[str, object] = {"kind": kind, "message": message}
-            if problems:
-                error["problems"] = list(problems)
+            error["problems"] = list(problems) or [{"code": code_of_kind(kind), "what": message}]
             extra = {"diagnosis": list(diagnosis)} if diagnosis else {}
             print_json({"error": error, **extra})
             return

@@ -36,6 +36,6 @@ additive over eliminated elements, so that candidate images are low-rank updates
 The same matrix gives the response to errors of fixed quantities (:func:`response`), the
 disagreement between eliminated elements with common errors (:class:`Clusters`), score tests of
 columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the covariance of
-predictions (:func:`explained_share`). Variances of random effects are estimated by restricted
+predictions (:func:`leverage`). Variances of random effects are estimated by restricted
 maximum likelihood (:class:`Effects`).
 """

@@ -103,7 +103,7 @@ def _element_derivatives(normal: NormalEquations) -> Array:
     return np.asarray(np.moveaxis(normal.tangent.Q, 0, 2) + normal.tangent.Z @ inside)
 
 
-def explained_share(
+def leverage(
     problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,

@@ -1,4 +1,4 @@
-"""How well images agree with what is assumed of their machine: readings, model, cameras.
+"""Agreement of images with hypotheses on their machine: readings, model, cameras.
 
 The legs of all images of a view vote for one camera pose, as in recognition, and what counts is how
 many legs they show there. Nothing is measured, so that many assumptions can be compared.
@@ -26,10 +26,10 @@ _MIN_EXPECTED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How well images agree with one assumption."""
+    """Agreement of images with one hypothesis."""
 
     row: IntArray  # (n,) of the images
-    support: Array  # (n,) legs that agree with each, less its part of what shifted joints cost
+    support: Array  # (n,) legs that agree with each, less its share of the cost of shifted joints
     expected: Array  # (n,) legs that each should show
     cameras: tuple[RigidTransform | None, ...]  # T_base_group of each group of views, where found
 
@@ -59,7 +59,7 @@ class Agreement:
         )
 
     def at(self, rows: Sequence[int]) -> "Agreement":
-        """Return that of some images."""
+        """Return the agreement of some images."""
         chosen = np.isin(self.row, rows)
         row, support, expected = self.row[chosen], self.support[chosen], self.expected[chosen]
         return replace(self, row=row, support=support, expected=expected)
@@ -76,7 +76,7 @@ class Agreement:
 
     @property
     def images(self) -> int:
-        """How many images agree."""
+        """Number of images that agree."""
         return int(self.agrees.sum())
 
     @property
@@ -87,7 +87,7 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """What should be seen in the images of a group of views."""
+    """The predicted legs in the images of a group of views."""
 
     search: Search  # with the edge pairs of all images
     flip: Array  # (n_rows, 2) of images, as in :func:`as_if`
@@ -161,7 +161,7 @@ def as_if(pairs: CandidatePairs, corners: Array, flip: Array, focal: float) -> C
 
 
 def compare_assumptions(assumptions: Iterable[Assumption], run: Run) -> list[Agreement]:
-    """Return how well images agree with each of some assumptions.
+    """Return the agreement of images with each of some hypotheses.
 
     Rows at which the legs are not known (NaN) agree with nothing.
     """
@@ -181,14 +181,14 @@ class _Task:
 
 
 def _task(one: Assumption) -> _Task:
-    """Return what a process needs to judge an assumption."""
+    """Return the inputs with which a process judges a hypothesis."""
     known = [r for r in one.rows if np.isfinite(one.search.B_base[r]).all()]
     pictures = one.group.pictures({row: _picture(one, row) for row in known}, known)
     return _Task(pictures, known, one.rows, one.search.n_legs, one.starts, one.known)
 
 
 def _picture(one: Assumption, row: int) -> Picture:
-    """Return what an image shows under an assumption, and what it should."""
+    """Return the edge pairs and predicted legs of an image under a hypothesis."""
     search = one.search
     view = int(search.measurements.view[row])
     corners = sensor_extent(search.measurements.views[view].camera)
@@ -197,7 +197,7 @@ def _picture(one: Assumption, row: int) -> Picture:
 
 
 def _agreement(task: _Task) -> Agreement:
-    """Return how well the images of a group agree."""
+    """Return the agreement of the images of a group."""
     row = np.array(task.rows, dtype=np.intp)
     support, expected = np.zeros(len(row)), np.full(len(row), float(task.n_legs))
     nothing = Agreement(row, support, expected, (None,))
@@ -206,8 +206,8 @@ def _agreement(task: _Task) -> Agreement:
     placed = place_camera(task.pictures, task.n_legs, task.starts, task.known)
     if len(placed.poses) == 0:
         return nothing
-    found = np.isin(row, task.known_rows)
+    is_known = np.isin(row, task.known_rows)
     cost = float(placed.support[0].sum() - placed.score[0]) / len(task.known_rows)
-    support[found] = np.maximum(placed.support[0] - cost, 0.0)
-    expected[found] = placed.expected[0]
+    support[is_known] = np.maximum(placed.support[0] - cost, 0.0)
+    expected[is_known] = placed.expected[0]
     return Agreement(row, support, expected, (placed.pose(),))

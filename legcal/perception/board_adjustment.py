@@ -59,7 +59,7 @@ class BoardImages:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """How a board departs from a flat one whose squares are square.
+    """Deviations of a board from a flat one with square fields.
 
     With X and Y from -1 to 1 over its corners, a corner lies warp_x (1 - X^2) + warp_y (1 - Y^2) +
     twist X Y above the plane, and lengths along x are 1 + print_ratio times those along y.
@@ -82,7 +82,7 @@ class Sheet:
         return np.array([warp, warp, warp, SIGMA_PRINT_RATIO])
 
     def placed(self, points: Array) -> tuple[Array, Array]:
-        """Return where corners (n, 3) of a flat board lie, and the derivative (n, 3, 4)."""
+        """Return positions of corners (n, 3) of a flat board, and their derivative (n, 3, 4)."""
         from_middle = points[:, :2] - self.middle
         X, Y = (from_middle / self.half).T
         by_number = np.zeros((len(points), 3, len(SHEET)))
@@ -100,14 +100,16 @@ class AdjustedBoard:
     sheet: Sheet | None  # None where the board was taken as flat
     residual: Array  # (n, 2) corners less where they should be seen [px]
     cost: float  # half the sum of squares, in standard deviations, large ones by Huber's loss
-    covariance: Array  # (k, k) of the free intrinsics, then of the sheet, by those of corners
-    clusters: Clusters  # what each image says of these
+    covariance: (
+        Array  # (k, k) of the free intrinsics, then of the sheet, from the covariances of corners
+    )
+    clusters: Clusters  # scores of these by image
     # (n_images, 6, 6) of a rotation vector [rad] and a displacement [m] of the board, the camera
     # being known
     information: Array
 
     def rms_px(self, which: BoolArray | None = None) -> float:
-        """How far corners (of all (n,) or some) are from where they should be seen (rms) [px]."""
+        """Reprojection error (rms) of corners, of all (n,) or some [px]."""
         residual = self.residual if which is None else self.residual[which]
         return float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
@@ -143,7 +145,7 @@ def adjust_board(
     moving = problem
     if held:
         moving = replace(problem, variables=tuple(map(_held, problem.variables)))
-    found = minimise(
+    minimum = minimise(
         moving,
         state,
         LOSS,
@@ -151,14 +153,14 @@ def adjust_board(
         tolerance=tolerance,
         must_converge=False,
     )
-    linear = linearize(problem, found.state) if held else found.linear
-    normal = normal_equations(problem, found.state, linear, LOSS)
+    linear = linearize(problem, minimum.state) if held else minimum.linear
+    normal = normal_equations(problem, minimum.state, linear, LOSS)
     return AdjustedBoard(
-        found.state.camera,
-        found.state.board_pose.motions,
-        found.state.sheet,
+        minimum.state.camera,
+        minimum.state.board_pose.motions,
+        minimum.state.sheet,
         -linear["corners"].r * seen.sigma_px[:, None],
-        found.cost,
+        minimum.cost,
         normal.kept_covariance(),
         clustered(problem, linear, normal, LOSS),
         normal.V,

@@ -28,7 +28,7 @@ from legcal.vision.image_file import Grey, possible_scale, quiet_opencv, reduced
 from legcal.workers import Run
 
 STAGE = "Searching the board"
-MAX_ASKED = 2  # images of a view that are searched for what they show instead
+MAX_ASKED = 2  # images of a view that are searched for other boards
 
 _STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
 _FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
@@ -43,7 +43,7 @@ _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """What an image shows of a board.
+    """The corners of a board in an image.
 
     Attributes
     ----------
@@ -129,25 +129,25 @@ def find_corners(
 
     Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
-    found = search_board(board, image).numbered(board)
-    if not found.certain or len(found.number) < MIN_CORNERS:
+    detection = search_board(board, image).numbered(board)
+    if not detection.certain or len(detection.number) < MIN_CORNERS:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0)
-    return found.number, found.px, found.sigma_px
+    return detection.number, detection.px, detection.sigma_px
 
 
 def search_board(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> SeenBoard:
-    """Return what an image shows of a board; of a chessboard of any extent."""
+    """Detect a board in an image; a chessboard of any extent."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
     tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if board.kind == "chessboard":
-        ij, found = _chessboard(grey)
+        ij, saddles = _chessboard(grey)
     else:
-        (ij, found), tags = _tags_and_corners(board, grey)
-    black = np.where(found.contrast > 0.0, 1, -1)
-    return SeenBoard(board.kind, ij, found.px, found.sigma_px, black, *tags)
+        (ij, saddles), tags = _tags_and_corners(board, grey)
+    black = np.where(saddles.contrast > 0.0, 1, -1)
+    return SeenBoard(board.kind, ij, saddles.px, saddles.sigma_px, black, *tags)
 
 
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
@@ -166,9 +166,9 @@ def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
         if len(best.ij) >= columns * rows and min(columns, rows) >= _MIN_SIDE:
             break
     assert best is not None
-    ij, found = _measured_twice(grey, board, best.ij, best.px, scale_of_best)
+    ij, saddles = _measured_twice(grey, board, best.ij, best.px, scale_of_best)
     kept = _without_loose_lines(ij)
-    return ij[kept] - (ij[kept].min(axis=0) if kept.any() else 0), found.choose(kept)
+    return ij[kept] - (ij[kept].min(axis=0) if kept.any() else 0), saddles.choose(kept)
 
 
 def _measured_twice(
@@ -180,8 +180,8 @@ def _measured_twice(
     """
     blur = 0.0
     if len(ij) and (scale < _SAME or scale > 1.0):
-        ij, found = measured(rescaled(grey, scale), board, ij, px, grow=False)
-        px, blur = reduced(found.px, scale), _usual_blur(found) / scale
+        ij, saddles = measured(rescaled(grey, scale), board, ij, px, grow=False)
+        px, blur = reduced(saddles.px, scale), _usual_blur(saddles) / scale
     elif len(ij):
         px = reduced(px, scale)
         some = np.linspace(0, len(ij) - 1, min(_N_ASKED, len(ij))).astype(np.intp)
@@ -193,17 +193,17 @@ def _measured_twice(
     scale = _MEASURED_BLUR / blur
     small = rescaled(grey, scale)
     both = np.array(small.shape[::-1]) / grey.shape[::-1]  # of columns and rows, which are whole
-    ij, found = measured(small, board, ij, (px + 0.5) * both - 0.5, _MEASURED_BLUR)
-    return ij, found.moved_to((found.px + 0.5) / both - 0.5, scale)
+    ij, saddles = measured(small, board, ij, (px + 0.5) * both - 0.5, _MEASURED_BLUR)
+    return ij, saddles.moved_to((saddles.px + 0.5) / both - 0.5, scale)
 
 
-def _usual_blur(found: Saddles) -> float:
+def _usual_blur(saddles: Saddles) -> float:
     """Return the blur of most corners [px]; 0 without any."""
-    return float(np.median(found.blur_px[found.found])) if found.found.any() else 0.0
+    return float(np.median(saddles.blur_px[saddles.found])) if saddles.found.any() else 0.0
 
 
 def _without_loose_lines(ij: IntArray) -> BoolArray:
-    """Return which corners of a lattice stay when outer lines of few of them are left out."""
+    """Return the mask of corners of a lattice without sparse outer lines."""
     kept = np.ones(len(ij), dtype=np.bool_)
     while kept.any():
         for axis, end in ((0, -1), (0, 1), (1, -1), (1, 1)):
@@ -219,7 +219,7 @@ def _without_loose_lines(ij: IntArray) -> BoolArray:
 
 
 def _print(board: Board) -> Print:
-    """Return how the corners of a board with markers or tags lie on it [m]."""
+    """Return the positions of the corners of a board with markers or tags [m]."""
     nx, ny = board.grid
     points = board.points.reshape(ny, nx, 3)
     x, y = points[0, :, 0], points[:, 0, 1]
@@ -261,9 +261,9 @@ def _tags_and_corners(
             continue
         ij = _near_anchors(board_print, xy)
         at, _ = expected(xy, px, board_print.xy(ij), board_print.pitch)
-        found = _measured_twice(grey, board_print, ij, (at + 0.5) * scale - 0.5, scale)
-        if best is None or len(found[0]) > len(best[0]):
-            best = found
+        saddles = _measured_twice(grey, board_print, ij, (at + 0.5) * scale - 0.5, scale)
+        if best is None or len(saddles[0]) > len(best[0]):
+            best = saddles
         if len(best[0]) >= MIN_CORNERS:
             break
     if best is None:
@@ -272,7 +272,7 @@ def _tags_and_corners(
 
 
 def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
-    """Return how markers are searched in turn: scale, whether sharpened, windows."""
+    """Return the settings by which markers are searched in turn: scale, sharpening, windows."""
     wanted = (
         (1.0, _MARKERS_SEARCHED, False, _WINDOW),
         (1.0, _MARKERS_SEARCHED, True, _BLURRED_WINDOW),
@@ -291,8 +291,8 @@ def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
 def _anchors(board: Board, tags: IntArray, places: Array) -> tuple[Array, Array]:
     """Return corners of markers that agree with each other: on the board (n, 2) [m], and in px."""
     if board.kind == "aprilgrid":
-        own = tags < board.columns * board.rows
-        tags, places = tags[own], places[own]
+        is_known_tag = tags < board.columns * board.rows
+        tags, places = tags[is_known_tag], places[is_known_tag]
         corner = board.side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         pitch = (1.0 + board.spacing) * board.side
         first = pitch * np.column_stack([tags % board.columns, tags // board.columns])
@@ -303,8 +303,8 @@ def _anchors(board: Board, tags: IntArray, places: Array) -> tuple[Array, Array]
             int(k): np.asarray(p)[::-1, :2]
             for k, p in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
         }
-        own = np.array([int(tag) in known for tag in tags], dtype=np.bool_)
-        tags, places = tags[own], places[own]
+        is_known_tag = np.array([int(tag) in known for tag in tags], dtype=np.bool_)
+        tags, places = tags[is_known_tag], places[is_known_tag]
         xy = np.array([known[int(tag)] for tag in tags]).reshape(-1, 4, 2)
     _, first_of = np.unique(tags, return_index=True)
     xy, px = xy[first_of].reshape(-1, 2), places[first_of].reshape(-1, 2)
@@ -340,7 +340,7 @@ def _search_tags(
     A blurred image is sharpened for it. Returns numbers (n,); places (n, 4, 2) [px] anticlockwise
     from the lower left of a tag.
     """
-    ids, found = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
+    ids, outlines = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
     # Where it becomes smaller that is first, as the conversion takes memory.
     image = _eight_bits(rescaled(grey, scale)) if scale < 1 else rescaled(_eight_bits(grey), scale)
     if is_blurred:
@@ -352,12 +352,12 @@ def _search_tags(
         corners, numbers, _ = detector.detectMarkers(image)
         if numbers is not None and len(numbers) > len(ids):
             ids = np.asarray(numbers).ravel().astype(np.intp)
-            found = reduced(np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2), scale)
+            outlines = reduced(np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2), scale)
         if len(ids):
             break
     turn = _quarter_turns() if board.dictionary == APRIL_TAGS else 0
     order = [(k + turn) % 4 for k in (3, 2, 1, 0)]
-    return ids, found[:, order]
+    return ids, outlines[:, order]
 
 
 def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -367,7 +367,7 @@ def _eight_bits(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _quarter_turns() -> int:
-    """Return how far OpenCV's tags are turned against Kalibr's, in quarter turns clockwise.
+    """Return the rotation of OpenCV's tags against Kalibr's, in quarter turns clockwise.
 
     OpenCV lists the corners of a tag clockwise from the top left of its own picture of it.
     """
@@ -379,12 +379,12 @@ def _quarter_turns() -> int:
 
 def _parameters(border: int, windows: tuple[int, int]) -> cv2.aruco.DetectorParameters:
     """Return the settings of the detector."""
-    found = cv2.aruco.DetectorParameters()
-    found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = windows
-    found.markerBorderBits = border
-    found.minMarkerPerimeterRate = _MIN_PERIMETER
-    found.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    return found
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = windows
+    parameters.markerBorderBits = border
+    parameters.minMarkerPerimeterRate = _MIN_PERIMETER
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    return parameters
 
 
 def detect_corners(
@@ -399,12 +399,12 @@ def detect_corners(
     ``load`` returns the image of a row and can travel to another process.
     """
     report(STAGE, 0, len(rows))
-    found = []
+    tables = []
     search = partial(_search, board, load)
     for k, (row, (corner, px, sigma)) in enumerate(zip(rows, run(search, rows), strict=True)):
-        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+        tables.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
         report(STAGE, k + 1, len(rows))
-    return join_corners(found)
+    return join_corners(tables)
 
 
 def require_board(
@@ -456,7 +456,7 @@ _MIN_MARKERS = 3  # of another dictionary that are no chance
 
 
 def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
-    """Return the board that images show, and what is to be said of it, "" for nothing.
+    """Return the board that images show, and a note on it, "" for none.
 
     Of a chessboard squares are stated, and most people count its inner corners: it is the reading
     that more images show. None where they show a larger one: which one goes after "found".
@@ -493,10 +493,10 @@ def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, 
     return shown, ""
 
 
-def _smaller(board: Board, found: str, n_images: str, taken: str = "") -> str:
-    """Return what is said where a smaller board is seen than was stated."""
+def _smaller(board: Board, seen: str, n_images: str, taken: str = "") -> str:
+    """Return a note for a detected board that is smaller than stated."""
     return (
-        f"{found[0].upper()}{found[1:]} or that part of one is seen in {n_images}, and the whole "
+        f"{seen[0].upper()}{seen[1:]} or that part of one is seen in {n_images}, and the whole "
         f"of {board_in_words(board)} in none{taken}; correct --board, or uncover the board."
     )
 
@@ -542,7 +542,7 @@ def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | Non
 
 
 def _n_tags(board: Board) -> int:
-    """Return how many tags or markers a board has."""
+    """Return the number of tags or markers of a board."""
     count = board.columns * board.rows
     return count if board.kind == "aprilgrid" else count // 2
 
@@ -558,7 +558,7 @@ def _middles(board: Board, columns: int, parity: int, tags: IntArray) -> Array:
 
 
 def _mislaid(board: Board, columns: int, parity: int, seen: SeenBoard) -> float:
-    """Return how far tags are off if they lie in so many columns (rms), by the step to the next."""
+    """Return the misfit (rms) of tags in a number of columns, over the distance of tags."""
     at = _middles(board, columns, parity, seen.tags)
     with quiet_opencv():
         H, _ = cv2.findHomography(at, seen.tags_px)
@@ -569,8 +569,8 @@ def _mislaid(board: Board, columns: int, parity: int, seen: SeenBoard) -> float:
         off = np.linalg.norm(back[:, :2] / back[:, 2:] - seen.tags_px, axis=1)
     apart = np.linalg.norm(seen.tags_px[:, None] - seen.tags_px, axis=2)
     apart[np.diag_indices(len(apart))] = np.inf
-    found = float(np.sqrt(np.mean(off**2)) / np.median(apart.min(axis=1)))
-    return found if np.isfinite(found) else np.inf
+    misfit = float(np.sqrt(np.mean(off**2)) / np.median(apart.min(axis=1)))
+    return misfit if np.isfinite(misfit) else np.inf
 
 
 def _extent(board: Board) -> tuple[int, int]:
@@ -588,7 +588,7 @@ def _turned_as(board: Board, extent: tuple[int, int]) -> tuple[int, int]:
 
 
 def _squares(board: Board, extent: tuple[int, int]) -> str:
-    """Return which chessboard has so many corners, turned as the board is."""
+    """Return the chessboard with these numbers of corners, turned as the board is."""
     x, y = _turned_as(board, extent)
     return f"a chessboard of {x + 1} x {y + 1} squares"
 
@@ -597,7 +597,7 @@ def describe_image(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> str | None:
-    """Return what an image shows instead of a board, in words that go after "found"."""
+    """Describe what an image shows instead of the board."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
     if board.kind != "chessboard" and (markers := _other_markers(board, grey)):
         return markers
@@ -626,7 +626,7 @@ def tags_are_mirrored(
 
 
 def _other_markers(board: Board, grey: Grey) -> str | None:
-    """Return which markers or tags are seen."""
+    """Return the numbers of the detected markers or tags."""
     thing = _things(board)
     own = _n_tags(board)
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)

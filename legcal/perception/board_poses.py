@@ -63,10 +63,12 @@ def _refine(
 ) -> PlanePose | None:
     """Return the pose of least cost near a start; None if it puts points behind the camera."""
     one = BoardImages(np.zeros(len(px), dtype=np.intp), points, px, sigma_px)
-    found = adjust_board(camera, [start], one)
-    if found is None:
+    adjusted = adjust_board(camera, [start], one)
+    if adjusted is None:
         return None
-    return PlanePose(found.T_camera_board[0], found.cost, found.residual, found.information[0])
+    return PlanePose(
+        adjusted.T_camera_board[0], adjusted.cost, adjusted.residual, adjusted.information[0]
+    )
 
 
 def _distinct(poses: list[PlanePose], angle: float) -> list[PlanePose]:
@@ -229,7 +231,7 @@ def _joint_pose(
 
 
 def _outliers(pose: PlanePose, corners: Corners) -> BoolArray:
-    """Return which corners are further from a pose than noise puts them."""
+    """Return the mask of corners that are outliers of a pose."""
     off = np.linalg.norm(pose.residual_px, axis=1)
     scaled = OUTLIER_SIGMA * _scale(pose, corners) * corners.sigma_px
     return np.asarray(off > np.maximum(OUTLIER_PX, scaled))
@@ -242,7 +244,7 @@ def _scale(pose: PlanePose, corners: Corners) -> float:
 
 
 def _span_plane(points: Array) -> bool:
-    """Say whether points are enough, and not all on a line."""
+    """Return whether points are enough, and not all on a line."""
     if len(points) < MIN_CORNERS:
         return False
     size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -291,7 +293,7 @@ def _require_still(
 
 
 def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> bool:
-    """Say whether two poses of the board are one, by their covariances."""
+    """Return whether two poses of the board agree, by their covariances."""
     if float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1)))) < MIN_SHIFT_PX:
         return True
     a, b = one.T_camera_plane, other.T_camera_plane
@@ -302,7 +304,7 @@ def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> b
 
 
 def _another_board(name: str, board: Board, found: str, needed: str) -> Problem:
-    """Return that corners are not those of this board by the camera file."""
+    """Return the rejection of corners that do not fit this board with the camera file."""
     sizes = {
         "chessboard": "the numbers of squares",
         "charuco": "the numbers of squares, marker and square",

@@ -62,7 +62,7 @@ UPSIDE_DOWN = np.array([-1.0, -1.0])
 
 
 class EdgeStep(NamedTuple):
-    """How poses are moved to edges."""
+    """Settings by which poses are moved to edges."""
 
     blur: float  # how far edges count [cells of half the size, or of the maps]
     turn: float  # by which poses are turned, one standard deviation [deg]
@@ -102,7 +102,7 @@ class PoseCandidates:
 
     @property
     def needed(self) -> float:
-        """How many legs must match in a picture on average for a pose to be accepted."""
+        """Mean number of legs per image that must match for a pose to be accepted."""
         n = self.support.shape[1]
         alone = not self.hinted and self._leads(LONE_LEAD)
         share = LONE_SUPPORT if alone else SUPPORT
@@ -116,7 +116,7 @@ class PoseCandidates:
 
     @property
     def lead(self) -> float:
-        """Score of the first pose beyond that of the second one, in legs."""
+        """Score of the first pose less the score of the second, in legs."""
         if len(self.poses) < 2:
             return float("inf")
         return float(self.score[0] - self.score[1])
@@ -154,7 +154,7 @@ class PoseCandidates:
         return float(self.support[0].sum()) / expected if expected else 0.0
 
     def _leads(self, enough: tuple[float, float]) -> bool:
-        """Say whether the first pose leads by so many legs and such a part of its score."""
+        """Return whether the first pose leads by a number of legs and a part of its score."""
         legs, part = enough
         return self.lead >= max(legs, part * float(self.score[0]))
 
@@ -223,13 +223,13 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     A leg on a wrong pair keeps a pose, and the joints moved for it, from where all legs agree.
     """
     n_legs = poses.shift.shape[1]
-    found = []
+    polished = []
     for i in range(min(N_POLISHED, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
         around = refined(pictures, around, POLISH, JOINT_ERROR)
         score = scores(pictures, around, POLISH[-1])
-        found.append(around.take(_best(score, 1)))
-    return CameraPoses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+        polished.append(around.take(_best(score, 1)))
+    return CameraPoses.joined([*polished, poses.take(np.zeros(0, dtype=np.intp))])
 
 
 def _reversed(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -276,8 +276,8 @@ def place_by_edges(
         of_step = (maps if step.is_fine else coarse).take(some).blurred(step.blur)
         poses, score = _moved_to_edges(of_step, every.take(some), poses, step, rng)
         poses = poses.take(_distinct(poses, score, step.n_kept))
-    found = match_pairs(every, poses, FITTING[-1])
-    support, expected = (_by_legs(every, x).T for x in (found.exclusive_score, found.visible))
+    matches = match_pairs(every, poses, FITTING[-1])
+    support, expected = (_by_legs(every, x).T for x in (matches.exclusive_score, matches.visible))
     error = _leg_error(every, poses.take(slice(0, 1)))
     first = float(score.max()) / len(pictures)
     return PoseCandidates(poses, support, expected, support.sum(axis=1), error, along_edges=first)
@@ -311,8 +311,8 @@ def place_near(
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     every = Pictures.of(pictures)
-    found = _candidates(every, _approached(every, poses))
-    return replace(found, hinted=True)
+    candidates = _candidates(every, _approached(every, poses))
+    return replace(candidates, hinted=True)
 
 
 def with_first(
@@ -331,18 +331,18 @@ def with_first(
 
 
 def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
-    """Return poses with their support, best first, without those that say the same."""
+    """Return poses with their support, best first, without equivalent ones."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
         return PoseCandidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
-    found = match_pairs(pictures, poses, FITTING[-1])
-    value = found.exclusive_score
-    support, expected = (_by_legs(pictures, x).T for x in (value, found.visible))
+    matches = match_pairs(pictures, poses, FITTING[-1])
+    value = matches.exclusive_score
+    support, expected = (_by_legs(pictures, x).T for x in (value, matches.visible))
     joint_error = JOINT_ERROR * pictures.size
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
     score = support.sum(axis=1) - SHIFT_COST * cost
-    order = _different(pictures, poses, found, value >= MIN_MATCH_SCORE, score)
+    order = _different(pictures, poses, matches, value >= MIN_MATCH_SCORE, score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
     return PoseCandidates(poses.take(order), support[order], expected[order], score[order], error)
@@ -354,7 +354,7 @@ def _by_legs(pictures: Pictures, value: Array) -> Array:
 
 
 def _different(
-    pictures: Pictures, poses: CameraPoses, found: PairMatches, matched: BoolArray, score: Array
+    pictures: Pictures, poses: CameraPoses, matches: PairMatches, matched: BoolArray, score: Array
 ) -> IntArray:
     """Return the poses, best first, that put other legs on other pairs than better ones do.
 
@@ -363,7 +363,7 @@ def _different(
     """
     common = np.zeros((len(score), len(score)))
     if pictures.pairs.shape[1]:
-        for pairs, pair, match in zip(pictures.pairs, found.pair, matched, strict=True):
+        for pairs, pair, match in zip(pictures.pairs, matches.pair, matched, strict=True):
             same = _one_leg(pairs)[pair[:, None], pair[None]]
             common += np.sum(same & match[:, None] & match[None], axis=2)
     least = np.maximum(np.diag(common), 1.0)
@@ -376,7 +376,7 @@ def _different(
 
 
 def _one_leg(pairs: Array) -> BoolArray:
-    """Return which pairs (n, n) may be of one leg: they continue each other or overlap.
+    """Return the mask of pairs (n, n) that may be of one leg: they continue or overlap.
 
     Pairs (n, 9) are as in :class:`legcal.perception.pair_matching.Pictures`.
     """
@@ -390,10 +390,10 @@ def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
     """Return the root mean square distance (n_legs,) of legs from their pairs, of the size."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
-    found = match_pairs(pictures, pose, FITTING[-1])
-    matched = found.exclusive_score[:, 0] >= MIN_MATCH_SCORE
+    matches = match_pairs(pictures, pose, FITTING[-1])
+    matched = matches.exclusive_score[:, 0] >= MIN_MATCH_SCORE
     if matched.any():
-        distance = distances(pictures, pose, found)[:, 0] / pictures.size
+        distance = distances(pictures, pose, matches)[:, 0] / pictures.size
         np.add.at(square, pictures.leg[matched], distance[matched] ** 2)
         np.add.at(count, pictures.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))
@@ -402,14 +402,14 @@ def _leg_error(pictures: Pictures, pose: CameraPoses) -> Array:
 
 
 def _starts(picture: Picture, n_legs: int) -> CameraPoses:
-    """Return the poses that suit a picture best, among those that two of its pairs suggest."""
+    """Return the poses that fit an image best, among the poses suggested by two of its pairs."""
     poses = _suggested(picture, n_legs)
     if len(poses) == 0:
         return poses
-    own = Pictures.of([picture])
-    poses = poses.take(_best(scores(own, poses, SEARCHING[0]), N_KEPT[0]))
-    poses = refined(own, poses, SEARCHING[:3])
-    score = scores(own, poses, SEARCHING[2])
+    alone = Pictures.of([picture])
+    poses = poses.take(_best(scores(alone, poses, SEARCHING[0]), N_KEPT[0]))
+    poses = refined(alone, poses, SEARCHING[:3])
+    score = scores(alone, poses, SEARCHING[2])
     return poses.take(_distinct(poses, score, N_KEPT[1]))
 
 
@@ -428,15 +428,15 @@ def refined(
 ) -> CameraPoses:
     """Return poses after a step towards the pairs for each of some tolerances."""
     for tolerance in tolerances:
-        found = match_pairs(pictures, poses, tolerance)
-        poses = gauss_newton_step(pictures, poses, found, tolerance, joint_error)
+        matches = match_pairs(pictures, poses, tolerance)
+        poses = gauss_newton_step(pictures, poses, matches, tolerance, joint_error)
     return poses
 
 
 def scores(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Array:
-    """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
-    found = match_pairs(pictures, poses, tolerance).exclusive_score
-    return np.asarray(_by_legs(pictures, found).sum(axis=0))
+    """Return the number of legs that agree with each pose in all images together, (n_poses,)."""
+    score = match_pairs(pictures, poses, tolerance).exclusive_score
+    return np.asarray(_by_legs(pictures, score).sum(axis=0))
 
 
 def _best(score: Array, n: int) -> IntArray:
@@ -455,7 +455,7 @@ def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
 
 
 def _near(poses: CameraPoses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
-    """Return which of some poses are within an angle and a part of the distance of pose i."""
+    """Return the mask of poses within an angle and a part of the distance of pose i."""
     trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
     # Where the camera stands in the base link.
@@ -489,18 +489,18 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
     return [replace(p, pairs=flipped(p.pairs, p.corners, LEFT_RIGHT)) for p in pictures]
 
 
-def may_be_mirrored(own: PoseCandidates) -> bool:
-    """Say whether a placed view needs to be compared with its mirror image."""
-    return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
+def may_be_mirrored(original: PoseCandidates) -> bool:
+    """Return whether a placed view needs to be compared with its mirror image."""
+    return not original.is_convincing or original.share < NOT_MIRRORED_SUPPORT
 
 
-def is_mirrored(own: PoseCandidates, other: PoseCandidates) -> bool:
-    """Say whether mirrored pictures explain a view better than its own ones do.
+def is_mirrored(original: PoseCandidates, other: PoseCandidates) -> bool:
+    """Return whether mirrored images explain a view better than the original ones.
 
     Those of a machine with a plane of symmetry, as all planar ones, explain it about as well.
     """
-    if not own.is_convincing:
+    if not original.is_convincing:
         return other.is_clear
-    lead = float(other.score[0] - own.score[0])
+    lead = float(other.score[0] - original.score[0])
     legs, part = MIRRORED_LEAD
     return other.is_convincing and lead >= max(legs, part * float(other.score[0]))

@@ -42,7 +42,7 @@ STRIDE = 4  # every such row and column is enough for a median
 _ASIDE = 1e-3
 N_SECTORS = 8  # of directions in which light changes along one edge
 MIN_PIXELS = 6  # of a piece
-MAX_SUBPIXEL = 0.6  # of the middle of an edge from that of its pixel [reduced px]
+MAX_SUBPIXEL = 0.6  # distance of the middle of an edge from its pixel [reduced px]
 MAX_SAG = 1.3  # of the pixels of a piece from its line [reduced px]
 MAX_CUTS = 3  # of a chain, each into two
 
@@ -83,14 +83,14 @@ def reduction(camera: Camera, part: float) -> int:
 
 
 class Still(NamedTuple):
-    """What stands still in reduced pictures of one view."""
+    """The static background in reduced images of one view."""
 
     picture: Grey
     noise: float  # by which most pixels of pictures differ from it [grey levels]
 
 
 def still_picture(pictures: Sequence[Grey]) -> Still | None:
-    """Return what stands still in reduced pictures of one view; None where they are few.
+    """Return the static background in reduced images of one view; None if they are few.
 
     Legs are somewhere else in most pictures.
     """
@@ -102,19 +102,19 @@ def still_picture(pictures: Sequence[Grey]) -> Still | None:
 
 
 def _differs(picture: Grey, still: Still) -> BoolArray:
-    """Return which pixels of a picture are not those of what stands still."""
+    """Return the mask of pixels of an image that differ from the background."""
     least = max(NOISE_FACTOR * still.noise, DIFFERS * float(still.picture.max()))
     return np.asarray(np.abs(picture - still.picture) > least)
 
 
 def moving_pixels(picture: Grey, still: Still) -> Image:
-    """Return 1 near pixels of a picture that are not those of what stands still, else 0."""
+    """Return 1 near pixels of an image that differ from the static background, else 0."""
     size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
 
 
 def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
-    """Return which pieces (n, 2, 2) of a picture lie mostly where it differs from a still one."""
+    """Return the mask of pieces (n, 2, 2) mostly where an image differs from the background."""
     differs = moving_pixels(picture, still)
     share = np.linspace(0.0, 1.0, N_ALONG)[:, None]
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
@@ -184,7 +184,7 @@ def _middle(values: Image) -> float:
 
 
 def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray:
-    """Return which chain each edge pixel (n,) belongs to: neighbours in a sector of directions.
+    """Return the chain of each edge pixel (n,): neighbours in a sector of directions.
 
     Sectors are laid twice, the second time between the first ones: a pixel takes the longer chain.
     """
@@ -208,9 +208,9 @@ def _chains(at: IntArray, gradient: Samples, shape: tuple[int, ...]) -> IntArray
 
 
 def _components(i: IntArray, j: IntArray, n: int) -> IntArray:
-    """Return which connected component each of n nodes is in, by links from i to greater j."""
+    """Return the connected component of each of n nodes, by links from i to greater j."""
     label: IntArray = np.arange(n)
-    while len(i):  # each round at least halves what still has links to others
+    while len(i):  # each round at least halves the nodes that still have links to others
         above: IntArray = np.arange(n)
         above[j] = i  # each node follows a lesser one, if it has a link to any
         higher = above.take(above)
@@ -245,7 +245,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
 
     What bends is cut where it is farthest from the line between its ends.
     """
-    found = []
+    pieces = []
     x, y = points
     gx, gy = gradient.astype(np.float64)
     for _ in range(MAX_CUTS + 1):
@@ -269,7 +269,7 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
         ends = np.stack([one.reduceat(place, first) for one in (np.minimum, np.maximum)])
         middle = np.stack([mx, my])
         lines = (middle + ends[:, None] * u).transpose(2, 0, 1)
-        found.append(lines[is_straight])
+        pieces.append(lines[is_straight])
         bent = np.flatnonzero(np.repeat(~is_straight, n))
         if len(bent) == 0:
             break
@@ -287,11 +287,11 @@ def _straight(points: Array, gradient: Samples, chain: IntArray) -> Array:
         )
         order = np.argsort(chain, kind="stable")
         x, y, gx, gy, chain = (one.take(order) for one in (x, y, gx, gy, chain))
-    return np.concatenate([np.zeros((0, 2, 2)), *found])
+    return np.concatenate([np.zeros((0, 2, 2)), *pieces])
 
 
 def _first_of(values: Array, value: Array, first: IntArray, n: IntArray) -> IntArray:
-    """Return where each group of n values from a first one on has its value for the first time."""
+    """Return the index of the first occurrence of each value within its group."""
     at = np.flatnonzero(values == np.repeat(value, n))
     return at[np.searchsorted(at, first)]
 
@@ -485,7 +485,7 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int) -> IntArray:
 
 
 def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
-    """Return which pairs (n,), best first, do not lie within better ones of the same width."""
+    """Return the mask of pairs (n,), best first, not within better ones of the same width."""
     along = stop - start
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]

@@ -112,18 +112,18 @@ def _candidates(grey: Grey) -> tuple[Array, Array, Array]:
 
 
 def _summit(strength: Grey, row: IntArray, column: IntArray) -> Array:
-    """Return where between pixels peaks are, (n, 2) less the pixels, by parabolas."""
+    """Return the subpixel offsets of peaks, (n, 2), by parabolas."""
     height, width = strength.shape
-    found = []
+    offsets = []
     for dr, dc, size, at in ((0, 1, width, column), (1, 0, height, row)):
         inner = (at > 0) & (at < size - 1)
         r, c = np.where(inner, row, 1), np.where(inner, column, 1)
         before, here, after = (strength[r + k * dr, c + k * dc] for k in (-1, 0, 1))
         bend = before - 2.0 * here + after
-        found.append(
+        offsets.append(
             np.where(inner & (bend < 0.0), 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
         )
-    return np.asarray(np.clip(np.column_stack(found), -0.5, 0.5))
+    return np.asarray(np.clip(np.column_stack(offsets), -0.5, 0.5))
 
 
 def _sampled(image: Grey, px: Array) -> Array:
@@ -235,9 +235,9 @@ def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: In
 
 _NEAR = 1.5  # pitches within which corners give how the board lies around a place
 _STIFF = 1e-3  # ridge on squares of distances, as a part of the weights
-_MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 2.0, 2.5  # times what is usual in the image
+_MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 2.0, 2.5  # over the median of the image
 _GOOD_FIT = 0.05  # of the contrast left over: always accepted
-_MIN_CONTRAST_RATIO = 0.3  # of what is usual
+_MIN_CONTRAST_RATIO = 0.3  # over the median
 # From where its neighbours put a corner that is another thing: at least; times what is usual; parts
 # of a pitch, with neighbours all around it and at the rim, where lenses bend what goes on.
 _OFF_PX, _OFF_MEDIANS, _OFF_BETWEEN, _OFF_BESIDE = 0.5, 9.0, 0.03, 0.25
@@ -247,7 +247,7 @@ _MAX_ROUNDS = 40  # of corners beside those that are known
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """How corners lie on a board, by columns and rows.
+    """Lattice of corners of a board, by columns and rows.
 
     Attributes
     ----------
@@ -272,7 +272,7 @@ class Print:
         return np.column_stack([self.x[ij[:, 0]], self.y[ij[:, 1]]])
 
     def has(self, ij: IntArray) -> BoolArray:
-        """Say which columns and rows (k, 2) there are."""
+        """Return the mask of existing columns and rows (k, 2)."""
         if self.x is None or self.y is None:
             return np.ones(len(ij), dtype=np.bool_)
         return np.asarray(np.all((ij >= 0) & (ij < [len(self.x), len(self.y)]), axis=1))
@@ -281,7 +281,7 @@ class Print:
 def expected(
     xy: Array, px: Array, at: Array, pitch: float, *, without_own: bool = False
 ) -> tuple[Array, Array]:
-    """Return where places *at* (k, 2) of a board are in the image, by others nearby.
+    """Predict the image positions of columns and rows *at* (k, 2) by their neighbours.
 
     Returns px (k, 2) and the steps in the image along x and y, (k, 2, 2) [px / unit].
     ``without_own`` leaves out for each place the row of the same number.
@@ -302,8 +302,8 @@ def expected(
     ridge = np.array([1e-9, 1e-6, 1e-6, _STIFF, _STIFF, _STIFF])
     N[:, np.arange(6), np.arange(6)] += ridge * size[:, None]
     centre = (weight @ px) / size[:, None]
-    found = np.linalg.solve(N, W @ (px - centre[:, None]))
-    return centre + found[:, 0], np.swapaxes(found[:, 1:3], 1, 2) / pitch
+    slopes = np.linalg.solve(N, W @ (px - centre[:, None]))
+    return centre + slopes[:, 0], np.swapaxes(slopes[:, 1:3], 1, 2) / pitch
 
 
 def measured(
@@ -348,7 +348,7 @@ def measured(
 def _grown(
     grey: Grey, board: Print, ij: IntArray, found: Saddles, tried: set[tuple[int, int]]
 ) -> tuple[IntArray, Array]:
-    """Return columns and rows (k, 2) that seem to go on from those that are known, px (k, 2).
+    """Return columns and rows (k, 2) that continue the known ones, px (k, 2).
 
     One line after the other is expected from those before it, and looked at.
     """
@@ -373,7 +373,7 @@ _MIN_KNOWN = 4  # corners from which others are expected
 
 
 def _beside(board: Print, ij: IntArray, tried: set[tuple[int, int]]) -> IntArray:
-    """Return columns and rows next to those that are known."""
+    """Return columns and rows next to the known ones."""
     around = (ij[:, None] + _STEPS).reshape(-1, 2)
     known = set(map(tuple, ij.tolist())) | tried
     fresh = sorted({at for at in map(tuple, around[board.has(around)].tolist()) if at not in known})
@@ -381,12 +381,12 @@ def _beside(board: Print, ij: IntArray, tried: set[tuple[int, int]]) -> IntArray
 
 
 def _parity(ij: IntArray) -> Array:
-    """Return 1 for corners whose squares are as those of the first one, -1 for the others."""
+    """Return 1 for corners with the contrast of the first one, -1 for the others."""
     return np.where(ij.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def _sign(ij: IntArray, found: Saddles) -> float:
-    """Return the sign of the contrast of the first corner, by that of most."""
+    """Return the sign of the contrast of the first corner, by majority."""
     return 1.0 if np.median(np.sign(found.contrast) * _parity(ij)) >= 0.0 else -1.0
 
 

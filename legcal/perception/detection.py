@@ -104,7 +104,7 @@ def _longest(search: Search, leg: int) -> str:
 
 
 def _pixels_per_metre(leg: PredictedLeg) -> float:
-    """Return how large a metre appears at the nearer joint of a leg [px/m]."""
+    """Return the image scale at the nearer joint of a leg [px/m]."""
     depths = leg.A_camera[2], leg.B_camera[2]
     length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
     nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)

@@ -1,4 +1,4 @@
-"""What is wrong with images, views and rough poses, each named once.
+"""Diagnostics of images, views and rough poses, each named once.
 
 Images in which few legs were found where the others of their view show theirs are examined again:
 with the readings of all other images, with the cameras of the other views, and mirrored. An
@@ -51,7 +51,7 @@ _FLIPS = (
 
 N_REFERENCES = 3  # good images that others are compared with
 MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
-GOOD_PERCENTILE = 75.0  # of the shares that images show, for what good ones do
+GOOD_PERCENTILE = 75.0  # percentile of the shares that images show, for good images
 MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 NO_OUTLINE = Rejection(Reason.OTHER, "no outline is used")
@@ -63,21 +63,21 @@ _CAMERA_AXES = {
     "x forward and z up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "x left and y up, or its images are upside down": np.diag([-1.0, -1.0, 1.0]),
 }
-# Three times what a rough pose is good to: part of the distance of the camera, angle
+# Three times the accuracy of a rough pose: part of the distance of the camera, angle
 FAR_OFF = (0.06, np.deg2rad(6.0))
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
 
 class ImageExplanation(NamedTuple):
-    """What an image shows."""
+    """The explanation of an image whose legs are not where its reading predicts them."""
 
     own: float  # share of the legs, by visible length, that are where its reading has them
-    reason: Rejection = USED  # what it shows instead; false where nothing explains it clearly
-    remedy: str = ""  # what to do then
+    reason: Rejection = USED  # the explanation; false without a clear one
+    remedy: str = ""
 
 
 class OutlineCount(NamedTuple):
-    """How many outlines of an image were found, of those that it should show."""
+    """Numbers of measured and of predicted outlines of an image."""
 
     used: int
     visible: int
@@ -96,7 +96,7 @@ def find_wrong_images(
     defects: Mapping[int, Rejection],
     run: Run,
 ) -> tuple[Placement, dict[int, Rejection]]:
-    """Return the placement with what is said of images, and why they are left out, by row.
+    """Return the placement with notes on images, and the rejections of images by row.
 
     ``rows`` were searched; ``defects`` are what is wrong with single images. A view all of whose
     images have one is not placed, with one note.
@@ -105,16 +105,16 @@ def find_wrong_images(
     usable = [row for row in rows.tolist() if row not in defects]
     defective = set(view[rows].tolist()) - set(view[usable].tolist())
     placement = _without_views(search.measurements, placement, sorted(defective), defects)
-    found = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
-    suspects = _suspects(found, view)
-    usual = _usual(search, placement, found, suspects, run)
+    counts = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
+    suspects = _suspects(counts, view)
+    usual = _usual(search, placement, counts, suspects, run)
     task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
     single = {row: why for row, why in sorted(defects.items()) if view[row] not in defective}
     notes = defect_notes(search.measurements, single)
     left_out, barely = dict[int, Cause](), dict[int, Cause]()
     for row, explanation in zip(suspects, run(task, suspects), strict=True):
-        reason, said = image_verdict(search.measurements, row, explanation, usual, found)
+        reason, said = image_verdict(search.measurements, row, explanation, usual, counts)
         if reason:
             reasons[row] = reason
         if reason.reason is Reason.OTHER_SCENE:
@@ -124,12 +124,12 @@ def find_wrong_images(
         else:
             barely[row] = Cause("{}.", (said,))
     notes += _left_out_notes(search.measurements, left_out)
-    notes += _leg_notes(search, placement, outlines, found, reasons)
+    notes += _leg_notes(search, placement, outlines, counts, reasons)
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
 def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outlines:
-    """Return outlines with those of some images rejected; edited ones stay.
+    """Reject the outlines of some images; edited ones stay.
 
     Those that an image should not show keep the reason for that, so that they do not count as
     expected there.
@@ -145,17 +145,17 @@ def reject_images(outlines: Outlines, reasons: Mapping[int, Rejection]) -> Outli
 
 
 def is_out_of_sight(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image cannot show: they are outside it, or hidden."""
+    """Return the mask of outlines outside the image or hidden."""
     return outlines.rejected_for(*NOT_IN_SIGHT)
 
 
 def is_visible(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image should show."""
+    """Return the mask of outlines that an image should show."""
     return ~outlines.rejected_for(*NOT_IN_SIGHT, Reason.NOT_PLACED)
 
 
 def is_measurable(outlines: Outlines) -> BoolArray:
-    """Return which outlines an image should show at a length that can be measured."""
+    """Return the mask of outlines that an image should show, long enough to be measured."""
     return is_visible(outlines) & ~outlines.rejected_for(Reason.SHORT)
 
 
@@ -165,21 +165,21 @@ def _without_views(
     defective: Sequence[int],
     defects: Mapping[int, Rejection],
 ) -> Placement:
-    """Return the placement with views unplaced all of whose images show nothing."""
+    """Return the placement without the cameras of views with unusable images only."""
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
     for v in defective:
         name = measurements.views[v].name
-        own = {row: why.cause for row, why in defects.items() if measurements.view[row] == v}
-        images = [f"{measurements.image[row]}: " for row in own] if len(own) == 1 else []
-        causes = [cause for cause, _ in by_cause(own)]
+        of_view = {row: why.cause for row, why in defects.items() if measurements.view[row] == v}
+        images = [f"{measurements.image[row]}: " for row in of_view] if len(of_view) == 1 else []
+        causes = [cause for cause, _ in by_cause(of_view)]
         cameras[v] = None
         unplaced[name] = NotPlaced(
             name,
             Cause(
-                f"its camera could not be placed: found nothing to see in its {{}} image"
-                f"{'s' * (len(own) != 1)} ({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}), "
-                "needed photographs of the legs; take them again.",
-                (len(own), *images, *causes),
+                f"its camera could not be placed: {'none of ' * (len(of_view) != 1)}its {{}} image"
+                f"{'s' * (len(of_view) != 1)} is {'un' * (len(of_view) == 1)}usable "
+                f"({'{}' * len(images)}{'; '.join(['{}'] * len(causes))}); take them again.",
+                (len(of_view), *images, *causes),
             ),
         )
     return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)
@@ -190,25 +190,25 @@ def image_verdict(
     row: int,
     explanation: ImageExplanation,
     usual: Mapping[int, float],
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
 ) -> tuple[Rejection, Cause]:
-    """Return why an image is left out, false if it is not, and what is said of it and to do."""
+    """Return the rejection of an image, false if it is used, and its cause with a remedy."""
     if explanation.reason:
         return explanation.reason, Cause("{}; {}", (explanation.reason.cause, explanation.remedy))
-    much = Cause("{} of {} outlines where its reading has the legs", tuple(found[row]))
+    much = Cause("{} of {} predicted outlines were found", tuple(counts[row]))
     view = int(measurements.view[row])
     if explanation.own >= SHARE_OF_OTHERS * usual[view]:
-        little = "shows little of the legs: found {}, in other images most; look at its light and "
-        return USED, Cause(little + "sharpness", (much,))
+        little = "shows little of the legs: {}, in other images most; check its light and sharpness"
+        return USED, Cause(little, (much,))
     nothing = (
-        "found {}, and nothing else that it shows; check that it is a photograph of this machine, "
-        "taken by this camera at this reading"
+        "{}, and no other explanation fits; check that it is a photograph of this machine, taken "
+        "by this camera at this reading"
     )
     return Rejection(Reason.OTHER_SCENE), Cause(nothing, (much,))
 
 
 def defect_notes(measurements: Measurements, defects: Mapping[int, Rejection]) -> list[str]:
-    """Return one sentence for each thing that is wrong with single images, by row."""
+    """Return one sentence for each defect of single images, by row."""
     again = {row: Cause("{}; take it again", (why.cause,)) for row, why in defects.items()}
     return _left_out_notes(measurements, again)
 
@@ -217,26 +217,26 @@ def _left_out_notes(measurements: Measurements, why: Mapping[int, Cause]) -> lis
     """Return one sentence for each cause for which images were left out, by row."""
     notes = []
     for cause, rows in by_cause(why):
-        verb = ": was left out" if len(rows) == 1 else " were left out, all for one reason"
+        verb = ": was left out" if len(rows) == 1 else " were left out"
         notes.append(f"{images_in_words(measurements, rows)}{verb}: {cause}.")
     return notes
 
 
 def images_left_out(outlines: Outlines) -> dict[int, Rejection]:
-    """Return why no outline is used of images that should show some, by row: what most say."""
-    found = {}
+    """Return the commonest rejection of images with no used outline, by row."""
+    rejections = {}
     for row in np.unique(outlines.row[~is_out_of_sight(outlines)]).tolist():
-        own = np.flatnonzero(outlines.row == row)
-        if outlines.used[own].any():
+        of_image = np.flatnonzero(outlines.row == row)
+        if outlines.used[of_image].any():
             continue
-        shown = [why for i in own.tolist() if (why := outlines.reason[i])
+        shown = [why for i in of_image.tolist() if (why := outlines.reason[i])
                  and why.reason not in NOT_IN_SIGHT]  # fmt: skip
-        found[row] = _most_common(shown or [NO_OUTLINE])
-    return found
+        rejections[row] = _most_common(shown or [NO_OUTLINE])
+    return rejections
 
 
 def _most_common(rejections: Sequence[Rejection]) -> Rejection:
-    """Return the reason of most, with its detail where it is that of all of them."""
+    """Return the commonest reason, with its detail if all have the same."""
     reason = Counter(why.reason for why in rejections).most_common(1)[0][0]
     details = {why.detail for why in rejections if why.reason is reason}
     return Rejection(reason, details.pop() if len(details) == 1 else "")
@@ -245,9 +245,9 @@ def _most_common(rejections: Sequence[Rejection]) -> Rejection:
 def share_shown(
     search: Search, placement: Placement, row: int, *, legs: IntArray | None = None
 ) -> float:
-    """Return the share of the legs, by visible length, that an image shows where they should be.
+    """Return the fraction of the predicted legs, by visible length, that an image shows.
 
-    By default of the legs that its view is stated to show; the view must have been placed.
+    By default of the legs stated for its view, which must have been placed.
     """
     view = int(search.measurements.view[row])
     picture = _picture(search, search.pairs(row, view), row, view, legs)
@@ -262,10 +262,11 @@ def explain(
     *,
     suspects: Collection[int] = (),
 ) -> ImageExplanation:
-    """Return what an image of a placed view shows whose legs are not where its reading has them.
+    """Explain an image of a placed view whose legs are not where its reading predicts them.
 
-    ``usual`` is the share of the legs that good images of each view show, by :func:`share_shown`;
-    ``suspects`` are all suspect images: readings that others show are hardly those of this one.
+    ``usual`` is the fraction of legs that good images of each view show (:func:`share_shown`);
+    ``suspects`` are all suspect images: a reading that another image shows hardly belongs to this
+    one.
     """
     measurements = search.measurements
     view = int(measurements.view[row])
@@ -327,17 +328,17 @@ def explain(
 def _at_other_reading(
     search: Search, row: int, other: int, exchanged: bool
 ) -> tuple[Rejection, str]:
-    """Return what an image shows that suits another image's reading, and what to do.
+    """Return the rejection of an image that matches another image's reading, and the remedy.
 
-    Where that image shows its own reading, the two were not exchanged: it may be near this pose,
-    and one wrong digit in this reading tells them apart.
+    Where that image matches its own reading, the two were not exchanged: its pose may be near, and
+    one wrong digit in this reading makes the difference.
     """
     measurements = search.measurements
     image, remedy = measurements.image[other], "check which image belongs to which row"
     if exchanged:
         shown = f"it shows the reading given for image {image}"
         return Rejection(Reason.OTHER_READING, shown), remedy
-    why = f"its legs are about where the reading of image {image} has them"
+    why = f"its legs match the reading of image {image}"
     difference = np.abs(measurements.q[row] - measurements.q[other])
     *_, second, first = np.argsort(np.nan_to_num(difference))
     if difference[first] > LONE_READING * difference[second]:
@@ -365,11 +366,15 @@ def _best(
 def _other_readings(search: Search, row: int) -> list[int]:
     """Return a row with an image of each other pose, of the same view where there is one."""
     measurements = search.measurements
-    own, view = int(measurements.pose[row]), int(measurements.view[row])
+    pose_of_row, view = int(measurements.pose[row]), int(measurements.view[row])
     of_pose: dict[int, int] = {}
     for other, image in enumerate(measurements.image):
         pose = int(measurements.pose[other])
-        if pose != own and image and (pose not in of_pose or measurements.view[other] == view):
+        if (
+            pose != pose_of_row
+            and image
+            and (pose not in of_pose or measurements.view[other] == view)
+        ):
             of_pose[pose] = other
     return list(of_pose.values())
 
@@ -399,25 +404,25 @@ def _share(
 
 
 def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
-    """Return how many outlines were found in images that should show any, by row."""
+    """Return the numbers of outlines of images that should show any, by row."""
     visible = is_visible(outlines)
     counts = {}
     for row in rows:
-        own = (outlines.row == row) & visible
-        if own.any():
-            counts[row] = OutlineCount(int(outlines.used[own].sum()), int(own.sum()))
+        of_image = (outlines.row == row) & visible
+        if of_image.any():
+            counts[row] = OutlineCount(int(outlines.used[of_image].sum()), int(of_image.sum()))
     return counts
 
 
-def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
+def _suspects(counts: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     """Return the images in which far fewer outlines were found than in others of their view.
 
     Where a view has few images, all others are compared with.
     """
     suspects = []
-    for row, count in found.items():
-        own = [other.share for r, other in found.items() if view[r] == view[row]]
-        every = [other.share for other in found.values()]
+    for row, count in counts.items():
+        own = [other.share for r, other in counts.items() if view[r] == view[row]]
+        every = [other.share for other in counts.values()]
         usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, GOOD_PERCENTILE))
         if usual >= MIN_USUAL_SHARE and count.share < SHARE_OF_OTHERS * usual:
             suspects.append(row)
@@ -427,18 +432,18 @@ def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
 def _usual(
     search: Search,
     placement: Placement,
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
     suspects: Sequence[int],
     run: Run,
 ) -> dict[int, float]:
-    """Return how much of the legs good images show, for views with suspect images.
+    """Return the fraction of legs that good images show, for views with suspect images.
 
     There is always a good one: an image is a suspect where others show far more.
     """
     views = np.unique(search.measurements.view[list(suspects)]).tolist() if suspects else []
     usual = {}
     for v in views:
-        good = {row: count for row, count in found.items() if row not in suspects}
+        good = {row: count for row, count in counts.items() if row not in suspects}
         rows = _references(search.measurements, good, v)
         task = partial(share_shown, search, placement)
         usual[v] = float(np.median(list(run(task, rows))))
@@ -446,46 +451,46 @@ def _usual(
 
 
 def _references(
-    measurements: Measurements, found: Mapping[int, OutlineCount], view: int
+    measurements: Measurements, counts: Mapping[int, OutlineCount], view: int
 ) -> list[int]:
     """Return the images of a view in which most was found; of all views if it has none."""
-    own = [row for row in found if measurements.view[row] == view]
-    return sorted(own or found, key=lambda row: -found[row].share)[:N_REFERENCES]
+    of_view = [row for row in counts if measurements.view[row] == view]
+    return sorted(of_view or counts, key=lambda row: -counts[row].share)[:N_REFERENCES]
 
 
 def _leg_notes(
     search: Search,
     placement: Placement,
     outlines: Outlines,
-    found: Mapping[int, OutlineCount],
+    counts: Mapping[int, OutlineCount],
     reasons: Mapping[int, Rejection],
 ) -> list[str]:
-    """Return notes on the legs that views are stated to show."""
+    """Return notes on the legs listed for views."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
-        rows = [r for r in found if measurements.view[r] == v and r not in reasons]
+        rows = [r for r in counts if measurements.view[r] == v and r not in reasons]
         if view.legs is None or not rows:
             continue
-        own = np.isin(outlines.row, rows)
-        used = set(outlines.leg[own & outlines.used].tolist())
+        of_view = np.isin(outlines.row, rows)
+        used = set(outlines.leg[of_view & outlines.used].tolist())
         for leg in np.flatnonzero(search.wanted[v]).tolist():
-            mine = own & (outlines.leg == leg)
+            mine = of_view & (outlines.leg == leg)
             if leg in used or not used or not mine.any():
                 continue
             why = _most_common([outlines.reason[i] for i in np.flatnonzero(mine).tolist()])
             notes.append(
-                f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
-                f"outline that can be used ({why}); look at legcal detect, "
-                "or leave it out there."
+                f"view {view.name} lists {names[leg]} (legs), but none of its images has a usable "
+                f"outline of it ({why}); inspect them with legcal detect, or remove it from the "
+                "list."
             )
-        good = {row: found[row] for row in rows}
+        good = {row: counts[row] for row in rows}
         notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
     return notes
 
 
 def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[int]) -> list[str]:
-    """Return a note on legs that a view leaves out although its images show them clearly."""
+    """Return a note on legs that a view does not list although its images show them clearly."""
     clear = [
         name
         for leg, name in enumerate(search.leg_names)
@@ -498,35 +503,39 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
     if not clear:
         return []
     return [
-        f"view {search.measurements.views[v].name}: legs leaves out {', '.join(clear)}, which "
-        "its images show clearly; name them there to use them."
+        f"view {search.measurements.views[v].name} does not list {', '.join(clear)} (legs), which "
+        "its images show clearly; add them to use them."
     ]
 
 
 def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
-    """Say whether a rough pose is farther from a pose than rough ones are."""
+    """Return whether a rough pose is farther from a pose than the tolerance of rough poses."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = pose_distance(hint, T_base_camera)
     return apart > reach * FAR_OFF[0] * distance or angle > reach * FAR_OFF[1]
 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
-    """Yield what people write in place of T_base_camera, and the pose that it means then."""
+    """Yield common misinterpretations of T_base_camera, with the pose each would mean."""
     t, R = hint.translation, hint.rotation
     written = (
         ("", t, R),
         ("its xyz are millimetres", MILLIMETRE * t, R),
-        ("its quaternion has w first", t, Rotation.from_quat(np.roll(R.as_quat(), -1))),
+        (
+            "its quaternion is in the order w, x, y, z",
+            t,
+            Rotation.from_quat(np.roll(R.as_quat(), -1)),
+        ),
     )
     for what, xyz, rotation in written:
         pose = RigidTransform.from_components(xyz, rotation)
         if what:
             yield what, pose
         both = f", and {what}" if what else ""
-        yield f"it is inverted, the base in the camera{both}", pose.inv()
+        yield f"it is T_camera_base, the inverse{both}", pose.inv()
         for axes, R_axes in _CAMERA_AXES.items():
             turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
-            yield f"its camera has {axes}{both}", pose * turned
+            yield f"its camera axes are {axes}{both}", pose * turned
 
 
 def far_from_hints(
@@ -557,21 +566,20 @@ def hint_notes(
 ) -> list[str]:
     """Return notes on rough T_base_camera of views that the images contradict.
 
-    ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
-    many times farther than rough poses are they may be. Views that mean the same other thing have
-    one note. Those of some views, by their names, follow from clicks.
+    ``cameras`` are found in the images, None where a view could not be placed; ``reach`` multiplies
+    the tolerance of rough poses. Views with the same misinterpretation have one note. Poses of the
+    views ``by_landmarks`` follow from clicks.
     """
-    notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by what they mean
+    notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by misinterpretation
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not far_off(hint, T, reach):
             continue
         apart, angle = pose_distance(hint, T)
         if name in by_landmarks:
             notes.append(
-                f"view {name}: the images contradict its clicks: found the camera "
-                f"{1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg from where the images put "
-                "it, needed clicks on the joints that they name; check those of the view in "
-                f"{LANDMARKS_NAME}."
+                f"view {name}: its clicks contradict the images: the camera by clicks is "
+                f"{1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg from the camera found in "
+                f"the images; check the clicks of the view in {LANDMARKS_NAME}."
             )
             continue
         x, y, z = T.translation
@@ -587,23 +595,22 @@ def hint_notes(
                       if not far_off(as_meant, T, reach)), None)  # fmt: skip
         remedy = "correct it in dataset.yaml"
         if other is not None:
-            remedy = f"it suits view {other}: check whether views or their images were exchanged"
+            remedy = f"it fits view {other}: check whether views or their images were swapped"
         elif meant is not None:
             alike.setdefault(meant, []).append((name, 1e3 * apart, float(np.degrees(angle))))
             continue
         notes.append(
-            f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
-            f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
-            f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
+            f"view {name}: its T_base_camera is wrong: it is {1e3 * apart:.0f} mm and "
+            f"{np.degrees(angle):.0f} deg from the camera found in the images (xyz: [{x:.3f}, "
+            f"{y:.3f}, {z:.3f}]); {remedy}."
         )
     for meant, views in alike.items():
         of_views, mm, deg = zip(*views, strict=True)
         one = len(views) == 1
         notes.append(
-            f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: found it "
-            f"{_span(mm)} mm and {_span(deg)} deg from where the images put the camera, needed a "
-            f"rough pose; it suits the images if {meant}: correct {'it' if one else 'them'} in "
-            "dataset.yaml."
+            f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: it is "
+            f"{_span(mm)} mm and {_span(deg)} deg from the camera found in the images; it fits if "
+            f"{meant}: correct {'it' if one else 'them'} in dataset.yaml."
         )
     return notes
 

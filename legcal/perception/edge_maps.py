@@ -45,7 +45,7 @@ class EdgeMaps:
         cameras: Sequence[Camera],
         factors: Sequence[int],
     ) -> EdgeMaps:
-        """Return the edges of pictures that were reduced by factors, where they move if told."""
+        """Return the edge maps of images reduced by factors, without static background if given."""
         grids = [_grid(*one) for one in zip(pictures, cameras, factors, strict=True)]
         flat = [
             (_on_plane(picture, grid), None if part is None else _on_plane(part, grid))
@@ -54,13 +54,13 @@ class EdgeMaps:
         of_pictures = [_edges(picture, part) for picture, part in flat]
         shape = np.max([one.shape for one in of_pictures], axis=0)
         maps = np.zeros((len(pictures), *shape), dtype=np.float32)
-        for into, own in zip(maps, of_pictures, strict=True):
-            into[:, : own.shape[1], : own.shape[2]] = own
+        for into, of_picture in zip(maps, of_pictures, strict=True):
+            into[:, : of_picture.shape[1], : of_picture.shape[2]] = of_picture
         corner = np.array([corner for _, corner, _ in grids])
         return cls(maps, corner, np.array([cell for _, _, cell in grids]))
 
     def take(self, chosen: slice) -> EdgeMaps:
-        """Return those of some pictures."""
+        """Return the maps of some images."""
         return EdgeMaps(self.maps[chosen], self.corner[chosen], self.cell[chosen])
 
     def mirrored(self, middle: Array) -> EdgeMaps:
@@ -86,7 +86,7 @@ class EdgeMaps:
         return replace(self, maps=np.reshape(np.array(soft, dtype=np.float32), self.maps.shape))
 
     def scores(self, pictures: Pictures, poses: CameraPoses) -> Array:
-        """Return how many legs poses explain in all pictures together, (n_poses,)."""
+        """Return the number of legs that poses explain in all images together, (n_poses,)."""
         samples = 2 * SAMPLES * pictures.ends.shape[1] * len(pictures)
         n = max(1, MOST_SAMPLES // max(samples, 1))
         chunks = [poses.take(slice(k, k + n)) for k in range(0, len(poses), n)]
@@ -146,7 +146,7 @@ def _on_plane(picture: Image, grid: Samples | None) -> Samples:
 
 
 def _edges(picture: Samples, moving: Samples | None) -> Samples:
-    """Return how strong edges of each direction are, (N_DIRECTIONS, height, width)."""
+    """Return the strength of edges by direction, (N_DIRECTIONS, height, width)."""
     smooth = cv2.GaussianBlur(np.sqrt(np.maximum(picture, 0.0)), (0, 0), SMOOTH)
     dx, dy = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1 - k, k)) for k in (0, 1))
     slope = cv2.magnitude(dx, dy)

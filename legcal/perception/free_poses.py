@@ -96,13 +96,13 @@ class _Image:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What is known of the machine; it travels to worker processes."""
+    """Constants of the machine; they travel to worker processes."""
 
     machine: Machine
     wanted: BoolArray  # (n_views, n_legs)
     q: Array  # (n_poses, n_legs) readings; of motors alone they have a meaning
     drawn: Array  # (n_drawn, 3, 4) poses of the workspace
-    targets: tuple[LegSegments, ...]  # what is to be seen at them
+    targets: tuple[LegSegments, ...]  # predicted legs at them
     images: Mapping[int, Sequence[_Image]]  # by pose
     # (n, 3, 4) by pose: where clicks have the platform, and around; drawn ones are not tried then
     clicked: Mapping[int, Array] = field(default_factory=dict)
@@ -124,7 +124,7 @@ class _Scene:
     def pictures(
         self, targets: Sequence[LegSegments], of_pose: Sequence[int], cameras: Array
     ) -> tuple[Pictures, IntArray]:
-        """Return what images show and should show with the legs at poses, and the index of each.
+        """Return edge pairs and predicted legs of images at poses, and the index of each.
 
         *of_pose* are the poses of the measurements whose images they are, *cameras* (n, n_views, 3,
         4) T_camera_base with each of them.
@@ -166,7 +166,7 @@ class _Guesses:
 
 
 def _targets(machine: Machine, poses: Array) -> list[LegSegments]:
-    """Return what is to be seen of all legs at poses (n, 3, 4)."""
+    """Return the predicted cylinders of all legs at poses (n, 3, 4)."""
     A, every = machine.A_base, np.arange(machine.n_legs)
     B = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     cylinders = [leg.cylinders for leg in machine.legs]
@@ -192,15 +192,15 @@ def _drawn(machine: Machine) -> Array:
     size = machine.size
     unit = np.array([1.0] * 3 + [size] * 3)
     poses = np.repeat(machine.home.as_matrix()[None, :3], N_CHAINS, axis=0)
-    found = []
+    poses_drawn = []
     for step in range(1, STEPS + 1):
         moved = poses_after(poses, STRIDE * unit * rng.normal(size=(N_CHAINS, 6)))
         moved, is_closed = _constrained(machine, moved, size)
         inside = is_closed & (np.abs(_beyond_travel(machine, moved)[0]).max(axis=1) == 0.0)
         poses = np.where(inside[:, None, None], moved, poses)
         if step in SNAPSHOTS:
-            found.append(poses)
-    return np.concatenate(found)
+            poses_drawn.append(poses)
+    return np.concatenate(poses_drawn)
 
 
 def _constrained(machine: Machine, poses: Array, size: float) -> tuple[Array, BoolArray]:
@@ -209,12 +209,12 @@ def _constrained(machine: Machine, poses: Array, size: float) -> tuple[Array, Bo
         return poses, np.ones(len(poses), dtype=np.bool_)
 
     def constraints(poses: Array) -> tuple[Array, Array]:
-        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-        return found.values[:, ~found.measured], found.by_pose[:, ~found.measured]
+        solved = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        return solved.values[:, ~solved.measured], solved.by_pose[:, ~solved.measured]
 
     unit = np.array([1.0 / size] * 3 + [1.0] * 3)
-    found = solve(constraints, poses_after, poses, tolerance=1e-6 * size, unit=unit, steps=10)
-    return found.points, found.worst < 1e-3 * size
+    solved = solve(constraints, poses_after, poses, tolerance=1e-6 * size, unit=unit, steps=10)
+    return solved.points, solved.worst < 1e-3 * size
 
 
 def find_free_poses(
@@ -296,20 +296,20 @@ def require_rough_cameras(
 
 def _searched(scene: _Scene, cameras: Array, k: int) -> _Guesses:
     """Return the poses at which the images of pose *k* show most legs, best first."""
-    found, targets = _Guesses.before(cameras, scene.drawn), list(scene.targets)
+    guesses, targets = _Guesses.before(cameras, scene.drawn), list(scene.targets)
     if k in scene.clicked:
-        found = _Guesses.before(cameras, scene.clicked[k])
-        targets = _targets(scene.machine, found.poses)
+        guesses = _Guesses.before(cameras, scene.clicked[k])
+        targets = _targets(scene.machine, guesses.poses)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
-        score = _scores(scene, cameras, k, found, targets, tolerance)
-        found = found.take(np.argsort(-score, kind="stable"))
+        score = _scores(scene, cameras, k, guesses, targets, tolerance)
+        guesses = guesses.take(np.argsort(-score, kind="stable"))
         few = kept <= ALL_ALIKE
-        found = found.take(_apart(scene.machine, found.poses, kept) if few else slice(kept))
-        found = _stepped_often(scene, cameras, k, found, [tolerance] * (1 + few))
-        targets = _targets(scene.machine, found.poses)
-    score = _scores(scene, cameras, k, found, targets, TOLERANCES[-1])
-    found = found.take(np.argsort(-score, kind="stable"))
-    return found.take(_apart(scene.machine, found.poses, CHOICES))
+        guesses = guesses.take(_apart(scene.machine, guesses.poses, kept) if few else slice(kept))
+        guesses = _stepped_often(scene, cameras, k, guesses, [tolerance] * (1 + few))
+        targets = _targets(scene.machine, guesses.poses)
+    score = _scores(scene, cameras, k, guesses, targets, TOLERANCES[-1])
+    guesses = guesses.take(np.argsort(-score, kind="stable"))
+    return guesses.take(_apart(scene.machine, guesses.poses, CHOICES))
 
 
 def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array:
@@ -323,7 +323,7 @@ def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array
 
 
 def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
-    """Return which are the first n poses (m, 3, 4) that are not near an earlier one."""
+    """Return the indices of the first n poses (m, 3, 4) that are not near an earlier one."""
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
     near = np.sqrt(np.mean(off**2, axis=2)) < APART * machine.size
@@ -335,12 +335,12 @@ def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
 
 
 def _stepped_often(
-    scene: _Scene, rough: Array | None, k: int, found: _Guesses, tolerances: Sequence[float]
+    scene: _Scene, rough: Array | None, k: int, guesses: _Guesses, tolerances: Sequence[float]
 ) -> _Guesses:
     """Return guesses after a Gauss-Newton step with each tolerance."""
-    for tolerance in tolerances if len(found) else ():
-        found = _stepped(scene, rough, k, found, tolerance)
-    return found
+    for tolerance in tolerances if len(guesses) else ():
+        guesses = _stepped(scene, rough, k, guesses, tolerance)
+    return guesses
 
 
 def _scores(
@@ -351,11 +351,11 @@ def _scores(
     targets: Sequence[LegSegments],
     tolerance: float,
 ) -> Array:
-    """Return how many legs agree with each guess, less what the model and rough poses say."""
+    """Return the number of legs that agree with each guess, less the cost of its priors."""
     poses = guesses.poses
     every, index = scene.pictures(targets, [k] * len(poses), guesses.cameras)
-    found = match_pairs(every, _as_they_are(scene), tolerance)
-    value = (found.exclusive_score[:, 0] * every.share).sum(axis=1)
+    matches = match_pairs(every, _as_they_are(scene), tolerance)
+    value = (matches.exclusive_score[:, 0] * every.share).sum(axis=1)
     score = np.bincount(index, value, minlength=len(poses))
     residual, _ = _model_rows(scene, poses, np.full(len(poses), k))
     views = scene.views(k)
@@ -380,7 +380,7 @@ def _stepped(
     n, unit = 6 + 6 * len(views), _pose_unit(scene)
     J = np.zeros((*of_lines.shape[:2], n))
     J[..., :6] = of_lines[..., 1:]
-    weight, value = np.zeros(n), np.zeros((len(poses), n))  # of what is known without images
+    weight, value = np.zeros(n), np.zeros((len(poses), n))  # of the priors
     weight[:6] = unit**-2
     if rough is not None:
         seen = np.array([views.index(image.view) for image in scene.images[k]] * len(poses))
@@ -406,19 +406,19 @@ def _stepped(
 
 def _cameras_of(T_base_camera: Sequence[RigidTransform | None]) -> Array:
     """Return T_camera_base (n_views, 3, 4); NaN where nothing is known."""
-    found = np.full((len(T_base_camera), 3, 4), np.nan)
+    cameras = np.full((len(T_base_camera), 3, 4), np.nan)
     for v, T in enumerate(T_base_camera):
         if T is not None:
-            found[v] = T.inv().as_matrix()[:3]
-    return found
+            cameras[v] = T.inv().as_matrix()[:3]
+    return cameras
 
 
 def _placed(
     hints: Sequence[RigidTransform | None], cameras: Array
 ) -> tuple[RigidTransform | None, ...]:
     """Return T_base_camera of the cameras that are known."""
-    found = _motions(np.where(np.isnan(cameras), np.eye(4)[:3], cameras))
-    return tuple(None if hint is None else T.inv() for hint, T in zip(hints, found, strict=True))
+    motions = _motions(np.where(np.isnan(cameras), np.eye(4)[:3], cameras))
+    return tuple(None if hint is None else T.inv() for hint, T in zip(hints, motions, strict=True))
 
 
 def _motions(of: Array) -> tuple[RigidTransform, ...]:
@@ -443,13 +443,13 @@ def _camera_change(start: Array, cameras: Array) -> Array:
 
 
 def _camera_unit(rough: Array) -> Array:
-    """Return how far cameras may be from rough ones (..., 3, 4), (..., 6) [rad, m]."""
+    """Return the tolerance (..., 6) of cameras about rough ones (..., 3, 4) [rad, m]."""
     far = CAMERA_SIGMA[1] * np.linalg.norm(rough[..., 3], axis=-1)
     return np.stack([np.full_like(far, CAMERA_SIGMA[0])] * 3 + [far] * 3, axis=-1)
 
 
 def _pose_unit(scene: _Scene) -> Array:
-    """Return how far a pose may be from where it is if nothing says so, (6,) [rad, m]."""
+    """Return the standard deviations of a weak prior on a pose, (6,) [rad, m]."""
     size = scene.machine.size
     return np.array([TURN_SIGMA] * 3 + [PLACE_SIGMA * size] * 3)
 
@@ -467,8 +467,8 @@ def _line_rows(
     With derivatives (n_pictures, 2 n_segments, 6) by a step of the camera.
     """
     base = _as_they_are(scene)
-    found = match_pairs(every, base, tolerance)
-    J, J_leg, residual, weight = segment_equations(every, base, found, tolerance)
+    matches = match_pairs(every, base, tolerance)
+    J, J_leg, residual, weight = segment_equations(every, base, matches, tolerance)
     root = np.sqrt(weight[:, 0, :, :2])  # (n_pictures, n_segments, 2)
     arm = np.einsum("kxy,ksy->ksx", poses[index, :, :3], scene.machine.B_platform[every.leg])
     by_B = J_leg[:, 0, :, :, 3:]
@@ -485,12 +485,12 @@ def _line_rows(
 def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]:
     """Return whitened residuals (n, m) of readings, constraints and travel, and derivatives."""
     machine = scene.machine
-    found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
-    wanted = np.zeros_like(found.values)
-    measured = found.measured
-    wanted[:, measured] = (machine.sign * scene.q[k])[:, found.leg[measured]]
+    equations = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+    wanted = np.zeros_like(equations.values)
+    measured = equations.measured
+    wanted[:, measured] = (machine.sign * scene.q[k])[:, equations.leg[measured]]
     sigma, sigma_travel = EQUATION_SIGMA * machine.size, TRAVEL_SIGMA * machine.size
-    values, jacobian = (found.values - wanted) / sigma, found.by_pose / sigma
+    values, jacobian = (equations.values - wanted) / sigma, equations.by_pose / sigma
     beyond, by_travel = _beyond_travel(machine, poses)
     return (
         np.concatenate([values, beyond / sigma_travel], axis=1),
@@ -499,7 +499,7 @@ def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]
 
 
 def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
-    """Return how far sliders are beyond their travel (n, n_legs) [m], and derivatives by pose."""
+    """Return the excess of sliders over their travel (n, n_legs) [m], with derivatives by pose."""
     arm = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2)
     vector = arm + poses[:, None, :, 3] - machine.A_base
     length = np.linalg.norm(vector, axis=2)
@@ -517,7 +517,7 @@ def _beyond_travel(machine: Machine, poses: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What the fit of all images moves."""
+    """The unknowns of the fit of all images."""
 
     cameras: Array  # (n_used, 3, 4) T_camera_base of the views that have images
     poses: Array  # (n_poses, 3, 4) T_base_platform of the poses that have images
@@ -537,9 +537,9 @@ def _fitted(
     unit = _pose_unit(scene)
 
     def placed(state: _State) -> Array:
-        found = cameras.copy()
-        found[views] = state.cameras
-        return found
+        fitted = cameras.copy()
+        fitted[views] = state.cameras
+        return fitted
 
     def lines(state: _State, tolerance: float) -> Residuals:
         targets = _targets(scene.machine, state.poses)

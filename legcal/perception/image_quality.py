@@ -17,7 +17,7 @@ from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.light import reduce
 from legcal.vision.image_file import Grey
 
-BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
+BLACK, WHITE = 8.0, 247.0  # bounds of nearly all pixels of an unusable image [grey levels]
 BRIGHTEST = 254.5  # [grey levels]
 TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
 MIN_RANGE = 10.0  # of an image in which something can be seen [grey levels]
@@ -37,7 +37,7 @@ _SMOOTHED, _SLOPES = (  # of a row of pixels, without the ends
     for taps in (_SMOOTH, _SLOPE)
 )
 MARGIN = 3  # of the image of half the size, beyond which edges do not count [px]
-DIRECTIONS = 4  # of edges: what moves is blurred in one
+DIRECTIONS = 4  # of edges: motion blurs one of them
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
 FLAT = 1.0  # slope below which nothing is there: a hundredth of a grey level in a pixel
@@ -45,7 +45,7 @@ MIN_EDGES, MIN_EDGES_PART = 40, 0.1  # places of a direction, and of all
 MAX_EDGES = 1000  # places of a direction that are compared
 MAX_BLUR = 8.0  # that the scales can measure [px]
 MAX_BLUR_OF_OTHERS = (2.0, 1.2)  # against others: factor, and more [px]
-USUAL_PERCENTILE = 40.0  # percentile of blurs, for what is usual
+USUAL_PERCENTILE = 40.0  # percentile of blurs, for the usual blur
 MIN_IMAGES = 3  # images of a view or camera, to be compared
 
 
@@ -95,14 +95,14 @@ def _blur(grey: Grey, half: Grey) -> float:
     direction = np.rint(angle / np.float32(np.pi / DIRECTIONS)).astype(np.int8) % DIRECTIONS
     least = max(MIN_EDGES, int(MIN_EDGES_PART * len(coarse)))  # else they are corners of others
     of_directions = [np.flatnonzero(direction == d) for d in range(DIRECTIONS)]
-    strong = [own[_strongest(coarse[own])] for own in of_directions if len(own) >= least]
+    strong = [edges[_strongest(coarse[edges])] for edges in of_directions if len(edges) >= least]
     strong = [one[:: -(-len(one) // MAX_EDGES)] for one in strong]
     if not strong:
         return 0.0
     every = np.concatenate(strong)
     ratios = _greatest_slopes(grey, 2 * row[every], 2 * column[every]) / coarse[every]
     blurs = [
-        _blur_of(own) for own in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]
+        _blur_of(edges) for edges in np.split(ratios, np.cumsum([len(one) for one in strong]))[:-1]
     ]
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
     return sorted(blurs)[min(1, len(blurs) - 1)]
@@ -130,7 +130,7 @@ def _edges(half: Grey) -> tuple[Grey, IntArray, IntArray, Grey]:
 
 
 def _strongest(slope: Grey) -> BoolArray:
-    """Return which edges of a direction count."""
+    """Return the mask of edges of a direction that count."""
     k = min(len(slope) - MIN_EDGES, math.ceil(0.01 * STRONG * (len(slope) - 1)))
     return np.asarray(slope >= np.partition(slope, k)[k])
 
@@ -156,13 +156,13 @@ def _blur_of(ratios: Grey) -> float:
 def image_defects(
     exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, Hashable]
 ) -> dict[int, Rejection]:
-    """Return why images cannot be used: by themselves, or beside others, by row.
+    """Return the rejections of unusable images, alone or compared with others, by row.
 
     ``view`` and ``camera`` are those of each row: images of a view show about the same through the
     same lens. Where a view has few, as of a camera in the hand, all of its camera are compared.
     """
-    found = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
-    good = {row: exposure.blur for row, exposure in exposures.items() if row not in found}
+    defects = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
+    good = {row: exposure.blur for row, exposure in exposures.items() if row not in defects}
     for row, blur in good.items():
         others, whose = [b for r, b in good.items() if view[r] == view[row]], "view"
         if len(others) < MIN_IMAGES:
@@ -173,5 +173,5 @@ def image_defects(
         factor, more = MAX_BLUR_OF_OTHERS
         if blur > max(factor * usual, usual + more):
             detail = Cause("{:.1f} px, the others of its {} by {:.1f}", (blur, whose, usual))
-            found[row] = Rejection(Reason.BLURRED, detail)
-    return found
+            defects[row] = Rejection(Reason.BLURRED, detail)
+    return defects

@@ -8,7 +8,7 @@ from legcal.vision.image_file import Grey
 
 Samples = NDArray[np.float32]
 
-DARK = 12.0  # grey level below which noise is taken to be that of this level
+DARK = 12.0  # grey level below which the noise is constant
 
 
 def reduce(grey: Grey, factor: int) -> Grey:

@@ -64,7 +64,7 @@ _FARTHER = (0.0, 1.0, 2.5, 5.0)  # from the curve, in the least distance of a te
 _APART = 0.25  # of that distance between two texts
 _ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
 _ON_LINE = 0.1  # of the area of a text, that each point of a line under it costs
-_ON_TEXT = 4.0  # times the areas of a text and of what it hides of another
+_ON_TEXT = 4.0  # weight of the overlap of two texts
 _LEADER_POINTS = 8
 
 
@@ -76,9 +76,9 @@ class Mark(NamedTuple):
 
 
 class PartMarks(NamedTuple):
-    """What is drawn of a part of a leg."""
+    """The drawing of a part of a leg."""
 
-    name: str  # the leg, and the part where the leg has several; "" for what has no label
+    name: str  # the leg, and the part where the leg has several; "" without a label
     reason: str  # why an outline of it is not used, shortened; "" if both are
     marks: tuple[Mark, ...]
 
@@ -89,7 +89,7 @@ def marks_of_image(
     predicted: Sequence[PredictedLeg],
     leg_names: Sequence[str],
 ) -> list[PartMarks]:
-    """Return what is drawn over an image, one entry for each part of a leg in it.
+    """Return the drawings over an image, one for each part of a leg in it.
 
     From its outlines and the predicted legs.
     """
@@ -136,7 +136,7 @@ def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
 
 
 def _reason(pair: Outlines) -> str:
-    """Return why an outline of a part is not used."""
+    """Return the reason of a rejected outline."""
     rejections = {
         int(edge): why
         for edge, why, used in zip(pair.edge, pair.reason, pair.used, strict=True)
@@ -160,9 +160,9 @@ def _part_marks(
 ) -> tuple[Mark, ...]:
     """Return the outlines of a part, its axis if both are used, and where it should be if not."""
     marks: list[Mark] = []
-    found = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
-    used = pair.used & found
-    for i in np.flatnonzero(found).tolist():
+    are_measured = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
+    used = pair.used & are_measured
+    for i in np.flatnonzero(are_measured).tolist():
         kind: MarkKind = "rejected"
         if pair.used[i]:
             kind = "edge 1" if pair.edge[i] == 1 else "edge 2"
@@ -172,10 +172,10 @@ def _part_marks(
         # h1 . M = R and h2 . M = -R of all points M of the axis, eq (5): it is seen at h1 + h2.
         ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
         marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
-    if leg is not None and not np.all(found) and not pair.rejected_for(Reason.OUTSIDE).any():
+    if leg is not None and not np.all(are_measured) and not pair.rejected_for(Reason.OUTSIDE).any():
         for i, segment in enumerate(leg.segments):
             if segment.link == part:
-                edges = [e - 1 for e, seen in zip(pair.edge, found, strict=True) if not seen]
+                edges = [e - 1 for e, seen in zip(pair.edge, are_measured, strict=True) if not seen]
                 marks += [mark for k, mark in enumerate(_prediction(camera, leg, i)) if k in edges]
     return tuple(marks)
 
@@ -392,6 +392,6 @@ def _leader(anchor: Array, corner: Array, extent: Array) -> Array:
 
 
 def _is_in(points: Array, low: Array, high: Array) -> BoolArray:
-    """Say which points (n, 2) are in a box."""
+    """Return the mask of points (n, 2) in a box."""
     inside: BoolArray = np.all((points > low) & (points < high), axis=1)
     return inside

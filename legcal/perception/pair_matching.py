@@ -124,7 +124,7 @@ class CameraPoses:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is known of a picture: its edge pairs, and the legs that it may show."""
+    """An image: its edge pairs, and the legs that it may show."""
 
     pairs: CandidatePairs
     targets: LegSegments  # segments of legs at its reading
@@ -219,15 +219,15 @@ class Pictures:
 
 def _filled(parts: Sequence[NDArray[Any]], n: int, value: NDArray[Any]) -> NDArray[Any]:
     """Return arrays (m, ...) one behind the other, filled up to n rows of a value."""
-    found = np.empty((len(parts), n, *value.shape), dtype=value.dtype)
-    for one, part in zip(found, parts, strict=True):
+    filled = np.empty((len(parts), n, *value.shape), dtype=value.dtype)
+    for one, part in zip(filled, parts, strict=True):
         one[: len(part)] = part
         one[len(part) :] = value
-    return found
+    return filled
 
 
 class PairMatches(NamedTuple):
-    """How well poses explain pictures, (n_pictures, n_poses, n_segments) each."""
+    """Scores of poses in images, (n_pictures, n_poses, n_segments) each."""
 
     score: Array  # of each segment, 0 to 1: how well, times how much of its visible length
     pair: IntArray  # the edge pair of its picture with that score
@@ -251,7 +251,7 @@ def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pai
     if len(pictures) == 0 or n == 0:
         nothing = np.zeros((len(pictures), n, pictures.ends.shape[1]))
         return PairMatches(nothing, nothing.astype(np.intp), nothing)
-    found = [
+    blocks = [
         _joined(
             [
                 _match_block(some, poses.take(slice(k, k + CHUNK)), tolerance)
@@ -261,7 +261,7 @@ def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pai
         )
         for some in pictures.blocks(n)
     ]
-    return _joined(found, 0)
+    return _joined(blocks, 0)
 
 
 def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
@@ -342,8 +342,8 @@ def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pa
     length = np.abs(run) * np.maximum(visible, 0.05)[..., None].astype(np.float32)
     value *= np.minimum(overlap / length, 1.0)
     best = np.argmax(value, axis=-1)
-    found = np.take_along_axis(value, best[..., None], axis=-1)[..., 0]
-    return PairMatches(np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible)
+    chosen = np.take_along_axis(value, best[..., None], axis=-1)[..., 0]
+    return PairMatches(np.where(visible > 0.0, chosen, 0.0).astype(np.float64), best, visible)
 
 
 def _tolerances(pictures: Pictures, X: Array, tolerance: float) -> Array:
@@ -436,7 +436,7 @@ def _step_prior(centre: Array, min_depth: float) -> Array:
 
 
 def segment_equations(
-    pictures: Pictures, poses: CameraPoses, found: PairMatches, tolerance: float
+    pictures: Pictures, poses: CameraPoses, matches: PairMatches, tolerance: float
 ) -> tuple[Array, Array, Array, Array]:
     """Return residuals of each segment: two of its line, one of its width, one of its place.
 
@@ -447,7 +447,7 @@ def segment_equations(
     X, xy, width = projected(pictures, poses)
     K, n_pairs = pictures.pairs.shape[:2]
     table = np.concatenate([pictures.pairs, _width_sigmas(pictures)[..., None]], axis=2)
-    at = found.pair + (n_pairs * np.arange(K))[:, None, None]
+    at = matches.pair + (n_pairs * np.arange(K))[:, None, None]
     of_pair = table.reshape(K * n_pairs, -1).take(at, axis=0)
     middle, axes = of_pair[..., :2], of_pair[..., 2:6].reshape(*at.shape, 2, 2)
     half, seen, sigma_width = of_pair[..., 6], of_pair[..., 7], of_pair[..., 9]
@@ -501,15 +501,15 @@ def segment_equations(
     pixel = LINE_PIXELS * pictures.pixel[:, None, None]
     variance[..., 0] = variance[..., 1] = sigma**2 + pixel**2
     variance[..., 2], variance[..., 3] = sigma_width**2, sigma_place**2
-    return J, J_leg, residual, found.score[..., None] / variance
+    return J, J_leg, residual, matches.score[..., None] / variance
 
 
-def distances(pictures: Pictures, poses: CameraPoses, found: PairMatches) -> Array:
-    """Return how far segments are from the pairs that agree with them, (K, n, T) [m].
+def distances(pictures: Pictures, poses: CameraPoses, matches: PairMatches) -> Array:
+    """Return the distances of segments from the pairs that agree with them, (K, n, T) [m].
 
     Sideways, at the ends of the pairs and at the depth of the segments.
     """
-    _, _, residual, _ = segment_equations(pictures, poses, found, 1.0)
+    _, _, residual, _ = segment_equations(pictures, poses, matches, 1.0)
     X, _, _ = projected(pictures, poses)
     return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
 

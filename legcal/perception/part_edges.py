@@ -27,7 +27,7 @@ BLOCK_LENGTH = 8.0  # along the part [px]
 ROWS, ROWS_NEAR = 4, 2  # of samples in a block, and where all windows are small
 NEAR_WINDOW = 4  # such a window, at most [px]
 MAX_BLOCKS = 80  # of a part
-MARGIN = 6  # columns beyond the search window, to judge what an edge is [px]
+MARGIN = 6  # columns beyond the search window, to judge edges [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
@@ -39,7 +39,7 @@ LONE_SCORE = 0.5  # of an edge that may stand alone
 LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
 MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
-BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
+BESIDE_WEIGHT = 0.8  # weight of an edge in the columns beside it
 # An edge that was found a pixel off may be where it is predicted [px]. Found ones are off by
 # multiples of half a pixel: between two of these, rounding decides nothing.
 MAX_PREDICTION_ERROR = 1.25
@@ -54,7 +54,7 @@ class EdgePair:
     alone: BoolArray  # (2,) whether each edge is convincing without the other
 
     def suits(self, width: Array) -> bool:
-        """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
+        """Return whether both edges are at the distance of the part's outlines (2,) [px]."""
         off = np.abs(self.v[1] - self.v[0] - width)
         tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
         return bool(np.all(self.found) and np.all(off <= tolerance))
@@ -119,22 +119,22 @@ def _pairs(
     of_pair = predicted + np.stack([shift[every, 0, i], shift[every, 1, j]], axis=1)
     convincing = alone & (np.stack([i, j], axis=1) == 0)
     of_single = predicted + shift[every, edge, 0][:, None]
-    found: list[EdgePair | None] = []
+    pairs: list[EdgePair | None] = []
     for k in every.tolist():
         if together[k]:
-            found.append(EdgePair(of_pair[k], np.ones(2, dtype=np.bool_), convincing[k]))
+            pairs.append(EdgePair(of_pair[k], np.ones(2, dtype=np.bool_), convincing[k]))
         elif single[k]:
             own = np.arange(2) == edge[k]
-            found.append(EdgePair(of_single[k], own, own))
+            pairs.append(EdgePair(of_single[k], own, own))
         else:
-            found.append(None)
-    return found
+            pairs.append(None)
+    return pairs
 
 
 def _best_pairs(
     parts: Sequence[LegPart], predicted: Array, shift: Array, merit: Array, score: Array
 ) -> tuple[IntArray, IntArray, BoolArray]:
-    """Return which lines near both edges of each part are a pair, and whether it is convincing."""
+    """Return the best pair of lines near both edges of each part, and whether it is convincing."""
     one, two = shift[:, 0, :, None], shift[:, 1, None]
     width = (predicted[:, 1] - predicted[:, 0])[:, None, None]
     window = np.array([part.window for part in parts])[:, None, None, None]
@@ -227,7 +227,7 @@ def _node_points(parts: Sequence[LegPart], n_blocks: IntArray, reach: float) -> 
 
 
 def _sharpness(profiles: Samples, seen: BoolArray, n_blocks: IntArray) -> Samples:
-    """Return how much each column of profiles (n, n_columns) looks like an edge, 0 to 1.
+    """Return the edge score of each column of profiles (n, n_columns), 0 to 1.
 
     The maxima of the smoothed gradient along each profile against the median of its patch, widened
     by one column to each side, where they count less. ``n_blocks`` are those of each patch.
@@ -328,7 +328,7 @@ def _added(votes: Samples, n_blocks: IntArray, halves: IntArray, half: int) -> S
 
 @lru_cache(maxsize=512)
 def _columns(n_blocks: int, half: int) -> IntArray:
-    """Return where lines begin to count in each block, by the difference of their ends.
+    """Return the first offset of lines that counts in each block, by the difference of their ends.
 
     (n_blocks, 2 half + 1) columns of votes with half // 2 + 1 more on each side.
     """

@@ -68,7 +68,7 @@ MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 
 def detection_settings() -> dict[str, object]:
-    """Return what detected outlines depend on besides the dataset."""
+    """Return the settings that detected outlines depend on besides the dataset."""
     return {"near_fit_px": WINDOW_PX, "detector": DETECTOR_VERSION}
 
 
@@ -86,11 +86,11 @@ class Photographs:
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
-    still: dict[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
+    still: dict[int, Still] = field(default_factory=dict)  # static background by view
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
-        """What can be seen of each leg."""
+        """The visible cylinders of each leg."""
         return tuple(leg.cylinders for leg in self.machine.legs)
 
     @property
@@ -110,7 +110,7 @@ class Photographs:
         pairs: Mapping[int, CandidatePairs] | None = None,
         blur: Mapping[int, float] | None = None,
     ) -> Search:
-        """Return what is searched for by a model.
+        """Return the search for the legs of a model.
 
         Candidate pairs of some images may be known, and roughly the blur [px], by row.
         """
@@ -129,10 +129,10 @@ class Photographs:
             self.still,
         )
 
-    def with_found(self, found: Outlines) -> Outlines:
+    def with_found(self, outlines: Outlines) -> Outlines:
         """Return found outlines and kept ones in one table; edited ones win."""
         others = self.keep.choose(~is_edited(self.keep))
-        return join_outlines([merge_edited(found, self.keep), others])
+        return join_outlines([merge_edited(outlines, self.keep), others])
 
     def narrowed(self, rows: IntArray, outlines: Outlines) -> Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
@@ -140,7 +140,7 @@ class Photographs:
         return replace(self, detect=rows, keep=outlines.choose(kept))
 
     def with_intrinsics(self, cameras: Sequence[Camera]) -> Photographs:
-        """Return the same images, seen through the lenses of other cameras, one a view."""
+        """Return the images with the intrinsics of other cameras, one a view."""
         views = tuple(
             replace(view, camera=replace(view.camera, K=lens.K, distortion=lens.distortion))
             for view, lens in zip(self.measurements.views, cameras, strict=True)
@@ -148,7 +148,7 @@ class Photographs:
         return replace(self, measurements=replace(self.measurements, views=views))
 
     def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
-        """Return the same images, read with other gammas of some views, by their names."""
+        """Return the images with other gammas of some views, by name."""
         views = tuple(
             replace(view, camera=replace(view.camera, gamma=gammas[view.name]))
             if view.name in gammas
@@ -164,7 +164,7 @@ class MeasuredImages:
 
     photographs: Photographs  # the images, and the mechanism with the radii that they show
     placement: Placement  # with views that could not be placed, and notes on views and images
-    outlines: Outlines  # of all images; those of images that are left out are rejected
+    outlines: Outlines  # of all images; rejected in images that are left out
     left_out: dict[int, Rejection]  # why images were left out, by row
     blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
     # T_base_platform of every pose that images show, where the readings do not give it
@@ -181,7 +181,7 @@ class MeasuredImages:
         ]
 
     def kept(self, rows: IntArray) -> IntArray:
-        """Return those of some images that were not left out, and whose views were placed."""
+        """Return the rows of images that were not left out, in placed views."""
         view, cameras = self.photographs.measurements.view, self.placement.T_base_camera
         is_kept = [r not in self.left_out and cameras[view[r]] is not None for r in rows.tolist()]
         return rows[np.array(is_kept, dtype=np.bool_)]
@@ -195,7 +195,7 @@ def given_outlines(photographs: Photographs) -> Outlines:
 def nominal_placement(
     machine: Machine, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
 ) -> Placement:
-    """Return where a model has the legs at poses (n_poses,), with the rough cameras of views."""
+    """Return the placement by a model at poses (n_poses,), with the rough cameras of views."""
     B_base = np.array([T.apply(machine.B_platform) for T in T_base_platform])
     poses = np.array([T.as_matrix() for T in T_base_platform])
     A_base = B_base - vectors_at(machine, poses)
@@ -278,47 +278,47 @@ class _Measured:
         view, known = self.photographs.measurements.view, ~np.isnan(self.blur)
         n_views = len(self.photographs.measurements.views)
         of_views = [self.blur[known & (view == v)] for v in range(n_views)]
-        return tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
+        return tuple(float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views)
 
 
 def _with_other_radii(
-    found: _Measured,
+    measured: _Measured,
     views: PlacedViews,
     report: Report,
     *,
     method: Method,
 ) -> _Measured:
-    """Return what is measured with other radii of parts that were not found, if it is more.
+    """Return the outlines measured with other radii of parts not found, if these are more.
 
     *views* are where its images were recognised.
     """
-    machine, m = found.photographs.machine, found.photographs.measurements
-    suspects = _parts_not_found(machine.legs, found.outlines)
+    machine, m = measured.photographs.machine, measured.photographs.measurements
+    suspects = _parts_not_found(machine.legs, measured.outlines)
     while suspects:
-        placement = views.with_other_radii(suspects, found.photographs.run)
+        placement = views.with_other_radii(suspects, measured.photographs.run)
         if placement is None:
             break
         radii = placement.radii
-        photographs = replace(found.photographs, machine=machine.with_radii(radii.corrected))
-        search = replace(found.search, cylinders=photographs.cylinders)
+        photographs = replace(measured.photographs, machine=machine.with_radii(radii.corrected))
+        search = replace(measured.search, cylinders=photographs.cylinders)
         stage = f"{MEASURING} with other radii"
         outlines, blur = _measured(
             photographs, search, placement, report, method=method, stage=stage
         )
-        found = replace(found, blur=np.where(np.isnan(blur), found.blur, blur))
-        shown = _images_with_more(machine.legs, radii, m.view, found.outlines, outlines)
+        measured = replace(measured, blur=np.where(np.isnan(blur), measured.blur, blur))
+        shown = _images_with_more(machine.legs, radii, m.view, measured.outlines, outlines)
         of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
-        if of_one and not radii.common:  # what one camera sees may be light and shade
+        if of_one and not radii.common:  # one camera alone may see light and shade
             left = [part for part in suspects if not _is_among(part, of_one)]
             suspects = left if len(left) < len(suspects) else []
             continue
-        if outlines.used.sum() > found.outlines.used.sum():
+        if outlines.used.sum() > measured.outlines.used.sum():
             seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
             notes = radius_notes(radii, search.leg_names, seen_in)
             placement = replace(placement, notes=(*placement.notes, *notes))
-            found = _Measured(photographs, search, placement, outlines, found.blur)
+            measured = _Measured(photographs, search, placement, outlines, measured.blur)
         break
-    return found
+    return measured
 
 
 def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
@@ -336,11 +336,11 @@ def _with_free_poses(
     rows: IntArray,
     report: Report,
 ) -> tuple[Placement, FreePosesOf]:
-    """Return where a model has the legs, with poses found in images where readings give none."""
+    """Return the placement by a model, with poses found in images where readings give none."""
     machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
-    found = find_free_poses(
+    poses = find_free_poses(
         photographs.search(nominal, pairs),
         machine,
         rows.tolist(),
@@ -349,15 +349,15 @@ def _with_free_poses(
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
         photographs.clicked_poses,
     )
-    nominal = replace(nominal, T_base_camera=found.T_base_camera)
-    first = {pose: choices[0] for pose, choices in found.T_base_platform.items()}
-    return _at_poses(photographs, nominal, first), found.T_base_platform
+    nominal = replace(nominal, T_base_camera=poses.T_base_camera)
+    first = {pose: choices[0] for pose, choices in poses.T_base_platform.items()}
+    return _at_poses(photographs, nominal, first), poses.T_base_platform
 
 
 def _at_poses(
     photographs: Photographs, nominal: Placement, T_base_platform: Mapping[int, RigidTransform]
 ) -> Placement:
-    """Return where a model has the legs with the platform at other poses, by their number."""
+    """Return the placement by a model with the platform at other poses, by their number."""
     B_base = nominal.B_base.copy()
     for pose, T in T_base_platform.items():
         B_base[photographs.measurements.pose == pose] = T.apply(photographs.machine.B_platform)
@@ -367,15 +367,15 @@ def _at_poses(
 def _in_doubt(
     measurements: Measurements, rows: IntArray, n_outlines: Mapping[int, int]
 ) -> dict[int, Rejection]:
-    """Return why images do not tell where the platform is, by row, by the outlines of poses."""
+    """Return the rejections of images that leave the platform pose ambiguous, by row."""
     checked = np.array([n_outlines[k] >= MIN_OUTLINES for k in measurements.pose[rows].tolist()])
     reasons = dict.fromkeys(rows[~checked].tolist(), Rejection(Reason.FEW_LEGS))
     left, view = rows[checked], measurements.view
     for v in np.unique(view[left]).tolist():
-        own = left[view[left] == v]
-        if len(np.unique(measurements.pose[own])) < MIN_POSES:
+        of_view = left[view[left] == v]
+        if len(np.unique(measurements.pose[of_view])) < MIN_POSES:
             why = Rejection(Reason.FEW_LEGS, "as most of its view do")
-            reasons |= dict.fromkeys(own.tolist(), why)
+            reasons |= dict.fromkeys(of_view.tolist(), why)
     return reasons
 
 
@@ -387,7 +387,7 @@ def _decided_by_outlines(
     report: Report,
     joined: Joined,
 ) -> tuple[Placement, FreePosesOf, dict[int, int]]:
-    """Return the legs at those of several poses at which most outlines can be measured.
+    """Return the legs at the pose, of several, at which most outlines can be measured.
 
     With the number of outlines there, by pose. They are measured at the likeliest poses of all
     images first, then at others before cameras that these have placed; twice, since cameras stand
@@ -449,21 +449,21 @@ def with_measured_radii(
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, found = np.array(outlines.part), dict[tuple[int, float], float]()
+    part, factors = np.array(outlines.part), dict[tuple[int, float], float]()
     for j, leg in enumerate(machine.legs):
         for cylinder in leg.cylinders:
-            own = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
-            if 2 * np.count_nonzero(wrong[own]) <= len(own):
+            of_cylinder = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
+            if 2 * np.count_nonzero(wrong[of_cylinder]) <= len(of_cylinder):
                 continue
-            row, edge = outlines.row[own], outlines.edge[own]
+            row, edge = outlines.row[of_cylinder], outlines.edge[of_cylinder]
             A = np.array([places[int(m.view[r])].apply(placement.A_base[r, j]) for r in row])
-            distance = np.sum(outlines.h[own] * A, axis=1) * np.array(EPSILON)[edge - 1]
+            distance = np.sum(outlines.h[of_cylinder] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                found[j, cylinder.radius] = float(np.mean(of_edges))
-    if not found:
+                factors[j, cylinder.radius] = float(np.mean(of_edges))
+    if not factors:
         return None
-    other = machine.with_radii(lambda j, c: found.get((j, c.radius), c.radius))
+    other = machine.with_radii(lambda j, c: factors.get((j, c.radius), c.radius))
     return replace(photographs, machine=other)
 
 
@@ -475,7 +475,7 @@ def _placed(
     report: Report,
     joined: Joined,
 ) -> PlacedViews:
-    """Return where views have the legs that some images show."""
+    """Return the placement of views by the legs in some images."""
     progress = _counted(report, "Recognising legs", len(rows))
     return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
 
@@ -505,7 +505,7 @@ def _measured(
 def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
 ) -> tuple[dict[int, Rejection], dict[int, CandidatePairs], dict[int, float]]:
-    """Return why images show nothing, pairs of those recognised first, and blurs [px], by row."""
+    """Return rejections of unusable images, edge pairs of the first ones, blurs [px], by row."""
     rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
     groups = group_views(measurements, photographs.detect, hints, joined)
@@ -530,7 +530,7 @@ def _inspect_images(
 def _still_pictures(
     measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
 ) -> dict[int, Still]:
-    """Return what stands still in the reduced pictures of each view that has enough of them."""
+    """Return the static background of each view with enough reduced images."""
     of_view: dict[int, list[Grey]] = {}
     for row, picture in small.items():
         if row not in defects:
@@ -547,7 +547,7 @@ def _pairs_of_reduced(search: Search, seen_by: tuple[Grey, int]) -> CandidatePai
 def defects_of(
     measurements: Measurements, exposures: Mapping[int, Exposure]
 ) -> dict[int, Rejection]:
-    """Return why images show nothing, by themselves or beside others of their view, by row."""
+    """Return rejections of unusable images, alone or compared with their view, by row."""
     views = measurements.views
     camera = shared_cameras([view.name for view in views], [view.camera for view in views])
     view = {row: int(measurements.view[row]) for row in exposures}
@@ -555,7 +555,7 @@ def defects_of(
 
 
 def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Grey | None]:
-    """Return how an image was exposed, and reduced if it is one of rows."""
+    """Return the exposure of an image, and the reduced image if it is one of rows."""
     image = search.load(row)
     factor = search.reduction(int(search.measurements.view[row]))
     return measure_exposure(image), reduce(image, factor) if row in rows else None
@@ -575,15 +575,15 @@ def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]
     parts = []
     for j, leg in enumerate(legs):
         for link, radius in leg.radius_along.items():
-            own = visible & (outlines.leg == j) & (part == link)
-            is_seen = own.any() or not visible.any()
-            if is_seen and used[own].sum() <= MAX_USED_SHARE * own.sum():
+            of_part = visible & (outlines.leg == j) & (part == link)
+            is_seen = of_part.any() or not visible.any()
+            if is_seen and used[of_part].sum() <= MAX_USED_SHARE * of_part.sum():
                 parts.append((j, radius))
     return parts
 
 
 def _is_among(part: LegRadius, others: Sequence[LegRadius]) -> bool:
-    """Say whether a part is one of others, whose radii may differ by rounding."""
+    """Return whether a part is one of others, whose radii may differ by rounding."""
     return any(part[0] == leg and look_alike(part[1], radius) for leg, radius in others)
 
 
@@ -599,7 +599,7 @@ def _images_with_more(
     With a radius that is wrong by as much as light and shade suggest, a part loses its outlines in
     most images; where it gains some in all together, views that gain speak for that radius.
     """
-    found = {}
+    images = {}
     for leg, radius in radii.factor:
         links = [link for link, r in legs[leg].radius_along.items() if look_alike(r, radius)]
         gain = Counter[int]()
@@ -612,8 +612,8 @@ def _images_with_more(
             of_view[int(view[row])] += more
         speaks = {v for v, more in of_view.items() if more > 0} if gain.total() > 0 else set()
         rows = [row for row, more in gain.items() if more > 0 and int(view[row]) in speaks]
-        found[leg, radius] = sorted(rows)
-    return found
+        images[leg, radius] = sorted(rows)
+    return images
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

@@ -1,4 +1,4 @@
-"""What is searched for in images, and where their cameras and legs are estimated to be.
+"""The search for legs in images, and the estimated cameras and joint centres.
 
 A :class:`Search` is the nominal model at every reading. A :class:`Placement` is what flows through
 the room: first rough cameras and the nominal model, then what was recognised, then what views
@@ -53,20 +53,20 @@ NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What is searched for; it travels to worker processes."""
+    """The search for legs; it travels to worker processes."""
 
     load: Load  # the image of a row
     measurements: Measurements
     A_base: Array  # (n_rows, n_legs, 3) joint centres by the nominal model, in the base link [m]
     B_base: Array
-    cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
+    cylinders: Sequence[Sequence[Cylinder]]  # visible cylinders of each leg
     wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
     size: float  # mean leg length of the machine [m]
     edge_pairs: Mapping[int, CandidatePairs] = field(default_factory=dict)  # of rows seen before
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
-    occluders: Sequence[Occluder] = ()  # what hides besides legs and arms
-    still: Mapping[int, Still] = field(default_factory=dict)  # of views, what moves in no picture
+    occluders: Sequence[Occluder] = ()  # occluders besides legs and arms
+    still: Mapping[int, Still] = field(default_factory=dict)  # static background by view
 
     @property
     def n_legs(self) -> int:
@@ -74,7 +74,7 @@ class Search:
         return len(self.cylinders)
 
     def picture(self, row: int) -> Picture:
-        """Return what the image of a row shows, and what it should."""
+        """Return the edge pairs and predicted legs of the image of a row."""
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
         extent = sensor_extent(camera)
@@ -92,7 +92,7 @@ class Search:
         return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
 
     def edge_maps(self, rows: Sequence[int]) -> EdgeMaps:
-        """Return where the images of rows show edges of each direction, if these move."""
+        """Return the edge maps of the images of rows, without the static background."""
         views = [int(self.measurements.view[row]) for row in rows]
         factors = [self.reduction(view) for view in views]
         cameras = [self.measurements.views[view].camera for view in views]
@@ -120,12 +120,12 @@ class Search:
 
     @cached_property
     def shapes(self) -> list[tuple[Cylinder, ...]]:
-        """What each leg is recognised by: its cylinders, and housings as such."""
+        """The cylinders by which each leg is recognised, with housings as such."""
         housings = housings_of_legs(self.occluders, self.n_legs)
         return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
-        """Return what an image shows with what it should show by other cylinders."""
+        """Return the image with the legs predicted by other cylinders."""
         return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
@@ -135,7 +135,7 @@ def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cy
     A convex solid is as wide as its circumference over pi, in the mean of all directions from
     which it is seen; a square one differs from that by up to 21 %.
     """
-    found: list[list[Cylinder]] = [[] for _ in range(n_legs)]
+    housings: list[list[Cylinder]] = [[] for _ in range(n_legs)]
     for occluder in occluders:
         half = occluder.carrier
         if not isinstance(half, LegHalf):
@@ -147,8 +147,8 @@ def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cy
         radius = around / (2.0 * np.pi)
         off = float(np.linalg.norm(hull.mean(axis=0)))
         if off <= HOUSING_OFF * radius and end - start >= HOUSING_LENGTH * radius:
-            found[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
-    return found
+            housings[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
+    return housings
 
 
 def sensor_extent(camera: Camera) -> Array:
@@ -199,7 +199,7 @@ def placed_arms(
     radii: Mapping[tuple[int, str], float] = MappingProxyType({}),  # of those that a fit has seen
 ) -> dict[int, PlacedArm]:
     """Return the arms that are cylinders, by the legs that have them as parts."""
-    found = {}
+    arms = {}
     for j, ends in arms_at(legs, q).items():
         actuator = legs[j].actuator
         if actuator is not None and actuator.arm is not None:
@@ -208,8 +208,8 @@ def placed_arms(
             seen = radii.get((j, actuator.arm.link))
             arm = actuator.arm if seen is None else replace(actuator.arm, radius=seen)
             error = PREDICTED_JOINT_ERROR if seen is None else 0.0
-            found[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends[pose], error)
-    return found
+            arms[j] = PlacedArm(actuator.joint, cylinder_of_arm(arm), ends[pose], error)
+    return arms
 
 
 class NotPlaced(NamedTuple):
@@ -243,7 +243,7 @@ class Placement:
     moved: Array | None = None
     radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, NotPlaced] = field(default_factory=dict)  # by the names of views
-    notes: tuple[str, ...] = ()  # what else a reader should know
+    notes: tuple[str, ...] = ()  # further notes
     # What is said of images that show little or nothing of the legs, by row: near a fit they may
     # show more
     barely: Mapping[int, Cause] = field(default_factory=dict)
@@ -252,7 +252,7 @@ class Placement:
 
     @cached_property
     def shift(self) -> Array:
-        """How far A and B are in each view from the nominal model, (n_views, n_legs, 2, 3) [m]."""
+        """Shift of A and B from the nominal model in each view, (n_views, n_legs, 2, 3) [m]."""
         if self.moved is None:
             return np.zeros((len(self.T_base_camera), self.A_base.shape[1], 2, 3))
         return self.moved
@@ -284,13 +284,13 @@ class Placement:
             raise NotVisible(unplaced_notes(self.unplaced))
 
     def all_notes(self, measurements: Measurements) -> tuple[str, ...]:
-        """Return what a reader should know, also of views without a camera, and of images."""
+        """Return all notes, also on views without a camera, and on images."""
         on_images = image_notes(measurements, self.barely)
         return (*unplaced_notes(self.unplaced), *self.notes, *on_images)
 
 
 def unplaced_notes(unplaced: Mapping[str, NotPlaced]) -> list[str]:
-    """Return why views have no camera, by name, one sentence a cause."""
+    """Return one sentence for each cause for which views have no camera."""
     return [
         f"{few_views(views)}{', each' * (len(views) > 1)}: {why}"
         for why, views in by_cause({one.view: one.why for one in unplaced.values()})
@@ -310,11 +310,11 @@ class Group:
 
     def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
         """Return the pictures of some rows, in the frame of the group."""
-        found = []
+        pictures_of_rows = []
         for row in rows:
             T = self.T_group_camera[self.view_of_row[row]].inv()
-            found.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
-        return found
+            pictures_of_rows.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
+        return pictures_of_rows
 
 
 def group_views(
@@ -323,7 +323,7 @@ def group_views(
     hints: Sequence[RigidTransform | None],
     joined: Joined,
 ) -> list[Group]:
-    """Return the views of rows that stand alone, and those that are joined by T_board_camera.
+    """Return the single views of rows, and groups of views related by T_board_camera.
 
     Hints are rough T_base_camera of each view.
     """
@@ -333,13 +333,15 @@ def group_views(
     groups = [[v] for v in views if v not in together] + ([together] if together else [])
     found = []
     for group in groups:
-        own = [row for row, v in view_of.items() if v in group]
+        rows_of_group = [row for row, v in view_of.items() if v in group]
         T = {v: RigidTransform.identity() for v in group}
         if joined is not None and group == together:
             T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
         given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
         hint = None if not given else given[0][0] * given[0][1].inv()
-        spread = np.unique(np.rint(np.linspace(0, len(own) - 1, min(NEAR_IMAGES, len(own)))))
-        some = [own[k] for k in spread.astype(int).tolist()]
-        found.append(Group(group, T, own, some, view_of, hint))
+        spread = np.unique(
+            np.rint(np.linspace(0, len(rows_of_group) - 1, min(NEAR_IMAGES, len(rows_of_group))))
+        )
+        some = [rows_of_group[k] for k in spread.astype(int).tolist()]
+        found.append(Group(group, T, rows_of_group, some, view_of, hint))
     return found

@@ -31,7 +31,7 @@ MIN_CROSSING = 0.03  # sine between axes seen, below which the second pair does 
 MAX_POSES = 3000  # poses of a picture
 
 
-class _Firsts(NamedTuple):
+class _FirstAssignments(NamedTuple):
     """Pairs assigned to legs, each with a lean; the turn about the leg and the place are open."""
 
     u: Array  # (n, 3) direction in the camera frame, from base to platform
@@ -102,7 +102,7 @@ def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
 
 
 def _turns(
-    firsts: _Firsts, targets: LegSegments, n: Array, w: Array, is_near: BoolArray
+    firsts: _FirstAssignments, targets: LegSegments, n: Array, w: Array, is_near: BoolArray
 ) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
     """Return the turns about a first leg that lay a second one into the plane of a second pair.
 
@@ -130,7 +130,7 @@ def _turns(
     return f, k, m, cosine, sine
 
 
-def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _Firsts:
+def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _FirstAssignments:
     """Take the best pairs for every segment, with all leans that their edges allow."""
     n = min(N_FIRST, len(pairs))
     first = pairs.take(np.arange(n))
@@ -157,7 +157,9 @@ def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _Firsts:
     i, j, lean = np.nonzero(good)
     tolerance = np.maximum(0.5 * length[j] - reach[good], 0.0) + PLACE_TOLERANCE * length[j]
     u, P = v[i, lean], z[i, j][:, None] * rays[i]
-    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, tolerance, i, j)))
+    return _FirstAssignments(
+        np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, tolerance, i, j))
+    )
 
 
 def _rays(pairs: CandidatePairs) -> Array:

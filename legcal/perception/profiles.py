@@ -123,7 +123,7 @@ def read_profiles(
 
 
 def fading(depth: NDArray[Any], end: NDArray[Any] | float) -> NDArray[Any]:
-    """Return how much pixels count at depths, where the range that is used ends at ``end`` [px].
+    """Return the weights of pixels at depths, with a used range that ends at ``end`` [px].
 
     From 1 to 0 within TAPER, half of it to either side of the end.
     """

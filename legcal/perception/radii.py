@@ -28,13 +28,13 @@ from legcal.vision.visibility import look_alike
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
 TOLERANCES = (*2 * (SEARCHING[3],), *2 * (SEARCHING[4],))  # of an axis from its pair
 MIN_MATCH_SCORE = 0.25  # score of a segment with its pair that counts
-PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
+PREFERRED = 1.15  # ratio by which a farther factor must be better than a nearer one
 MIN_CHANGE = 0.08  # from the model, as a logarithm: less does no harm
 CONVERGED = 0.02  # the same once corrected
 MIN_SIGMAS = 4.0  # standard errors
 MIN_PAIRS = 3  # pairs of a part in a view
 MAX_SPREAD = 0.025  # robust standard deviation of their logarithms: else some are of other edges
-NOISE = 0.01  # of what a view says
+NOISE = 0.01  # of a factor by one view
 CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wrong alike
 MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
 MAX_ITERATIONS = 4  # of correcting radii and placing cameras by them
@@ -81,7 +81,7 @@ class RadiusFactors:
         return RadiusFactors(more, self.common) if more else NO_RADIUS_FACTORS
 
     def of_the_same(self, step: "RadiusFactors") -> "RadiusFactors":
-        """Return what a step says of the parts whose radii this one has corrected."""
+        """Return the factors of a further step for the parts that this one has corrected."""
         if self.common:
             return step if step.common else NO_RADIUS_FACTORS
         mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
@@ -174,8 +174,8 @@ def _by_lines(pictures: Pictures, placed: CameraPoses) -> CameraPoses:
     """Return a pose by where pairs are, which widths hardly move: joints stay as in the model."""
     pose = CameraPoses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
-        found = _whatever_the_width(pictures, pose, tolerance)
-        pose = gauss_newton_step(pictures, pose, found, tolerance)
+        matches = _whatever_the_width(pictures, pose, tolerance)
+        pose = gauss_newton_step(pictures, pose, matches, tolerance)
     return pose
 
 
@@ -184,11 +184,11 @@ def _whatever_the_width(pictures: Pictures, pose: CameraPoses, tolerance: float)
     best = match_pairs(pictures, pose, tolerance)
     for factor in FACTORS[1:]:
         scaled = replace(pictures, radius=factor * pictures.radius)
-        found = match_pairs(scaled, pose, tolerance)
-        better = found.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
+        matches = match_pairs(scaled, pose, tolerance)
+        better = matches.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
         best = PairMatches(
-            np.where(better, found.score, best.score),
-            np.where(better, found.pair, best.pair),
+            np.where(better, matches.score, best.score),
+            np.where(better, matches.pair, best.pair),
             best.visible,
         )
     return best
@@ -219,7 +219,7 @@ def _logarithms(
 
 
 def _width(ends: Array, radius: float, middle: Array) -> float:
-    """Return how wide a cylinder along ends (2, 3) is seen where the axis is next to a point."""
+    """Return the apparent width of a cylinder along ends (2, 3), next to a point."""
     xy = ends[:, :2] / ends[:, 2:]
     run = xy[1] - xy[0]
     share = float((middle - xy[0]) @ run / (run @ run))
@@ -230,23 +230,23 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
 
 
 def radius_notes(
-    found: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
+    factors: RadiusFactors, legs: Sequence[str], seen_in: Mapping[LegRadius, str]
 ) -> list[str]:
-    """Return notes on radii that differ from the model; where it is seen, in words, of each."""
-    if not found.factor:
+    """Return notes on radii that differ from the model; *seen_in* names the images of each."""
+    if not factors.factor:
         return []
-    if found.common:
-        way = _away(found.common)
+    if factors.common:
+        way = _away(factors.common)
         return [
-            f"All legs are seen {way} than their radii in the model; the radii that the images "
-            "show were used; correct those of the model, or the unit and scale of the model and "
-            "the readings if the radii are right."
+            f"All legs appear {way} than in the model; the radii found in the images were used. "
+            "Correct the radii of the model, or, if these are right, the unit and scale of the "
+            "model and the readings."
         ]
     return [
-        f"{legs[leg]} may be {_away(factor)} than in the model: found a radius of about "
-        f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, given {1e3 * radius:.2f} mm, "
-        "and used what these images show; measure the leg, and correct the model if it is so."
-        for (leg, radius), factor in sorted(found.factor.items())
+        f"{legs[leg]} may be {_away(factor)} than in the model: its radius is about "
+        f"{1e3 * factor * radius:.1f} mm in {seen_in[leg, radius]}, not {1e3 * radius:.2f} mm; the "
+        "measured radius was used; measure the leg, and correct the model if confirmed."
+        for (leg, radius), factor in sorted(factors.factor.items())
     ]
 
 

@@ -59,7 +59,7 @@ from legcal.workers import Run, in_turn
 
 MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
-MIRRORED_EDGES = 1.06  # legs along edges of mirrored pictures, in those of the pictures
+MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
 # Of the joint centres of a leg that a view shows: at least, besides standard deviations
@@ -73,10 +73,9 @@ MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of
 RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 TWO_POSES = (
-    "its camera could not be placed: found two poses at which its images show the legs about as "
-    "well ({:.1f} and {:.1f} legs an image; {:.0f} mm and {:.0f} deg apart), needed one; add "
-    "images at readings that differ more between the legs, or clicks on its joints "
-    f"({LANDMARKS_NAME})."
+    "its camera could not be placed: two poses explain its images about equally well ({:.1f} and "
+    "{:.1f} legs per image; {:.0f} mm and {:.0f} deg apart); add images at readings that differ "
+    f"more between the legs, or clicks on its joints ({LANDMARKS_NAME})."
 )
 
 
@@ -142,7 +141,7 @@ class PlacedViews:
     def with_other_radii(
         self, suspects: Collection[LegRadius], run: Run = in_turn
     ) -> Placement | None:
-        """Return the same with other radii of some parts, by leg and radius [m]; None without any.
+        """Return the recognition with other radii of parts, by leg and radius [m]; None without.
 
         Their outlines were not found with those of the model.
         """
@@ -155,12 +154,12 @@ class PlacedViews:
         return _gathered(replace(self, placed=placed), radii, run)
 
     def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
-        """Return the pictures of a group, all of them or those of some rows."""
+        """Return the images of a group, all of them or of some rows."""
         group = self.groups[g]
         return group.pictures(self.pictures, group.rows if rows is None else rows)
 
     def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> PlacedViews:
-        """Return what images show and should show by other cylinders of the legs."""
+        """Return images with the legs predicted by other cylinders."""
         search = replace(self.search, cylinders=cylinders)
         pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
         return replace(self, search=search, pictures=pictures)
@@ -196,7 +195,7 @@ class PlacedViews:
 
     @property
     def support(self) -> float:
-        """How many legs agree in a picture, over all groups that were placed."""
+        """Number of legs that agree in an image, over all placed groups."""
         return sum(float(one.support[0].mean()) for one in self.placed if one.is_convincing)
 
     def decided_by_outlines(self, g: int) -> PoseCandidates:
@@ -229,13 +228,13 @@ class PlacedViews:
 def _pictures(
     search: Search, rows: Sequence[int], progress: Callable[[int], None] | None, run: Run
 ) -> dict[int, Picture]:
-    """Return what the images of rows show, and what they should."""
-    found = {}
+    """Return edge pairs and predicted legs of the images of rows."""
+    pictures = {}
     for row, picture in zip(rows, run(search.picture, rows), strict=True):
-        found[row] = picture
+        pictures[row] = picture
         if progress is not None:
             progress(row)
-    return found
+    return pictures
 
 
 class _ByEdges(NamedTuple):
@@ -280,7 +279,7 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
         return near
     if len(near.poses) == 0:
         return anywhere
-    mean = [float(found.support[0].mean()) for found in (near, anywhere)]
+    mean = [float(candidates.support[0].mean()) for candidates in (near, anywhere)]
     return anywhere if mean[1] > 1.1 * mean[0] else near
 
 
@@ -344,7 +343,7 @@ class _Trial:
 
     @property
     def evidence(self) -> float:
-        """How much they support it."""
+        """Their support."""
         return 0.0 if self.fit is None else self.fit.evidence
 
 
@@ -368,7 +367,7 @@ def _best(trials: Sequence[_Trial]) -> int:
 
 
 def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Group) -> bool:
-    """Say whether outlines support one pose, and not nearly as much for another one."""
+    """Return whether outlines support one pose clearly more than any other."""
     best = _best(trials)
     others = [
         trial.evidence
@@ -388,7 +387,7 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
 
 
 def _same(one: Outlines, other: Outlines) -> bool:
-    """Say whether two poses have most legs at the same places."""
+    """Return whether two poses have most legs in the same positions."""
     where = [
         {
             (row, leg, part, edge): middle
@@ -405,14 +404,14 @@ def _same(one: Outlines, other: Outlines) -> bool:
 
 
 def _gap(one: Array, other: Array) -> float:
-    """Return how far the middle of a line (2, 2) is from another line [px]."""
+    """Return the distance of the middle of a line (2, 2) from another line [px]."""
     along = other[1] - other[0]
     step = one.mean(axis=0) - other[0]
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
 
 
 def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
-    """Put the views together, with the reasons of those that could not be placed."""
+    """Assemble the placement of all views, with the causes of unplaced ones."""
     search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
     T, unplaced = list(found.hints), dict[str, NotPlaced]()
@@ -449,37 +448,35 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
 
 
 def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> Cause:
-    """Return why a view could not be placed."""
+    """Return the cause for which a view could not be placed."""
     if is_mirrored:
         return Cause(
-            "its camera could not be placed: found that its images show the legs if "
-            "left and right are exchanged, needed photographs as the camera took them; replace "
-            "mirrored images by the originals, or check what may look the same: the order of the "
-            "columns of readings, and the signs of y in the model."
+            "its camera could not be placed: its images show the legs only if left and right are "
+            "swapped; replace mirrored images with the originals, or check what looks the same: "
+            "the order of the columns of readings, and the signs of y in the model."
         )
     where = "near its rough pose or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:
         return Cause(
-            "its camera could not be placed: found no pair of edges in its images "
-            "that could be a leg, needed legs; check that the photographs show the machine, "
-            "sharp and neither black nor overexposed."
+            "its camera could not be placed: no pair of edges in its images could be a leg; check "
+            "that the photographs show the machine, sharp and neither black nor overexposed."
         )
     legs, n = float(placed.support[0].mean()), float(placed.expected[0].mean())
     clicked = "" if hinted else f"; or click its joints ({LANDMARKS_NAME})"
     if not placed.is_enough:
         return Cause(
-            f"its camera could not be placed: found no pose {where} at which its images show the "
-            "legs (at the best one {:.1f} of {:.0f} legs an image), needed {:.1f}; check that the "
-            "images belong to this machine and to their readings, that they are no mirror images, "
-            f"the camera file, and the legs of the view if dataset.yaml names them{clicked}.",
+            f"its camera could not be placed: no pose {where} explains its images: the best one "
+            "matches {:.1f} of {:.0f} legs per image, and {:.1f} are needed; check that the images "
+            "belong to this machine and to their readings, that they are not mirrored, the camera "
+            f"file, and the legs of the view if dataset.yaml lists them{clicked}.",
             (legs, n, float(placed.needed)),
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
         return Cause(
-            f"its camera could not be placed: found too few outlines at the pose {where} at which "
-            "its images show {:.1f} of {:.0f} legs an image, needed more than other edges in the "
-            "images make as well; add images at other readings, in better light, or clicks on its "
-            f"joints ({LANDMARKS_NAME}).",
+            f"its camera could not be placed: too few outlines were measured at the best pose "
+            f"{where}, which matches {{:.1f}} of {{:.0f}} legs per image, to distinguish it from "
+            "other edges in the images; add images at other readings, in better light, or clicks "
+            f"on its joints ({LANDMARKS_NAME}).",
             (legs, n),
         )
     other = placed.pose(1)

@@ -71,7 +71,7 @@ class Saddles:
     # (n,) half of the step over an edge [grey levels]; positive if it is bright where both sides,
     # clockwise from the axes as the image shows them, are
     contrast: Array
-    misfit: Array  # (n,) what the model leaves over (root mean square), as a part of the contrast
+    misfit: Array  # (n,) residual of the model (root mean square), over the contrast
     found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
 
     def choose(self, rows: IntArray | BoolArray) -> Saddles:
@@ -91,7 +91,7 @@ def fit_saddles(
     band: float,  # how far from the edges nothing else is printed [unit]
     blur: float = 0.0,  # of crossings of this image, if it is known [px]
 ) -> Saddles:
-    """Return where two edges cross near some pixels."""
+    """Return the crossings of two edges near some pixels."""
     if not len(start):
         none = np.zeros(0)
         return Saddles(np.zeros((0, 2)), none, none, none, none, np.zeros(0, dtype=np.bool_))
@@ -144,12 +144,12 @@ def near_saddles(
         half = int(np.clip(_ROUGH_PART * np.nanmedian(free), *_ROUGH_HALF)) if len(free) else 0
         height, width = grey.shape
         inside = np.all((start > half) & (start < [width - half - 1, height - half - 1]), axis=1)
-    found = start.copy()
+    nearest = start.copy()
     if inside.any():
         at = np.ascontiguousarray(start[inside], dtype=np.float32)
-        found[inside] = cv2.cornerSubPix(grey, at, (half, half), (-1, -1), _ROUGH_ENDS)
-    moved = np.linalg.norm(found - start, axis=1)
-    return np.where((moved < most)[:, None], found, start)
+        nearest[inside] = cv2.cornerSubPix(grey, at, (half, half), (-1, -1), _ROUGH_ENDS)
+    moved = np.linalg.norm(nearest - start, axis=1)
+    return np.where((moved < most)[:, None], nearest, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,27 +348,29 @@ def _judged(
     narrow = c[:, 3] + 0.5 * (c[:, 6] + c[:, 7])
     slope = narrow / s + (0.5 * (c[:, 6] + c[:, 7]) + c[:, 8]) / np.hypot(s, _MASK_RADIUS)
     slope /= np.where(contrast == 0.0, 1.0, contrast)
-    found = count >= _MIN_PIXELS
-    found &= np.linalg.norm(x[:, :2], axis=1) < MAX_SHIFT_PX
-    found &= (turn < _MAX_TURN) & (size * window.scale > MIN_CONTRAST)
-    found &= (rms < _MAX_MISFIT * size) & (slope > 1.0 / _BLURS[1])
+    are_found = count >= _MIN_PIXELS
+    are_found &= np.linalg.norm(x[:, :2], axis=1) < MAX_SHIFT_PX
+    are_found &= (turn < _MAX_TURN) & (size * window.scale > MIN_CONTRAST)
+    are_found &= (rms < _MAX_MISFIT * size) & (slope > 1.0 / _BLURS[1])
     variance = np.zeros(n)
-    if found.any():
-        used = weight[found] > 0.0
-        variance[found] = _variance(pull[found], used, residual[found], rms[found], window.side)
-    found &= variance < MAX_SHIFT_PX**2
+    if are_found.any():
+        used = weight[are_found] > 0.0
+        variance[are_found] = _variance(
+            pull[are_found], used, residual[are_found], rms[are_found], window.side
+        )
+    are_found &= variance < MAX_SHIFT_PX**2
     return Saddles(
         start + x[:, :2],
         np.hypot(np.sqrt(variance), _MIN_SIGMA_PX),
         1.0 / np.maximum(slope, 1e-3),
         contrast * window.scale,
         rms / size,
-        found,
+        are_found,
     )
 
 
 def _pull(A: _Levels, N: Array) -> Array:
-    """Return how levels move the place, (n, 2, m), by all derivatives of the model (n, k, m)."""
+    """Return derivatives of the position by grey levels, (n, 2, m), from the model's (n, k, m)."""
     n, k, _ = A.shape
     size = np.maximum(np.trace(N, axis1=1, axis2=2) / k, 1e-9)
     N = N.copy()

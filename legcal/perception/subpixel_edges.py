@@ -28,7 +28,7 @@ ROUNDS, ROUNDS_NEAR = (1, 2), (2,)  # of estimates of the blur, and of one near 
 LAST_ROUNDS = 2  # most rounds of lines
 MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
-WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
+WIDENING = 1.3  # of the standard deviations of a fit of all blocks, whose errors are correlated
 POOLED_COMMON_BIAS, POOLED_TILT_BIAS = 0.012, 0.02  # of such a fit: of both ends, of each [px]
 
 

@@ -8,48 +8,48 @@ and calibrates small sessions.
 
 # Recognition: edge pairs, and camera poses by them
 
-# Of an edge in the reduced picture, at least [reduced px].
+# Minimum length of an edge in the reduced image [reduced px].
 EDGE_LENGTH = 14.0
-# Slopes of an edge in those of the median pixel, from which on it is no noise.
+# Minimum slope of an edge, over the slope of the median pixel.
 EDGE_SLOPE = 2.5
-# Of the width of an edge pair and of that of its leg: relative, one standard deviation.
+# Relative difference of the widths of an edge pair and its leg, one standard deviation.
 WIDTH_ERROR = 0.08
-# Of an axis beside its edge pair where a search of cameras begins [leg lengths].
+# Distance of an axis from its edge pair at the start of a camera search [leg lengths].
 AXIS_TOLERANCE = 0.12
-# Of the joints of the nominal model, one standard deviation [leg lengths].
+# Error of the joints of the nominal model, one standard deviation [leg lengths].
 JOINT_ERROR = 0.015
-# Of the legs that a picture should show: the share that accepts a camera pose.
+# Share of the predicted legs that accepts a camera pose.
 SUPPORT = 0.2
-# Of the best camera pose over the next one, in legs of all images together.
+# Lead of the best camera pose over the next one, in legs of all images together.
 LEAD = 0.6
-# Of the evidence of outlines for a camera pose over that for another one.
+# Ratio of the evidence of outlines for the best camera pose and for the next one.
 EVIDENCE_RATIO = 1.6
-# Of outlines for a camera pose, at least: halves of squared standard deviations.
+# Minimum evidence of outlines for a camera pose: halves of squared standard deviations.
 EVIDENCE = 8.0
-# Of a leg in an image from the fit of its view, beyond which it is left out [standard deviations].
+# Distance of a leg in an image from the fit of its view: rejected beyond [standard deviations].
 OUTLIER_SIGMAS = 3.5
-# Of the outlines that other images of a view show: an image with a smaller share is wrong.
+# Share of outlines over the share in other images of a view: below, an image is wrong.
 SHARE_OF_OTHERS = 0.5
 
 # Measurement: outlines near a camera pose
 
-# Around a predicted outline besides what errors of joints make, in which it is looked for [px].
+# Search window around a predicted outline, in addition to errors of joints [px].
 WINDOW_PX = 3.0
-# Mean sharpness of the blocks of an edge of a pair, from 0 to 1, at least.
+# Minimum mean sharpness of the blocks of an edge of a pair, from 0 to 1.
 EDGE_SCORE = 0.15
-# Of the score of an edge, which no other line near it may reach where it stands alone.
+# Part of the score of a single edge that no other line near it may reach.
 RIVAL = 0.6
-# Step of light at an outline [grey levels], at least.
+# Minimum step of light at an outline [grey levels].
 CONTRAST = 4.0
-# Of the blocks of an edge from its line, one standard deviation at most [px].
+# Maximum scatter of the blocks of an edge about its line, one standard deviation [px].
 SCATTER_PX = 0.6
-# Of the blocks that show an edge, the share that lies on its line.
+# Minimum share of the blocks of an edge on its line.
 INLIER_SHARE = 0.6
-# Of the distance of two outlines from the predicted width [px], beside 3.5 % of it.
+# Tolerance of the width between two outlines [px], in addition to 3.5 % of it.
 WIDTH_PX = 0.7
-# Width of the biweight by which blocks of a line are weighted [standard deviations].
+# Width of the biweight of the blocks of a line [standard deviations].
 BLOCK_SIGMAS = 4.0
-# Of an outline: what its covariance leaves out where views are fitted, as a wrong gamma [px].
+# Error of outlines beyond their covariance in fits of views, such as a wrong gamma [px].
 OUTLINE_SIGMA_PX = 0.3
 
 # Of axes beside edge pairs, all made from AXIS_TOLERANCE [leg lengths]: from where a search of

@@ -81,7 +81,7 @@ class ViewFit:
     row: IntArray  # (n,) legs in images that have outlines
     leg: IntArray  # (n,)
     n_outlines: IntArray  # (n,) how many of each
-    offset: Array  # (n, 3) what their images add to B [m]
+    offset: Array  # (n, 3) shift of B in their images [m]
     distance: Array  # (n,) how far their outlines are from the fit, in standard deviations
     middle: Array  # (3,) of the machine in the base link [m]
     evidence: float  # what it is worth that each outline was found near where the fit has it, less
@@ -121,11 +121,11 @@ class ViewFit:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What the fit of a group moves."""
+    """The unknowns of the fit of a group."""
 
     pose: Frames  # (1,) of the machine in the frame of the group, its origin at the middle
     shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
-    offset: Array  # (n_items, 3) what its image adds to B of each leg [m]
+    offset: Array  # (n_items, 3) shift of B of each leg in its image [m]
 
 
 def fit_view(
@@ -308,7 +308,7 @@ def _squared_distances(
 def _evidence(
     lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float, size: float
 ) -> float:
-    """Return how much outlines support a state, each leg of an image by itself."""
+    """Return the evidence of outlines for a state, by leg and image."""
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
@@ -317,12 +317,12 @@ def _evidence(
 
 
 def min_evidence(group: Group) -> float:
-    """Return how much evidence outlines must give: more images agree more by chance."""
+    """Return the required evidence of outlines: more images agree more by chance."""
     return EVIDENCE * (1.0 + EVIDENCE_OF_IMAGE * len(group.rows))
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
-    """Return how well a fit knows where legs are seen, (n_rows, n_legs) [px].
+    """Return the standard deviations of predicted legs in images, (n_rows, n_legs) [px].
 
     One standard deviation across each leg, at the joint where it is known worse; infinite for
     legs that reach behind the camera, and in images of other views.
@@ -380,7 +380,7 @@ class _Lines:
     whitening: Array  # (n, 2, 2)
     item_row: IntArray  # (n_items,)
     item_leg: IntArray
-    first: IntArray  # (n_items,) its first outline: those of an item follow each other
+    first: IntArray  # (n_items,) its first outline; the outlines of an item are consecutive
     size: IntArray  # (n_items,) offsets that were measured
 
     @property
@@ -435,7 +435,7 @@ def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None
 def _offsets_of(
     X: Array, radius: Array, edge: IntArray, ends: Array, metric: Array
 ) -> tuple[Array, Array]:
-    """Return how far points are from outlines (n, 2) [px], and derivatives (n, 2, 2, 3) by A and B.
+    """Return the distances of points from outlines (n, 2) [px], with derivatives by A and B.
 
     Of the outlines (0 where epsilon is +1, 1 where it is -1) of cylinders with A and B (n, 2, 3) in
     the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
@@ -459,7 +459,7 @@ def _offsets_of(
 
 
 def _metric_of(camera: Camera, ends: Array) -> Array:
-    """Return what makes normals of lines (..., 2) those in the picture at points (..., 2)."""
+    """Return the matrices that map normals of lines (..., 2) into the image at points (..., 2)."""
     return np.asarray(np.swapaxes(np.linalg.inv(camera.pixels_per_unit(ends)), -1, -2))
 
 
@@ -496,10 +496,10 @@ def refine_views(
     near = replace(placement, window=_windows(search, groups, fits, outlines))
     rows = sorted(row for group in groups for row in group.rows)
     again, _ = measure_outlines(search, near, rows, method=method, run=run, progress=progress)
-    found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
-    kept = outlines.choose(~_among(outlines, found))
-    outlines = join_outlines([kept, again.choose(_among(again, found))])
-    fits = _fits(search, groups, placement, outlines, fits, {row for row, _ in found})
+    measured = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
+    kept = outlines.choose(~_among(outlines, measured))
+    outlines = join_outlines([kept, again.choose(_among(again, measured))])
+    fits = _fits(search, groups, placement, outlines, fits, {row for row, _ in measured})
     outlines, fits = _without_outliers(search, groups, placement, outlines, fits)
     placement = _without_weak_views(
         search, groups, _placed_by_fits(search, groups, placement, fits), fits
@@ -551,7 +551,7 @@ def _without_outliers(
     outlines: Outlines,
     fits: Fits,
 ) -> tuple[Outlines, Fits]:
-    """Return outlines without those of legs that do not fit, and the fits to the others."""
+    """Return outlines without legs that do not fit, and the fits to the others."""
     wrong = {
         one
         for fit in fits
@@ -560,7 +560,7 @@ def _without_outliers(
     }
     if not wrong:
         return outlines, fits
-    out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
+    out = _among(outlines, wrong) & ~is_edited(outlines)  # edited outlines stay
     outlines = outlines.reject(out, Reason.VIEW_DISAGREES)
     return outlines, _fits(search, groups, placement, outlines, fits, {row for row, _ in wrong})
 
@@ -568,7 +568,7 @@ def _without_outliers(
 def _placed_by_fits(
     search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
 ) -> Placement:
-    """Return cameras and joint centres by the fits, those of other groups as recognised."""
+    """Return cameras and joint centres by the fits; other groups stay as recognised."""
     T, shift = list(placement.T_base_camera), placement.shift.copy()
     for group, fit in zip(groups, fits, strict=True):
         if fit is not None:
@@ -614,7 +614,7 @@ def group_name(names: Sequence[str]) -> str:
 
 
 def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:
-    """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
+    """Return the tolerance of missing legs about a fit (n_rows, n_legs) [px]; NaN for others."""
     missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
     visible = ~outlines.rejected_for(Reason.OUTSIDE, Reason.NOT_PLACED)
     missing[outlines.row[visible], outlines.leg[visible]] = True
@@ -629,6 +629,6 @@ def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outl
 
 
 def _among(outlines: Outlines, legs: set[tuple[int, int]]) -> BoolArray:
-    """Return which outlines are of some legs in images, (row, leg)."""
+    """Return the mask of outlines of some legs in images, (row, leg)."""
     own = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
     return np.array([one in legs for one in own], dtype=np.bool_)

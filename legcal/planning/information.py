@@ -85,10 +85,12 @@ class PredictedNoise:
         n = len(outlines.row)
         length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
         of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
-        found = replace(outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends)
+        with_noise = replace(
+            outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends
+        )
         if self.gamma_px == 0.0:
-            return found
-        return replace(found, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
+            return with_noise
+        return replace(with_noise, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
 
 
 DEFAULT_NOISE = PredictedNoise()
@@ -102,7 +104,7 @@ class Contributions:
 
     names: tuple[str, ...]  # of m unknowns, the p coordinates of the machine first
     rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
-    prior: Array  # (m, m): what is known without images
+    prior: Array  # (m, m): prior information
     basis: Array  # (n_parameters, p): directions of the kinematic parameters
     at_site: Array  # (n_images, r) variances of what photographs of a site share, in those rows
     site: IntArray  # (n_images,)
@@ -165,7 +167,7 @@ class Predictor:
         *,
         is_fit: bool = False,
     ) -> Contributions:
-        """Return what images add to the information.
+        """Return the contribution of images to the information.
 
         With *is_fit* that of a fit that weighs outlines as if they had no errors at places, and how
         these move it.
@@ -257,7 +259,7 @@ class Predictor:
         return Contributions(named, rows, whole, basis, at_site, site, moved[..., :0])
 
     def _shifts(self, problem: FitProblem, *, are_shared: bool) -> Array:
-        """Return how errors at places move both ends of outlines (n, 2, c) [px].
+        """Return the shifts of both ends of outlines by repeated errors (n, 2, c) [px].
 
         By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
         """
@@ -277,7 +279,7 @@ def _without(U: Array, X: Array) -> Array:
 
 def _apart(
     kept: Array,  # (n, r, m)
-    U: Array,  # (n, r, d): what the pose of an image takes up
+    U: Array,  # (n, r, d): derivatives by the pose of an image
     moved: Array,  # (n, r, 2): by bias and tilt of the outline of each row
     is_outline: BoolArray,  # (r,)
 ) -> tuple[Array, Array]:
@@ -314,22 +316,22 @@ def _by_element(rows: Array, element: IntArray, n: int) -> Array:
     order = np.argsort(element, kind="stable")
     count = np.bincount(element, minlength=n)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    found = np.zeros((n, int(count.max(initial=0)), q, c))
-    found[element[order], np.arange(m) - first[element[order]]] = rows[order]
-    return found.reshape(n, -1, c)
+    padded = np.zeros((n, int(count.max(initial=0)), q, c))
+    padded[element[order], np.arange(m) - first[element[order]]] = rows[order]
+    return padded.reshape(n, -1, c)
 
 
 def _are_lengths(problem: FitProblem) -> BoolArray:
-    """Return which kept unknowns count in metres, (n_kept,)."""
-    found = np.zeros(problem.n_kept, dtype=np.bool_)
+    """Return the mask of kept unknowns in metres, (n_kept,)."""
+    are_lengths = np.zeros(problem.n_kept, dtype=np.bool_)
     for block in problem.variables:
         where = problem.where(block.name)
         if block.units:
-            found[where] = [unit == "m" for unit in block.units]
+            are_lengths[where] = [unit == "m" for unit in block.units]
         elif block.unknown.shape[1] == 6:  # motions: turns before displacements
             displaced = block.unknown[:, 3:]
-            found[where[displaced[displaced >= 0]]] = True
-    return found
+            are_lengths[where[displaced[displaced >= 0]]] = True
+    return are_lengths
 
 
 def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:

@@ -19,7 +19,7 @@ _SAME = 2.5e-6  # mean leg lengths, and entries of rotations
 _ROUNDS = 20  # of 2-opt exchanges
 
 
-def in_short_order(machine: Machine, poses: Configurations, begin: Array) -> list[int]:
+def shortest_order(machine: Machine, poses: Configurations, begin: Array) -> list[int]:
     """Return an order of poses with short motor travel, from the configuration *begin*."""
     columns = slider_columns(machine, machine.motors)[0]
     lower, upper = motor_travel(machine)

@@ -67,7 +67,7 @@ class Setting:
         focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
         return focal * float(np.tan(self.turn) + (self.shift + self.length) / nearest)
 
-    def camera_elsewhere(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
+    def perturbed_camera(self, T: RigidTransform, rng: np.random.Generator) -> RigidTransform:
         """Draw a camera pose within tolerance."""
         shift, turn = rng.normal(size=(2, 3))
         shift *= self.shift * rng.random() / np.linalg.norm(shift)
@@ -77,7 +77,7 @@ class Setting:
         )
 
 
-def usual_setting(size: float) -> Setting:
+def default_setting(size: float) -> Setting:
     """Return the default tolerances for a mean leg length *size* [m]."""
     return Setting(USUAL_SHIFT * size, USUAL_LENGTH * size, draws=USUAL_DRAWS)
 
@@ -114,10 +114,10 @@ def places_around(
     if not places:
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
         raise NotVisible(
-            f"{start} no place up to {_DISTANCES[-1] * size:.1f} m around the machine that has all "
-            f"of it in the picture, tripods set to {1e2 * setting.shift:.2g} cm and "
-            f"{np.degrees(setting.turn):g} deg, needed one; use a camera with a wider view, or "
-            "correct the focal length in its file."
+            f"{start} no position within {_DISTANCES[-1] * size:.1f} m has the whole machine in "
+            f"the image (tripod tolerance {1e2 * setting.shift:.2g} cm and "
+            f"{np.degrees(setting.turn):g} deg); use a camera with a wider view, or correct the "
+            "focal length in its file."
         )
     if bounds is None:
         return places
@@ -127,11 +127,11 @@ def places_around(
     if not inside:
         positions = np.array([place.T_base_camera.translation for place in places])
         _, distance, least = _distances(bounds.mean(axis=1), points, camera, setting)
-        direction = " that reach one"
+        direction = " to reach one"
         if distance > _FARTHER * least:
-            direction = ", nearer to the machine"
+            direction = " towards the machine"
         elif distance < min(_NEARER) * least:
-            direction = ", farther from the machine"
+            direction = " away from the machine"
         spans = [
             f"{name} {low:.2f} to {high:.2f}"
             for name, low, high in zip(
@@ -139,9 +139,9 @@ def places_around(
             )
         ]
         raise NotVisible(
-            f"{start} no place inside --bounds shows most of the machine large enough; "
-            f"places around the machine have {', '.join(spans)} m: give wider bounds{direction}, "
-            "or a camera with another view."
+            f"{start} no position inside --bounds shows most of the machine large enough; "
+            f"positions around the machine are at {', '.join(spans)} m: widen --bounds{direction}, "
+            "or use a camera with another field of view."
         )
     return inside
 
@@ -213,7 +213,7 @@ def parse_bounds(text: str) -> Array:
     if np.any(bounds[:, 0] >= bounds[:, 1]):
         raise UsageError(
             f"--bounds could not be used: found '{text}', needed the lower number first in each "
-            "pair; exchange them."
+            "pair; swap them."
         )
     return bounds
 

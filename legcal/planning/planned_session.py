@@ -40,7 +40,7 @@ class PlannedView:
     @property
     def shows(self) -> BoolArray:
         """Which legs each image shows, (n_images, n_legs)."""
-        return self.seen.legs_in(len(self.poses.poses), self.poses.readings.shape[1])
+        return self.seen.visible_legs(len(self.poses.poses), self.poses.readings.shape[1])
 
 
 def pose_labels(n_images: int, n_given: int = 0) -> list[str]:

@@ -28,7 +28,7 @@ from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchang
 from legcal.planning.goals import Workspace, criterion_of, workspace_of
 from legcal.planning.information import Contributions, Predictor
 from legcal.planning.laid_board import LaidBoard, lying
-from legcal.planning.order import in_short_order, ways
+from legcal.planning.order import shortest_order, ways
 from legcal.planning.places import (
     Place,
     Setting,
@@ -38,7 +38,7 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Bodies, Seen, what_is_seen
+from legcal.planning.sight import Bodies, Seen, visible_parts
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
 from legcal.vision.visibility import in_picture, least_length
@@ -55,7 +55,7 @@ POSE_STEP = 0.08  # of the travel
 PLACE_STEP = 0.06  # of the distance
 N_NEAR_PLACES = 8
 # Mean leg lengths: a session with a larger error, also above the model's, is refused
-_LEAST_ERROR = 0.0025
+_MIN_ERROR_LIMIT = 0.0025
 _EXTRAPOLATED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # multiples of the planned images
 _MOST_NEEDED = 100  # images, in the search for a sufficient number
 
@@ -118,7 +118,7 @@ class Scene:
         bodies = Bodies.at(self.task.machine, self.legs, poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
-        return what_is_seen(self.task.predictor.camera, T, bodies, margin)
+        return visible_parts(self.task.predictor.camera, T, bodies, margin)
 
     def board_is_shown(
         self,
@@ -249,8 +249,8 @@ def plan_session(
         if stop():
             break
         step = 0.5**turn
-        placed = search.better_places(current, step, middle)
-        polished, reached = search.better_poses(placed, step, least)
+        placed = search.improve_positions(current, step, middle)
+        polished, reached = search.improve_poses(placed, step, least)
         polished_covariance = search.expected_covariance(polished)
         if search.value_of(polished_covariance) < search.value_of(expected):
             current, value, expected = polished, reached, polished_covariance
@@ -343,12 +343,13 @@ def _visible_places(
 
 
 _REMEDIES = {
-    "elsewhere": "turn {} to the machine, or move further away",
+    "elsewhere": "point {} at the machine, or move further away",
     "near": "move {} further away, or use a camera with a wider view",
     "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
     "hidden": "move {} to where no plate or other leg is in front of the legs",
-    "board": "move {} to where all of the board is in the picture, or use a smaller one",
-    "small": "use a board of larger squares, or a camera with a longer focal length or more pixels",
+    "board": "move {} so that the whole board is in the image, or use a smaller one",
+    "small": "use a board with larger squares, or a camera with a longer focal length or more "
+    "pixels",
 }
 
 
@@ -366,10 +367,10 @@ def _no_visible_places(
     remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
     names = ", ".join(place.name for place in blind if place.name)
     return (
-        f"{scene.task.machine.yaml_path}: no session could be planned: {n_places - len(blind)} of "
-        f"{n_places} camera places see legs{board} for every tripod within "
-        f"{1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg, needed {needed}; "
-        f"{remedy.format(names or 'the places')}."
+        f"{scene.task.machine.yaml_path}: no session could be planned: only "
+        f"{n_places - len(blind)} of {n_places} camera positions see legs{board} with the tripod "
+        f"tolerance of {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg; {needed} "
+        f"{'are' if needed > 1 else 'is'} needed; {remedy.format(names or 'the cameras')}."
     )
 
 
@@ -501,8 +502,8 @@ class _Search:
         if sum(count) < task.n_images:
             raise NotVisible(
                 f"{machine.yaml_path}: no session could be planned: only {sum(count)} images from "
-                f"{len(current)} places show legs and the board, needed {task.n_images}; plan "
-                "fewer --images, more --cameras, or a board of another size."
+                f"{len(current)} camera positions show legs and the board, {task.n_images} are "
+                "needed; plan fewer --images, more --cameras, or a board of another size."
             )
         least = 0 if task.hand_held else max(1, int(MIN_SHARE * task.n_images / task.n_views))
         least = min([least, *count])
@@ -521,7 +522,7 @@ class _Search:
     def _refuse_undetermined(self, session: Session) -> None:
         """Refuse a session that does not improve the model; state a sufficient number of images."""
         task, work, basis = self.task, self.work, self.basis
-        limit = max(task.setting.length, _LEAST_ERROR * task.machine.size)
+        limit = max(task.setting.length, _MIN_ERROR_LIMIT * task.machine.size)
 
         def error_of(S: Array) -> Array:
             """Error of the platform, or the criterion if readings do not determine its pose."""
@@ -544,20 +545,20 @@ class _Search:
             is_enough=lambda error: error < limit,
         )
         n = max(len(more.images), task.n_images + 1)
-        places = f"{task.n_views} place{'s' * (task.n_views != 1)}"
+        places = f"{task.n_views} camera position{'s' * (task.n_views != 1)}"
         remedy = (
             f"plan {n} --images or more"
             if more.value < limit
             else "plan more --cameras, or --board"
         )
-        needed = f"at least {n}" if more.value < limit else "more places"
+        needed = f"at least {n} images" if more.value < limit else "more positions"
         raise NotIdentifiable(
             f"{task.machine.yaml_path}: no session could be planned: {task.n_images} "
-            f"image{'s' * (task.n_images != 1)} from {places} would not improve on the accuracy of "
-            f"the model, needed {needed}; {remedy}."
+            f"image{'s' * (task.n_images != 1)} from {places} would not improve on the nominal "
+            f"model; {needed} are needed; {remedy}."
         )
 
-    def better_places(
+    def improve_positions(
         self, current: Sequence[Candidates], step: float, target: Array
     ) -> list[Candidates]:
         """Local search over camera places, poses unchanged."""
@@ -577,7 +578,7 @@ class _Search:
                     current[v], contributions[v], value = trial, added, trial_value
         return current
 
-    def better_poses(
+    def improve_poses(
         self, current: Sequence[Candidates], step: float, least: int
     ) -> tuple[list[Candidates], float]:
         """Exchange poses with poses nearby; also return the criterion."""
@@ -624,7 +625,7 @@ class _Search:
         ordered, begin = list[Configurations](), machine.home_configuration
         for candidates in current:
             ordered.append(
-                some_of(candidates.poses, in_short_order(machine, candidates.poses, begin))
+                some_of(candidates.poses, shortest_order(machine, candidates.poses, begin))
             )
             begin = ordered[-1].configurations[-1]
         via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
@@ -638,8 +639,8 @@ class _Search:
         notes = []
         if blocked:
             notes.append(
-                f"No free path was found to {blocked} of the poses, not even through home: move "
-                "the machine there manually, away from singularities and collisions."
+                f"No collision-free path was found to {blocked} of the poses, not even through "
+                "home: move the machine there manually, away from singularities and collisions."
             )
         if not machine.is_determined:
             notes.append(f"Readings do not determine the pose: {machine.undetermined}.")
@@ -668,14 +669,14 @@ class _Search:
             notes=tuple(notes),
         )
 
-    def _growth(self, found: Sequence[Contributions]) -> Array:
+    def _growth(self, contributions: Sequence[Contributions]) -> Array:
         """Numbers of images and their criterion, (n, 2), extrapolated beyond the plan."""
-        n = sum(len(part.rows) for part in found)
-        session = Session(found, self.given)
+        n = sum(len(part.rows) for part in contributions)
+        session = Session(contributions, self.given)
         order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
         rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
         for times in _EXTRAPOLATED:
-            more = [part.repeated(times) for part in found]
+            more = [part.repeated(times) for part in contributions]
             rows.append((round(times * n), self.value(more)))
         return np.array(rows)
 
@@ -691,7 +692,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
             for k in range(len(view.poses.poses))
         ]
         labels = pose_labels(len(views), task.n_given)
-        return tuple(replace(view, name=own) for view, own in zip(views, labels, strict=True))
+        return tuple(replace(view, name=label) for view, label in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
     return tuple(view if view.name else replace(view, name=next(free)) for view in views)
@@ -706,7 +707,7 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
         if machine.is_determined:
             poses = poses_at_readings(machine, scene.legs, candidates.poses.readings, nearby)
         T = candidates.place.T_base_camera
-        T = T if is_set else task.setting.camera_elsewhere(T, rng)
+        T = T if is_set else task.setting.perturbed_camera(T, rng)
         added = scene.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
         if added is not None:
             parts.append(added)

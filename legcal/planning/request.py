@@ -26,7 +26,7 @@ from legcal.planning.places import (
     MAX_LENGTH,
     Place,
     Setting,
-    usual_setting,
+    default_setting,
 )
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
@@ -129,7 +129,7 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
-    setting = usual_setting(machine.size) if setting is None else setting
+    setting = default_setting(machine.size) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
     n_images = _n_images(images, images_per_view, n_views, target)
@@ -187,9 +187,9 @@ def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[s
     rod, ends = rod_and_ends
     sigma = SIGMA_LENGTH * machine.size
     return Choices(priors={f"{rod.name}.length": Prior(rod.q0, sigma)}), (
-        f"Readings of motors that turn carry no length: the plan counts on the rod of {rod.name} "
-        f"measured to {1e3 * sigma:.2g} mm (legcal calibrate --length "
-        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * sigma:.2g}mm, with what you measure).",
+        f"Angle readings do not determine the scale; the plan assumes that the rod of {rod.name} "
+        f"is measured to {1e3 * sigma:.2g} mm (legcal calibrate --length "
+        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * sigma:.2g}mm, with the measured value).",
     )
 
 
@@ -206,8 +206,8 @@ def _plan_for_target(
         candidate = plan_session(replace(task, n_images=n), progress, stop, run)
         if candidate.error is None:
             raise UsageError(
-                f"--target could not be used: {task.machine.undetermined}, so that the error of "
-                "the platform is not predicted; give --images."
+                f"--target could not be used: {task.machine.undetermined}, so the error of the "
+                "platform cannot be predicted; give --images."
             )
         error = candidate.error.mean_displacement
         if error <= target:
@@ -255,12 +255,12 @@ def _unreachable_target(task: Task, planned: Plan, target: float) -> str:
     more = ""
     n, value = planned.growth[planned.growth[:, 0] <= MOST_IMAGES][-1]
     if n > planned.n_images:
-        more = f" and about {1e3 * error * value / planned.value:.3f} mm with {n:.0f} of their kind"
+        more = f", about {1e3 * error * value / planned.value:.3f} mm with {n:.0f} similar ones"
     return (
-        f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm could not be planned: found "
-        f"{1e3 * error:.3f} mm with {planned.n_images} images{more}, limited by {limit}, needed "
-        "fewer such errors; use better light or a camera of a longer focal length, more --cameras, "
-        "--board, or a larger --target."
+        f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm cannot be reached: "
+        f"{1e3 * error:.3f} mm are expected with {planned.n_images} images{more}, limited by "
+        f"{limit}; use better light or a longer focal length, more --cameras, --board, or a larger "
+        "--target."
     )
 
 
@@ -275,9 +275,8 @@ def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
         )
     if hand_held and cameras is not None and cameras > 1:
         raise UsageError(
-            f"The plan could not be made: found --hand-held and {cameras} cameras, needed one of "
-            "the two, a camera in the hand takes every image from a place of its own; leave out "
-            "--cameras."
+            f"--hand-held and --cameras {cameras} cannot be combined: a hand-held camera has a new "
+            "pose for every image; leave out --cameras."
         )
     return 1 if hand_held else n
 
@@ -286,13 +285,12 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
     """Return the checked number of photographs of the session."""
     if images is not None and per_view is not None:
         raise UsageError(
-            f"The plan could not be made: found {images} images and {per_view} images per view, "
-            "needed one of the two; leave out --images-per-view, or --images."
+            f"--images {images} and --images-per-view {per_view} cannot be combined; leave out one "
+            "of them."
         )
     if target is not None and (images is not None or per_view is not None):
         raise UsageError(
-            "The plan could not be made: found a target and a number of images, needed one of the "
-            "two; leave out --target, or the number."
+            "--target and a number of images cannot be combined; leave out --target, or the number."
         )
     if per_view is not None:
         return n_views * _checked_number("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
@@ -330,12 +328,12 @@ def _check(
         )
     if bounds is not None and places:
         problems.append(
-            f"{start} bounds and a list of places, needed one of the two; leave out --bounds."
+            "--bounds and a list of camera positions cannot be combined; leave out --bounds."
         )
     if hand_held and board is None:
         problems.append(
-            f"{start} a camera in the hand without a board, needed a calibration board on the base "
-            "in every image, which alone tells where it was; describe it with --board."
+            "--hand-held needs a calibration board on the base in every image, from which the "
+            "camera poses follow; describe it with --board."
         )
     for quantity, error, most, unit in (
         ("a model error of", setting.length, MAX_LENGTH * size, "m"),

@@ -147,14 +147,14 @@ class Seen:
             self.length_px[selected],
         )
 
-    def legs_in(self, n_images: int, n_legs: int) -> BoolArray:
+    def visible_legs(self, n_images: int, n_legs: int) -> BoolArray:
         """Return a mask of the legs in each image, (n_images, n_legs)."""
         shown, along = np.zeros((n_images, n_legs), dtype=np.bool_), ~self.is_arm
         shown[self.image[along], self.leg[along]] = True
         return shown
 
 
-def what_is_seen(
+def visible_parts(
     camera: Camera,
     T_base_camera: RigidTransform,
     bodies: Bodies,

@@ -61,7 +61,7 @@ class PlannedSession:
                     "needed where its camera stands; write it into dataset.yaml, or plan again."
                 )
             for _ in range(MAX_HAND_DRAWS if self.hand else 1):
-                moved, board = self.setting.camera_elsewhere(T, rng), self.board
+                moved, board = self.setting.perturbed_camera(T, rng), self.board
                 if not self.hand or board is None:
                     break
                 if board.is_enough(board.seen(posed_machines[poses[0]], view.camera, moved)):

@@ -1,4 +1,4 @@
-"""What is wrong with a session that images contradict: common mistakes tried, the best one named.
+"""Diagnosis of a session that its images contradict: the common mistake that fits best.
 
 Every mistake is undone in turn, and the images say how well they agree then (how many of the legs
 that they should show are there, with cameras placed anywhere). A few images of the views that
@@ -83,7 +83,7 @@ _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What looks wrong with a session.
+    """The likely mistake of a session.
 
     Attributes
     ----------
@@ -93,20 +93,20 @@ class Diagnosis:
     what : str
         The same as a clause that names columns, views and legs.
     same_as : tuple of str
-        Clauses of what images cannot tell from it: one of each kind, then more of these kinds, the
-        commoner first.
+        Clauses of mistakes that images cannot distinguish from it: one of each kind, then more of
+        these kinds, the commoner first.
     n_kinds : int
-        How many of these the sentence has.
+        Number of these in the sentence.
     mended : str
-        What it would take.
+        The correction, as a clause: "with the columns swapped".
     images, before, after : int
-        How many images judged, how many of them agree as things are, and how many without it.
+        Number of judged images, and of those that agree without and with the correction.
     score : float
-        Share of the legs that images then show where they should.
+        Fraction of the predicted legs that images show with the correction.
     remedy : str
-        What to do.
+        The remedy, as an imperative.
     tests : tuple of str
-        What would tell it from what it is the same as.
+        Tests that distinguish it from the mistakes of ``same_as``.
     """
 
     kind: str
@@ -123,25 +123,25 @@ class Diagnosis:
 
     @property
     def finding(self) -> str:
-        """What looks wrong and how many images say so, as a clause."""
+        """The mistake and the number of images that agree, as a clause."""
         more = len(self.same_as) - self.n_kinds
         others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
-        others += f", or {more} more that {'is' if more == 1 else 'are'} alike" * (more > 0)
-        rest = " (what the others show may have another cause as well)"
+        others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
+        rest = " (the other images may have a further problem)"
         return (
             f"{self.what}{others}: {self.mended}, {self.after} of {self.images} images agree"
-            f"{rest * (self.after < _MIN_SHARE * self.images)}, as it is {self.before}"
+            f"{rest * (self.after < _MIN_SHARE * self.images)}, against {self.before} now"
         )
 
     @property
     def remedies(self) -> str:
-        """What to do, and what would tell it from what it is the same as."""
-        tell = f". To tell these apart, {', or '.join(self.tests)}" if self.tests else ""
+        """What to do, and the tests that distinguish it from similar mistakes."""
+        tell = f". To distinguish them, {', or '.join(self.tests)}" if self.tests else ""
         return f"{self.remedy}{tell}"
 
     @property
     def sentence(self) -> str:
-        """The diagnosis for people."""
+        """The diagnosis as a message."""
         return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
 
     def document(self) -> DiagnosisBlock:
@@ -158,10 +158,10 @@ class Diagnosis:
 
 
 def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
-    """Return what looks wrong with a session, the likeliest first; nothing where nothing does.
+    """Return the likely mistakes of a session, the likeliest first; empty if none is likely.
 
-    Views of one or two images that no board joins to others say nothing: some camera pose fits them
-    whatever is assumed.
+    Views of one or two images that no board relates to others do not count: some camera pose fits
+    them under any hypothesis.
     """
     machine = data.machine
     rows = _rows_seen(data)
@@ -191,15 +191,15 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
 
 
 def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
-    """Return notes on images; only how many there are beside a diagnosis, of which most follow.
+    """Return notes on images; only their number beside a diagnosis, from which most follow.
 
-    They would accuse others. *job* is what to run again: ``legcal doctor``.
+    They would blame the wrong images. *job* is the command to run again: ``legcal doctor``.
     """
     if not (diagnosis and notes):
         return list(notes)
     return [
-        f"{len(notes)} more thing{'s' * (len(notes) != 1)} that images contradict may come from "
-        f"what looks wrong above: mend that, then run {job} again."
+        f"{len(notes)} further problem{'s' * (len(notes) != 1)} may have the same cause: correct "
+        f"the problem above first, then run {job} again."
     ]
 
 
@@ -221,7 +221,7 @@ def _rows_seen(data: OrderedDataset) -> IntArray:
 
 
 def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
-    """Return the views that can judge, those that show the board on the base together."""
+    """Return groups of views with enough images; views of the board on the base form one."""
     try:
         board = observe_board(data)
     except LegcalError:  # told by others; views judge alone then
@@ -233,7 +233,7 @@ def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
 
 
 class _Judge:
-    """The images of groups of views, and what they say of assumptions."""
+    """Judges hypotheses by the images of groups of views."""
 
     def __init__(self, data: OrderedDataset, groups: Sequence[Group]) -> None:
         self.data, self.groups = data, groups
@@ -255,7 +255,7 @@ class _Judge:
         self.symmetries = symmetries(data.machine)
 
     def shifted_from_a_row_on(self) -> list[Mistake]:
-        """Return where rows of single views may begin to stand late or early: the likeliest row.
+        """Return shifts by a row that begin within a view, each at its likeliest row.
 
         Images before it agree as they are, those from it on with the readings of the next row.
         """
@@ -276,7 +276,7 @@ class _Judge:
         return found
 
     def turned_images(self) -> list[Mistake]:
-        """Return single images that may be turned over: they agree then with the camera of all."""
+        """Return single images that agree with the camera of their view only if turned over."""
         found = list[Mistake]()
         for g, group in enumerate(self.groups):
             own = self.of_groups[g]
@@ -295,7 +295,7 @@ class _Judge:
         return found
 
     def moved_cameras(self) -> list[Mistake]:
-        """Return that cameras of single views may have stood in several places.
+        """Return views whose camera may have moved between images.
 
         Images that do not agree with the camera of the others agree with another one then, and
         hardly any are left: where readings are wrong, some camera suits a few images as well.
@@ -319,7 +319,7 @@ class _Judge:
         return [moved_cameras(self.data, self.given, moved)]
 
     def beside(self, what: Mistake, one: Agreement) -> _Judge:
-        """Return what judges other mistakes beside one, which are undone together."""
+        """Return a judge of further mistakes with one mistake taken as given."""
         other = copy(self)
         other.data = replace(self.data, progress=no_progress)
         other.given, other.own = what.true, one
@@ -330,12 +330,12 @@ class _Judge:
         return other
 
     def known(self, g: int) -> list[RigidTransform]:
-        """Return the cameras of a group that are known before anything is compared."""
+        """Return the cameras of a group that are known in advance."""
         hint = self.groups[g].hint
         return [] if hint is None else [hint, _mirrored_camera(hint)]
 
     def finalists(self, tried: Sequence[Mistake], rounds: int = len(_FEW_STARTS)) -> list[Mistake]:
-        """Return the mistakes that some images of the views that disagree most speak for.
+        """Return the mistakes favoured by some images of the views that disagree most.
 
         These are all images of views that nearly agree, whose cameras are known about, and a few of
         others; more of them in each of some rounds. Cameras are searched for only if no mistake
@@ -380,11 +380,11 @@ class _Judge:
         return [tried[k] for k in sorted(found)]  # the commoner first
 
     def nearly_agrees(self, g: int) -> bool:
-        """Say whether the images of a group show half of the legs as things are, or more."""
+        """Return whether the images of a group show half of the legs or more as given."""
         return self.of_groups[g].mean >= _SUITS
 
     def judged(self, finalists: Sequence[Mistake]) -> list[_Judged]:
-        """Return what all images say of some mistakes, with the amounts that suit them best."""
+        """Return the agreement of all images with some mistakes, by their best amounts."""
         found = [(what, self.all(what.true)) for what in finalists]
         if not found:
             return []
@@ -397,7 +397,7 @@ class _Judge:
         return found
 
     def likeliest(self, judged: Sequence[_Judged]) -> list[_Judged]:
-        """Return the mistakes that explain the images best, which do not tell these apart."""
+        """Return the mistakes that explain the images best, and that they cannot distinguish."""
         found = [(what, one) for what, one in judged if self.is_explained(what, one)]
         best = max((one for _, one in found), key=_total, default=self.own)
         alike = [(what, one) for what, one in found if _is_as_good(one, best)]
@@ -411,7 +411,7 @@ class _Judge:
     def likeliest_two(
         self, judged: Sequence[_Judged], likeliest: Sequence[_Judged]
     ) -> list[_Judged]:
-        """Return two mistakes at once, where images still show less than half of the legs with one.
+        """Return pairs of mistakes, if images show less than half of the legs with one corrected.
 
         The other one is looked for beside the likeliest, or where none is likely beside those that
         suit best, if that is no chance. With both of them undone images show half of the legs.
@@ -443,7 +443,7 @@ class _Judge:
         return []
 
     def _best_amount(self, what: Mistake, one: Agreement) -> tuple[Mistake, Agreement]:
-        """Return the amount of a mistake that suits all images best, by halving steps."""
+        """Return the amount of a mistake that fits all images best, by halving steps."""
         known = [[] if T is None else [T] for T in one.cameras]
         for step in _FINER if what.finer is not None else ():
             assert what.finer is not None
@@ -455,7 +455,7 @@ class _Judge:
         return what, one
 
     def is_explained(self, what: Mistake, one: Agreement) -> bool:
-        """Say whether images agree so much better without a mistake that it is no chance.
+        """Return whether images agree significantly better with a mistake corrected.
 
         Cameras at another place may nearly make up for one that has an opposite. Images agree
         little better without it then, but worse with the opposite.
@@ -477,7 +477,7 @@ class _Judge:
         return is_sure and float(contrast.mean()) >= _SURE_GAIN
 
     def _as_it_is_near(self, what: Mistake, one: Agreement) -> Agreement:
-        """Return what images say of things as they are, also near the cameras of a mistake.
+        """Return the agreement without correction, also near the cameras of a mistake.
 
         The search for cameras may have missed these, and then a mistake is none.
         """
@@ -494,7 +494,7 @@ class _Judge:
         starts: Sequence[int] = _STARTS,
         known: Sequence[Sequence[RigidTransform]] = (),
     ) -> Agreement:
-        """Return what all images say of an assumption."""
+        """Return the agreement of all images with a hypothesis."""
         return Agreement.joined(
             [
                 self.of_groups[g]
@@ -519,7 +519,7 @@ class _Judge:
         return found
 
     def _as_far(self, known: Sequence[RigidTransform], focal: float) -> list[RigidTransform]:
-        """Return cameras, and where others of another focal length see the same as large."""
+        """Return cameras, and those of another focal length at which the machine looks as large."""
         if focal == 1.0:
             return list(known)
         machine = self.data.machine
@@ -529,7 +529,7 @@ class _Judge:
         return [*known, *(T * move for T, move in zip(known, moves, strict=True))]
 
     def hints_suited(self, one: Agreement) -> int:
-        """Return how many rough camera poses suit the cameras that were found."""
+        """Return the number of rough camera poses that agree with the cameras found."""
         both = zip(self.groups, one.cameras, strict=True)
         return sum(
             group.hint is not None and T is not None and not far_off(group.hint, T)
@@ -544,7 +544,7 @@ class _Judge:
         starts: Sequence[int],
         known: Sequence[RigidTransform] = (),
     ) -> list[Agreement]:
-        """Return what some images of a group say of assumptions, near cameras that are known.
+        """Return the agreement of some images of a group with hypotheses, near known cameras.
 
         These are the pool's where none are given.
         """
@@ -574,7 +574,7 @@ class _Judge:
 
 
 class _Look:
-    """How many more legs some images of a group show without each of some mistakes.
+    """Gains: how many more legs some images of a group show with each mistake corrected.
 
     Cameras are tried where they are known roughly, and about where those of images that nearly
     agree are. They are searched for where that suits none, or suits as well as things as they are:
@@ -594,7 +594,7 @@ class _Look:
         self.is_near = False
 
     def near_known(self) -> Array:
-        """Return the gains near cameras that are known, (n_tried,)."""
+        """Return the gains near known cameras, (n_tried,)."""
         if not self.is_near:
             known = [] if self.T_near is None else self.judge.alike(self.T_near)
             self._at(self.some, (), [*known, *self.judge.known(self.g)] if known else ())
@@ -602,7 +602,7 @@ class _Look:
         return self._gained()
 
     def gains(self, starts: Sequence[int], *, searches: bool) -> Array:
-        """Return the gains, (n_tried,), with cameras that *starts* suggest if one *searches*."""
+        """Return the gains (n_tried,), with cameras suggested by *starts* if one *searches*."""
         self.near_known()
         tried, before = self.tried, _total(self.before)
         if self.T_near is not None:
@@ -626,7 +626,7 @@ class _Look:
     def _at(
         self, which: Sequence[int], starts: Sequence[int], known: Sequence[RigidTransform] = ()
     ) -> None:
-        """Look at some mistakes, and keep the cameras that suit most images in the pool."""
+        """Judge some mistakes, and keep the cameras that agree with most images in the pool."""
         judge, support = self.judge, self.support
         which_true = [self.tried[k].true for k in which]
         agreements = judge.compare(which_true, self.g, self.asked, starts, known)
@@ -639,7 +639,7 @@ class _Look:
 
 
 def symmetries(machine: Machine) -> list[Array]:
-    """Return the motions (4, 4) of the base link that lay all legs at home on legs, and mirrorings.
+    """Return motions (4, 4) of the base link that map legs at home to legs, and reflections.
 
     Two legs of a machine may come to lie on any two others: four points on four define a motion.
     """
@@ -673,14 +673,14 @@ def _better(one: Agreement, other: Agreement) -> Agreement:
 
 
 def _suits(support: float, own: Agreement) -> bool:
-    """Say whether images suit a mistake well, by legs, and as they are by far fewer."""
+    """Return whether images agree well with a mistake corrected, and far fewer without."""
     expected = float(own.expected.sum())
     gain = support - float(own.support.sum())
     return support >= _SUITS * expected and gain >= _MIN_GAIN * expected
 
 
 def _explains(one: Agreement, own: Agreement) -> bool:
-    """Say whether images agree so much better that it is no chance."""
+    """Return whether images agree significantly better."""
     gain = one.share - own.share
     if one.images < 2 or one.images <= own.images:
         return False
@@ -696,7 +696,7 @@ def _explains(one: Agreement, own: Agreement) -> bool:
 
 
 def _is_as_good(one: Agreement, best: Agreement) -> bool:
-    """Say whether images do not tell an assumption from the best one."""
+    """Return whether images cannot distinguish a hypothesis from the best one."""
     if float(one.support.sum()) < _ALIKE * float(best.support.sum()):
         return False
     lack = best.share - one.share
@@ -716,13 +716,13 @@ def _signed_ranks(gain: Array) -> float:
 def _diagnosis(
     alike: Sequence[Mistake], after: Agreement, before: Agreement, *, by_hints: bool
 ) -> Diagnosis:
-    """Return the diagnosis of mistakes that images cannot tell apart."""
+    """Return the diagnosis of mistakes that images cannot distinguish."""
     first = alike[0]
     kinds = {one.kind: one for one in reversed(alike) if one.kind != first.kind}  # their first
     of_kinds = [*first.same_as, *(one.what for one in alike if kinds.get(one.kind) is one)]
     same = dict.fromkeys([*of_kinds, *(one.what for one in alike[1:])])
     tests = dict.fromkeys(one.test for one in alike if one.test) if same else {}
-    rough = "; the rough T_base_camera of the views speak for the first" * by_hints
+    rough = "; the rough camera poses (T_base_camera) favour the first explanation" * by_hints
     return Diagnosis(
         kind=first.kind,
         what=first.what,
@@ -739,11 +739,11 @@ def _diagnosis(
 
 
 def _mirrored_camera(T_base_camera: RigidTransform) -> RigidTransform:
-    """Return where a camera sees mirrored images of a machine whose y is reversed."""
+    """Return the pose at which a camera sees mirrored images of a machine with y reversed."""
     return RigidTransform.from_matrix(_MIRROR_Y @ T_base_camera.as_matrix() @ _MIRROR_X)
 
 
 def _search(search: Search, machine: Machine, A: Array, B: Array) -> Search:
-    """Return what should be seen of a machine whose joints are there."""
+    """Return the search for a machine with joints A, B."""
     cylinders = [leg.cylinders for leg in machine.legs]
     return replace(search, A_base=A, B_base=B, cylinders=cylinders)

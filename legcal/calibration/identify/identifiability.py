@@ -21,7 +21,7 @@ from legcal.calibration.identify.predicted_observations import (
 from legcal.calibration.identify.ranks import Analysis, undetermined, weak_directions
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
-    Replanning,
+    Replanner,
     find_remedies,
     judge_board,
     recommend,
@@ -168,7 +168,7 @@ def identifiability(
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
     predicted = planned_observations(mechanism, legs, images, **boards)
-    replanning = Replanning(
+    replanning = Replanner(
         lambda more: planned_observations(mechanism, legs, more, **boards),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), **boards),
     )
@@ -207,9 +207,9 @@ def identifiability_of_dataset(
 def ranks_of_dataset(
     dataset: Dataset, choices: Choices = NO_CHOICES
 ) -> tuple[tuple[Condition, ...], Ranks]:
-    """Return the paper's conditions, and the rank of the joint fit, of what a dataset records.
+    """Return the paper's conditions and the rank of the joint fit for a dataset.
 
-    They are those of :func:`identifiability_of_dataset`, without what would change them.
+    As :func:`identifiability_of_dataset`, without remedies.
     """
     analysis = _analysis_of(dataset, choices)
     return conditions_of(dataset.machine, analysis.predicted), analysis.full
@@ -242,8 +242,7 @@ def check_identifiable(
     notes = [] if tied is None else [tied]
     if full.weak:  # only harmless ones are left
         notes.append(
-            "Not determined, and without effect on the platform: "
-            f"{_directions(full, harmless=True)}."
+            f"Undetermined, but without effect on the platform: {_directions(full, harmless=True)}."
         )
     return tuple(notes)
 
@@ -273,7 +272,7 @@ def _report_on(
     machine: Machine,
     analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
-    replanning: Replanning | None,
+    replanning: Replanner | None,
 ) -> Identifiability:
     """Report on a session."""
     predicted = analysis.predicted
@@ -316,7 +315,7 @@ def _report_on(
 
 
 def _rough_notes(analysis: Analysis) -> list[str]:
-    """Note on directions known so roughly that calibrate may reject the dataset."""
+    """Note on directions so uncertain that calibrate may reject the dataset."""
     predicted, motion = analysis.predicted, analysis.motion
     rough = undetermined(predicted, analysis.information, _ROUGH)
     harmful = [w for w in weak_directions(predicted, motion, rough) if not w.harmless]
@@ -326,9 +325,9 @@ def _rough_notes(analysis: Analysis) -> list[str]:
     others = f" and {len(harmful) - 1} more" if len(harmful) > 1 else ""
     known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
     return [
-        f"calibrate may reject this dataset: with outlines good to 0.1 px, the predicted error of "
-        f"{direction}{others} exceeds {known}. Add images from other directions, or at poses that "
-        "differ more."
+        f"calibrate may reject this dataset: with outlines good to 0.1 px, the predicted "
+        f"uncertainty of {direction}{others} exceeds {known}. Add images from other directions, or "
+        "at poses that differ more."
     ]
 
 
@@ -345,10 +344,10 @@ def _machine_notes(machine: Machine) -> list[str]:
     outside = list(legs_outside(machine, TRAVEL_MARGIN))
     if outside:
         which = legs_in_words(outside, machine.leg_names)
-        stand = "stand outside their" if len(outside) > 1 else "stands outside its"
+        stand = "are outside their" if len(outside) > 1 else "is outside its"
         notes.append(
             f"At home {which} {stand} travel by more than {100 * TRAVEL_MARGIN:g} % of it: "
-            "the judged poses include some between home and travel, which the machine may not "
+            "poses between home and the joint limits are included, which the machine may not "
             "reach; correct legcal.home or the limits."
         )
     tied = ties_in_words(machine)
@@ -457,11 +456,11 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
     unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
     if unseen and dataset.axes is None:
         names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
-        remedies.insert(0, f"add a <visual> cylinder along {names}, which no image shows without")
+        remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
         f"{dataset.folder}: the parameters cannot be identified: these views and poses determine "
-        f"at most {report.full.rank} of {report.full.of}, and not "
+        f"at most {report.full.rank} of {report.full.of} combinations; undetermined: "
         f"{_directions(report.full, harmless=False)}, which moves the platform; {remedy}, or state "
         "known values with --set."
     )

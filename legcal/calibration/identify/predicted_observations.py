@@ -55,7 +55,7 @@ FOCAL_PX = 1290.0  # 1024 x 768 pixels, 43 degrees wide
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
 _SEED = 2002
-_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what the mechanism itself demands
+_EXACT = 2.5e-7  # mean leg lengths: standard deviation of the constraints of the mechanism
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -87,7 +87,7 @@ class PredictedObservations:
     board: BoolArray
     # (n_images,): those that show a calibration board on the platform; none if it is empty
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-    tied_by: Ties | None = None  # what ties these parameters; frames alone without it
+    tie_constraints: Ties | None = None  # what ties these parameters; frames alone without it
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     shows_arms: bool = True  # which a table of axes does not
 
@@ -151,17 +151,17 @@ class PredictedObservations:
 
         Those by the line of an arm (``ActuatorColumns.ARM``) are by its motions (``Line.moved``).
         """
-        found = np.zeros((len(self.t), len(self.arms), 2, 3, LegColumns.COUNT))
+        derivatives = np.zeros((len(self.t), len(self.arms), 2, 3, LegColumns.COUNT))
         for a, motions in enumerate(self._motions_of_arms()):
             for end, (motion, slope) in enumerate(motions):
-                found[:, a, end, :, ActuatorColumns.AXIS] = motion.by_axis
-                found[:, a, end, :, ActuatorColumns.POINT] = motion.by_point
-                found[:, a, end, :, ActuatorColumns.GAIN] = motion.by_gain
-                found[:, a, end, :, ActuatorColumns.ARM] = motion.by_A @ slope
-        return found
+                derivatives[:, a, end, :, ActuatorColumns.AXIS] = motion.by_axis
+                derivatives[:, a, end, :, ActuatorColumns.POINT] = motion.by_point
+                derivatives[:, a, end, :, ActuatorColumns.GAIN] = motion.by_gain
+                derivatives[:, a, end, :, ActuatorColumns.ARM] = motion.by_A @ slope
+        return derivatives
 
     def _motions_of_arms(self) -> list[list[tuple[JointMotion, Array]]]:
-        """Return how both ends of arms move, and their slope (3, 4) by the line of the arm."""
+        """Return the motion of both ends of arms, with derivatives (3, 4) by the arm's line."""
         return [
             [
                 (actuator.motion(end, self.q[:, a]), slope)
@@ -221,15 +221,15 @@ class PredictedObservations:
     @cached_property
     def A_by_local(self) -> Array:
         """Their derivatives by the numbers of the legs (LegColumns), (k, n_legs, 3, 21)."""
-        found = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
-        found[..., LegColumns.A] = np.eye(3)
+        derivatives = np.zeros((len(self.t), self.n_legs, 3, LegColumns.COUNT))
+        derivatives[..., LegColumns.A] = np.eye(3)
         for j, actuator, a in self._carried():
             motion = actuator.motion(self.legs[j].A, self.q[:, a])
-            found[:, j, :, LegColumns.A] = motion.by_A
-            found[:, j, :, ActuatorColumns.AXIS] = motion.by_axis
-            found[:, j, :, ActuatorColumns.POINT] = motion.by_point
-            found[:, j, :, ActuatorColumns.GAIN] = motion.by_gain
-        return found
+            derivatives[:, j, :, LegColumns.A] = motion.by_A
+            derivatives[:, j, :, ActuatorColumns.AXIS] = motion.by_axis
+            derivatives[:, j, :, ActuatorColumns.POINT] = motion.by_point
+            derivatives[:, j, :, ActuatorColumns.GAIN] = motion.by_gain
+        return derivatives
 
     @cached_property
     def ends_by_reading(self) -> tuple[Array, Array]:
@@ -306,7 +306,7 @@ class PredictedObservations:
 
     @property
     def sigma_exact(self) -> float:
-        """Standard deviation of what the mechanism itself demands [m]."""
+        """Standard deviation of the constraints of the mechanism [m]."""
         return _EXACT * self.mean_length
 
     @cached_property
@@ -325,9 +325,9 @@ class PredictedObservations:
     @cached_property
     def ties(self) -> Array:
         """Derivative of what ties the parameters to each other, in metres, (w, p), independent."""
-        tied_by = self.tied_by or ties_of(self.legs, self.frame_legs)
-        found = tied_by.at(self.legs)
-        return independent(found, by_step(found, self.parametrization.place) * self.unit)[1]
+        tie_constraints = self.tie_constraints or ties_of(self.legs, self.frame_legs)
+        rows = tie_constraints.at(self.legs)
+        return independent(rows, by_step(rows, self.parametrization.place) * self.unit)[1]
 
     @cached_property
     def with_length(self) -> BoolArray:
@@ -342,8 +342,8 @@ class PredictedObservations:
 
     def columns(self, kind: int) -> IntArray:
         """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
-        found = self.parametrization.place[:, kind]
-        return np.unique(found[found >= 0])
+        columns_of_legs = self.parametrization.place[:, kind]
+        return np.unique(columns_of_legs[columns_of_legs >= 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,12 +362,12 @@ class Across:
 
 
 def at_base_joints(predicted: PredictedObservations) -> Across:
-    """Return what is seen at the base joint centres, and at the near ends of arms."""
+    """Return the predicted observations at base joint centres, and at near ends of arms."""
     return _across(predicted, predicted.ends[0][predicted.pose])
 
 
 def at_platform_joints(predicted: PredictedObservations) -> Across:
-    """Return what is seen at the platform joint centres, and at the far ends of arms."""
+    """Return the predicted observations at platform joint centres, and at far ends of arms."""
     return _across(predicted, predicted.ends[1][predicted.pose])
 
 
@@ -402,7 +402,7 @@ def planned_observations(
     that no symmetry by accident decides. Raises DidNotConverge if the machine cannot move.
     """
     n_poses = images * len(views)
-    (legs, length, rng), (R, t) = _random_session(machine, max(n_poses, REACHED))
+    (legs, length, rng), (R, t) = _random_sessions(machine, max(n_poses, REACHED))
     rng, home = deepcopy(rng), machine.home_of_frames
     A, B = ends_at_pose(legs, home)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
@@ -413,7 +413,7 @@ def planned_observations(
         legs=legs,
         frame_legs=machine.frame_legs,
         parametrization=parametrization_of(machine),
-        tied_by=machine_ties(machine),
+        tie_constraints=machine_ties(machine),
         radius=radii(machine.legs, length),
         R=R[:n_poses],
         t=t[:n_poses],
@@ -431,12 +431,12 @@ def planned_observations(
 
 
 @lru_cache(maxsize=4)
-def _random_session(
+def _random_sessions(
     machine: Machine, n_poses: int
 ) -> tuple[tuple[tuple[Leg, ...], float, np.random.Generator], tuple[Array, Array]]:
-    """Return what :func:`machine_near` does, and random postures: one plan follows the other."""
+    """Return :func:`perturbed_machine`, and random poses and readings."""
     home = machine.home_of_frames
-    legs, length, rng = machine_near(machine, home)
+    legs, length, rng = perturbed_machine(machine, home)
     travel = travel_of(machine)
     postures = random_postures_of_legs(legs, machine.frame_legs, home, travel, n_poses, rng)
     return (legs, length, rng), postures
@@ -457,7 +457,7 @@ def recorded_observations(
     """
     machine, m = dataset.machine, dataset.measurements
     to_Rb, home = machine.T_base_Rb.inv(), machine.home_of_frames
-    legs, length, rng = machine_near(machine, home)
+    legs, length, rng = perturbed_machine(machine, home)
     if machine.is_determined:
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
@@ -490,7 +490,7 @@ def recorded_observations(
         legs=legs,
         frame_legs=machine.frame_legs,
         parametrization=parametrization,
-        tied_by=machine_ties(machine),
+        tie_constraints=machine_ties(machine),
         radius=radii(machine.legs, length),
         R=R,
         t=t,
@@ -515,11 +515,11 @@ def orientations_of(dataset: Dataset, predicted: PredictedObservations) -> Array
     Cameras whose place the dataset does not give look at the legs.
     """
     to_Rb, views = dataset.machine.T_base_Rb.inv(), dataset.measurements.views
-    found = looking_at(predicted)
+    orientations = looking_at(predicted)
     for v, view in enumerate(views[i] for i in np.unique(dataset.measurements.view).tolist()):
         if view.T_base_camera is not None:
-            found[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
-    return found
+            orientations[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
+    return orientations
 
 
 def cameras_of(dataset: Dataset) -> tuple[str, ...]:
@@ -550,7 +550,7 @@ def default_cameras(
     spatial: bool,
     rng: np.random.Generator,
 ) -> Array:
-    """Return where a camera for each view stands.
+    """Return the position of a camera for each view.
 
     No two of them stand in the same place, even if they show the same legs.
 
@@ -579,7 +579,7 @@ def default_cameras(
 
 
 def cameras_for(predicted: PredictedObservations, views: Sequence[Sequence[int]]) -> Array:
-    """Return where further cameras stand by default, (n_views, 3) in R_b [m]."""
+    """Return the default positions of further cameras, (n_views, 3) in R_b [m]."""
     B = (predicted.arm + predicted.t[:, None]).mean(axis=0)
     rng = np.random.default_rng(_SEED + 1)
     return default_cameras(predicted.A_at.mean(axis=0), B, views, predicted.spatial, rng)
@@ -594,7 +594,7 @@ def _axis(A: Array, B: Array) -> Array:
     return np.asarray(across / size)
 
 
-def machine_near(
+def perturbed_machine(
     machine: Machine, home: RigidTransform
 ) -> tuple[tuple[Leg, ...], float, np.random.Generator]:
     """Return legs near the nominal ones, their mean length at home [m], and a source of chance."""
@@ -602,10 +602,10 @@ def machine_near(
     nominal = geometries(machine)
     A, B = ends_at_pose(nominal, home)
     length = float(np.linalg.norm(B - A, axis=1).mean())
-    found = parametrization_of(machine)
-    scale = np.where([unit == "m" for unit in found.units], length, 1.0)
-    legs = perturbed(nominal, found, length, rng)
-    return on_ties(legs, nominal, machine_ties(machine), found.place, scale), length, rng
+    parametrization = parametrization_of(machine)
+    scale = np.where([unit == "m" for unit in parametrization.units], length, 1.0)
+    legs = perturbed(nominal, parametrization, length, rng)
+    return on_ties(legs, nominal, machine_ties(machine), parametrization.place, scale), length, rng
 
 
 def perturbed(
@@ -641,19 +641,19 @@ def travel_of(machine: Machine) -> Array:
 
     Of rods on actuators it is the travel of these [m or rad].
     """
-    found = []
+    travels = []
     for leg in machine.legs:
         if leg.actuator is not None:
-            found.append(list(leg.actuator.travel))
+            travels.append(list(leg.actuator.travel))
         elif leg.kind is LegKind.CONSTANT:
-            found.append([leg.q0, leg.q0])
+            travels.append([leg.q0, leg.q0])
         else:
-            found.append(sorted(leg.length_at(q) for q in leg.travel))
-    return np.array(found)
+            travels.append(sorted(leg.length_at(q) for q in leg.travel))
+    return np.array(travels)
 
 
 def _showing(dataset: Dataset, link: Link) -> BoolArray:
-    """Return which images show the board on a link: all of them where nobody has looked yet."""
+    """Return the mask of images with the board on a link; all if not searched yet."""
     rows, fixed, corners = (
         range(dataset.measurements.n_rows),
         dataset.board_on(link),
@@ -688,8 +688,8 @@ def neighbours(ring: Sequence[int], size: int) -> list[tuple[int, ...]]:
     return list(dict.fromkeys(groups))
 
 
-def steps_apart(ring: Sequence[int], leg: int, others: Sequence[int]) -> int:
-    """Return how many places around the base a leg is from the nearest of others."""
+def ring_distance(ring: Sequence[int], leg: int, others: Sequence[int]) -> int:
+    """Return the number of steps around the base from a leg to the nearest of others."""
     place = {j: k for k, j in enumerate(ring)}
     steps = (abs(place[leg] - place[other]) for other in others)
     return min((min(s, len(ring) - s) for s in steps), default=0)

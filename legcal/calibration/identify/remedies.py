@@ -21,7 +21,7 @@ from legcal.calibration.identify.predicted_observations import (
     legs_in_words,
     neighbours,
     planned_observations,
-    steps_apart,
+    ring_distance,
     views_in_words,
 )
 from legcal.calibration.identify.ranks import Analysis, missing, undetermined, weak_directions
@@ -224,7 +224,7 @@ def _complement(space: Array, part: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Replanning:
+class Replanner:
     """Planners of other sessions of the same machine."""
 
     images: Callable[[int], PredictedObservations]  # with another number of images a view
@@ -234,7 +234,7 @@ class Replanning:
 
 def find_remedies(
     analysis: Analysis,  # of the session
-    replanning: Replanning | None,  # None for a recorded session
+    replanning: Replanner | None,  # None for a recorded session
 ) -> tuple[Remedy, ...]:
     """Return remedies for undetermined directions.
 
@@ -295,7 +295,7 @@ def _try_kind(
 
 
 def _more_images(
-    analysis: Analysis, replanning: Replanning | None
+    analysis: Analysis, replanning: Replanner | None
 ) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a session with more images a view."""
     images = int(np.bincount(analysis.predicted.view).min())
@@ -312,14 +312,14 @@ def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]
     ring = legs_around(predicted)
     for more in (1, 2):
         choices = [
-            (sum(steps_apart(ring, j, view) for j in added), v, added)
+            (sum(ring_distance(ring, j, view) for j in added), v, added)
             for v, view in enumerate(predicted.views)
             for added in combinations([j for j in ring if j not in view], more)
             if set(weak) & {*view, *added}
         ]
         for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
             legs = tuple(sorted((*predicted.views[v], *added)))
-            text = f"see {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
+            text = f"show {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
             wider = _widened(predicted, v, legs)
             yield text, partial(_score_with_more, analysis, wider, np.arange(len(predicted.t)))
 
@@ -344,10 +344,10 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a calibration board on the base, and one on the platform."""
     if analysis.predicted.n_frames > 1:
-        text = "put a calibration board on the base that every camera sees"
+        text = "put a calibration board on the base, visible to every camera"
         yield text, lambda: _score(analysis.with_board())
     if not analysis.predicted.platform_board.any():
-        text = "put a calibration board on the platform that every camera sees"
+        text = "put a calibration board on the platform, visible to every camera"
         yield text, lambda: _score(analysis.with_board(link="platform"))
 
 
@@ -363,7 +363,7 @@ def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _S
         yield f"fix {list_in_words(which)}", partial(_score, analysis, known)
 
 
-def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:
+def _other_views(analysis: Analysis, replanning: Replanner | None) -> tuple[Remedy, ...]:
     """Recommend the smallest sufficient set of views in place of the given ones."""
     sets = () if replanning is None else replanning.views()
     if not sets:

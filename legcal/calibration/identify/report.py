@@ -87,7 +87,7 @@ class BoardReport:
 
 @dataclass(frozen=True)
 class ScaleSource:
-    """A possible source of scale for a machine whose readings carry no length."""
+    """A possible source of scale for a machine without readings of lengths."""
 
     source: str  # ``length``, ``base_board``, ``platform_board`` or ``radii``
     assumed: str  # what was taken to be known, in words
@@ -101,7 +101,7 @@ class Remedy:
     """Something that would help, with the rank that it gives."""
 
     remedy: str  # what to do
-    full_rank: int  # of all parameters; what is fixed counts as known
+    full_rank: int  # of all parameters; fixed ones count as known
     enough: bool  # whether everything that moves the platform is determined with it
 
 
@@ -135,19 +135,21 @@ class Identifiability:
     identifiable: bool
     views: tuple[tuple[str, ...], ...]  # the legs that each view shows
     images: tuple[int, ...]  # number of images of each view
-    board: BoardReport  # what a calibration board on the base is needed for, and what it determines
+    board: BoardReport  # effect of a calibration board on the base
     platform_board: BoardReport  # the same of one on the platform
     # standard deviation of the platform that is to be expected from outlines good to 0.1 px, rms
     # over the poses. None where something that moves the platform is not determined, or the motors
     # do not determine its pose
     platform_sigma: RmsMotion | None
-    remedies: tuple[Remedy, ...]  # changes that would determine what is missing; each was tried
+    remedies: tuple[
+        Remedy, ...
+    ]  # changes that would determine the undetermined directions; each was tried
     # the smallest sets of views, fewest first; None where views were given
     recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]
-    # what the legs determine of the cameras of a dataset with images; empty without them
+    # intrinsics that the legs determine, of a dataset with images; empty without them
     intrinsics: tuple[CameraIntrinsics, ...] = ()
-    # what would fix the scale where radii alone do: where readings carry no length
+    # sources of the scale where only radii determine it: readings are angles or missing
     scale: tuple[ScaleSource, ...] = ()
 
     @property
@@ -162,8 +164,8 @@ class Identifiability:
         document["scale"] = document["scale"] or None
         for board in ("board", "platform_board"):
             document[board]["with"] = document[board].pop("with_board")
-        found = IdentifyDocument.model_validate(document)
-        return found.model_dump(mode="json", by_alias=True)
+        model = IdentifyDocument.model_validate(document)
+        return model.model_dump(mode="json", by_alias=True)
 
 
 class ConditionBlock(SparseDocument):

@@ -1,4 +1,4 @@
-"""Sources of scale for a machine whose readings carry no length.
+"""Sources of scale for a machine without readings of lengths.
 
 Encoders of arms measure angles: such a machine at twice the size, with rods twice as thick and
 cameras twice as far, gives the same images and readings. A measured length, a board, or radii fix
@@ -101,9 +101,9 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
     lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
     mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
-    open_directions = undetermined(predicted, information)
-    leaves_more = len(open_directions) > _n_open(analysis, 0.0)
-    if leaves_more or np.linalg.norm(open_directions @ mean) > _OPEN * np.linalg.norm(mean):
+    undetermined_directions = undetermined(predicted, information)
+    leaves_more = len(undetermined_directions) > _n_open(analysis, 0.0)
+    if leaves_more or np.linalg.norm(undetermined_directions @ mean) > _OPEN * np.linalg.norm(mean):
         return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
     seen = singular > 0.0
@@ -171,20 +171,20 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
         sources = tuple(source for source in sources if source.source == "length")
     fixing = [source.assumed for source in sources if source.sigma is not None]
     options = ", or ".join(fixing or [source.assumed for source in sources])
-    reason, fix_gain = "readings of arms carry no length", ""
+    reason, fix_gain = "readings of arms are angles", ""
     if machine.readings_carry_length:  # but for gains
         reason, fix_gain = (
             "the gains of all motors that slide are free",
             "fix one of these gains, or ",
         )
     if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
-        reason += f", and the stated values fix the scale no better than {100 * _VAGUE:g} %"
+        reason += f", and the stated values determine the scale no better than {100 * _VAGUE:g} %"
     stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:
         stated += (
             ", or radii that you know better than the model (--set '*.radius.*=VALUE±SIGMAmm')"
         )
     return (
-        f"{dataset.folder}: the parameters cannot be identified: {reason}, so that the scale of "
-        f"machine, rods and cameras is open; these would fix it: {options}; {fix_gain}{stated}."
+        f"{dataset.folder}: the parameters cannot be identified: {reason}, so the overall scale is "
+        f"undetermined; any of these would determine it: {options}; {fix_gain}{stated}."
     )

@@ -15,6 +15,7 @@ from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
+from legcal.calibration.tuning import HARMLESS, HELD_SIGMA, MAX_SIGMA
 from legcal.errors import NotIdentifiable
 from legcal.estimation.solver import NormalEquations, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
@@ -22,9 +23,6 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity
 
-_MAX_SIGMA = 0.1  # mean leg lengths: above, a direction is open
-_HELD_SIGMA = 0.01  # mean leg lengths: the same where the platform does not move
-_HARMLESS = 0.01  # motion of the platform over the change of parameters, below which it is ignored
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"
 _MIN_SPREAD = 2.5e-12  # mean leg lengths: floor of the error of the nominal model
@@ -42,7 +40,9 @@ class HeldDirections:
     ] = ()  # parameters that depend on the nominal model along these directions
 
 
-def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> HeldDirections:
+def undetermined_directions(
+    problem: FitProblem, state: State, normal: NormalEquations
+) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
     *problem* has no held directions yet; *normal* is its information at the state. Intrinsics with
@@ -61,7 +61,7 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     scaled = unit[:, None] * information * unit
     eigenvalue, eigenvector = np.linalg.eigh(0.5 * (scaled + scaled.T))
     basis = eigenvector[:, _are_open(eigenvalue, eigenvector, length)].T
-    weak_basis = eigenvector[:, eigenvalue * (_HELD_SIGMA * length) ** 2 < 1.0].T
+    weak_basis = eigenvector[:, eigenvalue * (HELD_SIGMA * length) ** 2 < 1.0].T
     if len(weak_basis) == 0:
         return HeldDirections(np.zeros((0, problem.n_named)), every_unit)
     not_kinematic = np.flatnonzero(
@@ -71,19 +71,19 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         basis = basis[not_kinematic]
     else:
         motion = _motion(problem, state, unit)
-        basis, _ = split_by_motion(motion, basis, length, _HARMLESS)
-        _, harmless = split_by_motion(motion, weak_basis, length, _HARMLESS)
+        basis, _ = split_by_motion(motion, basis, length, HARMLESS)
+        _, harmless = split_by_motion(motion, weak_basis, length, HARMLESS)
     if len(basis) and unseen:
         raise NotIdentifiable(
-            f"The fit is not determined: no measurement depends on {', '.join(unseen)}; every leg "
-            "needs readings or outlines; add images that show it."
+            f"The fit is not determined: no measurement depends on {', '.join(unseen)}. Every leg "
+            "needs readings or outlines: add images that show it."
         )
     if len(basis):
         description = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
         raise NotIdentifiable(
-            f"The fit is not determined: the measurements do not fix {len(basis)} of {len(names)} "
-            f"directions of the parameters to a tenth of a leg length: {description}; {_REMEDY}, "
-            "or state known values with a prior."
+            f"The fit is not determined: {len(basis)} of {len(names)} combinations of parameters "
+            f"are uncertain by more than a tenth of a leg length: {description}; {_REMEDY}, or "
+            "state known values with a prior."
         )
     weak: tuple[str, ...] = ()
     if len(
@@ -91,7 +91,7 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     ):  # moved by more than sigma if the nominal model is off by a hundredth of a leg
         N = null_space(harmless)
         sigma = np.sqrt(np.diagonal(N @ inverse_on_range(N.T @ scaled @ N) @ N.T))
-        is_weak = _HELD_SIGMA * length * np.linalg.norm(harmless, axis=0) > sigma
+        is_weak = HELD_SIGMA * length * np.linalg.norm(harmless, axis=0) > sigma
         weak = tuple(names[i] for i in np.flatnonzero(is_weak))
     directions = (_in_words(names, row, problem.legs.names) for row in sparse_basis(harmless))
     basis = np.zeros((len(harmless), problem.n_named))
@@ -125,13 +125,12 @@ def refuse_undetermined_inliers(
         description = _in_words(names, eigenvector[:, is_open[0]], problem.legs.names)
         if accepted.all():
             raise NotIdentifiable(
-                "The fit is not determined: at its minimum, the measurements do not fix "
-                f"{description} to a tenth of a leg length; {_REMEDY}, or state known values "
-                "with a prior."
+                f"The fit is not determined: at its minimum, {description} is uncertain by more "
+                f"than a tenth of a leg length; {_REMEDY}, or state known values with a prior."
             )
         raise NotIdentifiable(
-            "The fit is not determined: without the rejected outlines, the measurements do not fix "
-            f"{description}; correct the rejected outlines, or add images."
+            f"The fit is not determined: without the rejected outlines, {description} is not "
+            "determined; correct the rejected outlines, or add images."
         )
 
 
@@ -141,7 +140,7 @@ def _are_open(information: Array, direction: Array, length: float) -> BoolArray:
     *information* (k,) is along each. The test is by single parameters: a scale known to a per cent
     or two moves many of them, each by little.
     """
-    most = _MAX_SIGMA * length / np.abs(direction).max(axis=0)
+    most = MAX_SIGMA * length / np.abs(direction).max(axis=0)
     return np.asarray(information * most**2 < 1.0)
 
 
@@ -163,7 +162,7 @@ def held_at_nominal(
     )
 
 
-def held_spread(problem: FitProblem, state: State, held: HeldDirections) -> Array:
+def covariance_of_held(problem: FitProblem, state: State, held: HeldDirections) -> Array:
     """Return the covariance (n_kinematic, n_kinematic) of steps along the held directions H.
 
     Errors of the nominal model with covariance D^2, conditioned on the estimated complement of H,

@@ -15,7 +15,7 @@ from scipy.special import chdtri, ndtr
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
     held_at_nominal,
-    open_directions,
+    undetermined_directions,
 )
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
@@ -79,14 +79,14 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
             problems.append(
                 f"The prior of {problem.named[i]} contradicts the measurements: prior {mean:.6g} "
                 f"+- {sigma:.2g} {unit}, measurements about {estimate.value:.4g} {unit}, "
-                f"{estimate.apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are "
-                "accepted; correct the prior or leave it out."
+                f"{estimate.apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct "
+                "or remove the prior."
             )
     if problems:
         raise DidNotConverge(problems)
 
 
-def refuse_other_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
     """Refuse a calibration board whose dimensions in the dataset contradict the measurements.
 
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
@@ -115,15 +115,15 @@ def _refuse_other_size(
         choices = replace(problem.choices, free=problem.choices.free | {name})
         try:
             refitted = first_minimum(problem.with_choices(choices), state)
-            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times as large as"
+            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times the size"
         except (DidNotConverge, NotIdentifiable):
-            size = "of another size than"
+            size = "not of the size"
         board = "" if link == "base" else f" on the {link}"
         raise DidNotConverge(
-            f"The calibration board{board} does not fit the readings and the legs: it is {size} "
-            f"the dataset says ({estimate.apart:.0f} standard deviations off; assumed accuracy "
-            f"{1e2 * sigma:.2g} %); measure the board and correct its dimensions in dataset.yaml, "
-            f"or estimate them (--set {name}=free)."
+            f"The dimensions of the calibration board{board} contradict the readings and the legs: "
+            f"the board is {size} stated in the dataset ({estimate.apart:.0f} standard deviations; "
+            f"assumed accuracy {1e2 * sigma:.2g} %); measure the board and correct its dimensions "
+            f"in dataset.yaml, or estimate them (--set {name}=free)."
         )
 
 
@@ -162,20 +162,20 @@ class _Comparison:
     unit: str
     mean: float
     sigma: float  # zero where it is fixed
-    found: float
-    together: float  # difference in standard deviations, other stated values free
-    alone: float  # the same, other stated values right
+    estimate: float
+    sigmas_joint: float  # difference in standard deviations, other stated values free
+    sigmas_alone: float  # the same, other stated values right
 
     def __str__(self) -> str:
-        apart = self.together if self.together > _SIGNIFICANT else self.alone
+        apart = self.sigmas_joint if self.sigmas_joint > _SIGNIFICANT else self.sigmas_alone
         stated = f"{self.mean:.6g} {self.unit}"
         if self.sigma:
             stated = f"{self.mean:.6g} +- {self.sigma:.2g} {self.unit}"
         return (
             f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
-            f"measurements: stated {stated}, measured about {self.found:.4g} {self.unit}, "
-            f"{apart:.0f} standard deviations apart; at most {_SIGNIFICANT:g} are accepted; "
-            f"correct it, {'' if self.sigma else 'give it a prior, '}or let it free."
+            f"measurements: stated {stated}, measured about {self.estimate:.4g} {self.unit}, "
+            f"{apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct it, "
+            f"{'' if self.sigma else 'give it a prior, '}or free it (--set {self.name}=free)."
         )
 
 
@@ -234,9 +234,11 @@ def refuse_contradicted_values(
             continue
         comparisons = _compare(fit, held, stated, wide)
         break
-    contradicted = [comparison for comparison in comparisons if comparison.together > _SIGNIFICANT]
+    contradicted = [
+        comparison for comparison in comparisons if comparison.sigmas_joint > _SIGNIFICANT
+    ]
     contradicted = contradicted or [
-        comparison for comparison in comparisons if comparison.alone > _SIGNIFICANT
+        comparison for comparison in comparisons if comparison.sigmas_alone > _SIGNIFICANT
     ]
     if contradicted:
         raise DidNotConverge([str(comparison) for comparison in contradicted])
@@ -281,7 +283,7 @@ def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
     """Fit with the stated parameters free; return the fit and its held directions."""
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
-    held = open_directions(problem, first.state, normal)
+    held = undetermined_directions(problem, first.state, normal)
     if len(held.basis):
         problem, state = held_at_nominal(problem, first.state, held)
         continued = first_minimum(problem, state)
@@ -384,10 +386,11 @@ class DoubtedCamera:
     def __str__(self) -> str:
         unit = f" {intrinsic_unit(self.key)}".rstrip()
         return (
-            f"The camera of {self.view} does not agree with its covariance: the measurements move "
-            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to {self.found:.6g}{unit},"
-            f" {self.apart:.0f} standard deviations of such a change; the stated uncertainty does "
-            "not include this error; calibrate the camera again at the same focus and zoom."
+            f"The camera of {self.view} does not agree with its covariance: the fit moves "
+            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to "
+            f"{self.found:.6g}{unit}, {self.apart:.0f} times the expected change; the stated "
+            "uncertainty does not include this error; calibrate the camera again at the same focus "
+            "and zoom."
         )
 
 
@@ -441,7 +444,7 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     note = (
         f"The fit rejected {n_rejected} of {n} outlines"
         f"{', ' + ', '.join(groups) if groups else ''}; the stated uncertainty is valid only if "
-        "these are wrong; check them and the reasons in the table of observations"
+        "these outlines are wrong; check them and their reasons in observations.csv"
     )
     stated = [
         name
@@ -483,9 +486,7 @@ def arms_of_other_widths(outlines: Outlines, is_arm: BoolArray) -> dict[int, str
         of_leg = is_arm & (outlines.leg == leg)
         n_wrong, total = int(is_wide[of_leg].sum()), int((is_wide | outlines.used)[of_leg].sum())
         if n_wrong >= _MIN_COUNT and n_wrong > _MOST_REJECTED * total:
-            reasons[leg] = (
-                f"{n_wrong} of whose {total} outlines show another width than the model's"
-            )
+            reasons[leg] = f"{n_wrong} of {total} outlines have another width than the model's"
     return reasons
 
 
@@ -495,11 +496,11 @@ def wrong_arms_in_words(wrong: Mapping[int, str], legs: Sequence[Leg]) -> str:
     for j, reason in wrong.items():
         reasons.setdefault(reason, []).append(str(legs[j].prismatic))
     description = "; ".join(
-        f"{list_in_words(names)}, {reason}" for reason, names in reasons.items()
+        f"{list_in_words(names)} ({reason})" for reason, names in reasons.items()
     )
     return (
-        f"the arms of {description}; they are not the straight cylinders of the model; correct "
-        "their radii, or model other shapes as boxes or meshes."
+        f"the arms of {description}. They are not the cylinders of the model: correct their radii, "
+        "or model other shapes as boxes or meshes."
     )
 
 
@@ -518,9 +519,9 @@ def wrong_arms(
         of_arm = o.on_arm & (o.leg == leg)
         total, rejected = int(of_arm.sum()), int(np.sum(of_arm & ~used))
         if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * total:
-            reasons[leg] = f"{rejected} of whose {total} outlines disagree with the fit"
+            reasons[leg] = f"{rejected} of {total} outlines disagree with the fit"
         elif times > ARM_MISFIT and offset_px > _ARM_MISFIT_PX:
-            reasons[leg] = f"whose outlines lie {times:.1f} times as far off as those of rods"
+            reasons[leg] = f"errors of outlines are {times:.1f} times as large as for rods"
     return reasons
 
 
@@ -552,9 +553,9 @@ def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
     if not names:
         return ()
     return (
-        f"The readings of {list_in_words(names)} have the opposite sign in the model: the fitted "
-        "axes or directions are reversed; correct them in the model, or negate the readings (for a "
-        "servo, the sign of us_per_deg).",
+        f"The readings of {list_in_words(names)} have the opposite sign in the model (the fitted "
+        "axes or directions are reversed); correct them in the model, or negate the readings (for "
+        "a servo, the sign of us_per_deg).",
     )
 
 
@@ -580,13 +581,12 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     if not contradictions:
         return []
     return [
-        f"The measurements contradict radii of the model: {'; '.join(contradictions)}; at most "
-        f"{RADIUS_SIGMAS:g} standard deviations are expected; measure these parts and correct the "
-        "model."
+        f"The measurements contradict radii of the model: {'; '.join(contradictions)}; limit "
+        f"{RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
     ]
 
 
-def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
+def blaming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
     """Prepend the stated values, if any, to a failure as its likely cause."""
     stated = stated_parameters(problem)
     if not stated:

@@ -13,15 +13,15 @@ import numpy as np
 
 from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
-    open_directions,
     refuse_undetermined_inliers,
+    undetermined_directions,
 )
 from legcal.calibration.joint_fit.diagnostics import (
     arms_of_other_widths,
-    naming_stated_values,
+    blaming_stated_values,
+    refuse_contradicted_board,
     refuse_contradicted_priors,
     refuse_contradicted_values,
-    refuse_other_board,
     rejected_notes,
     wrong_arms,
     wrong_arms_in_words,
@@ -30,14 +30,15 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.free_poses import (
     are_free,
     have_outliers,
+    in_other_assembly_modes,
     with_better_poses,
     with_free_poses,
 )
-from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median
+from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.scale import naming_missing_lengths
+from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
@@ -124,7 +125,7 @@ def refine(
             legs, measurements, used, settings, axes=axes, board=board, choices=choices
         )
         problem.require_determined()
-        with naming_missing_lengths(problem):
+        with explaining_missing_scale(problem):
             return _fit_from_best_start(problem, used, starts)
 
     return _fit_without_wrong_arms(fitted, outlines, legs.nominal)
@@ -153,7 +154,7 @@ def _fit_without_wrong_arms(
             with_arms = np.unique(outlines.leg[is_arm & outlines.used]).tolist()
             if not with_arms:
                 raise
-            wrong = dict.fromkeys(with_arms, "with whose outlines the joint fit fails")
+            wrong = dict.fromkeys(with_arms, "the joint fit fails when their outlines are used")
         else:
             if not wrong:
                 return dataclasses.replace(solution, notes=(*notes, *solution.notes))
@@ -182,7 +183,7 @@ def _fit_from_best_start(
             continue
         if len(starts) > 1:
             cost = f"{minimum.cost:.6g}"
-            details.append(f"From {origin}, the joint fit reached a cost of {cost}.")
+            details.append(f"Starting from {origin}, the joint fit reached a cost of {cost}.")
         bound_of_ties = (1.0 + _COST_TOLERANCE) * minimum.cost
         rank = sum(other.cost <= bound_of_ties for _, other in candidates)
         candidates.insert(rank, (start, minimum))
@@ -255,9 +256,9 @@ def _refuse_common_mode(solution: Solution, most_px: float) -> None:
     if shifted > most_px:
         kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
         raise DidNotConverge(
-            f"The joint fit ended with a common-mode error of outlines ({kind}) of {shifted:.1f} "
-            f"px, more than the {most_px:g} px that light and blur can explain; check camera "
-            "poses, readings and outlines, or start nearer to the truth."
+            f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
+            f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or start "
+            "from a better nominal model."
         )
 
 
@@ -267,18 +268,34 @@ def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None
     try:
         if are_free(problem, begin):
             return _first_minimum_with_free_poses(problem, begin)
-        return first_minimum(*_held_at_start(problem, begin))
+        first = first_minimum(*_hold_undetermined_at_start(problem, begin))
+        return _in_best_assembly_modes(problem, first)
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
-        raise naming_stated_values(problem, failure) from None
+        raise blaming_stated_values(problem, failure) from None
+
+
+def _in_best_assembly_modes(problem: FitProblem, first: Minimum[State]) -> Minimum[State]:
+    """First minimum with poses in another assembly mode where that lowers the cost.
+
+    Forward kinematics of a start that is a few millimetres off may close in a wrong one, and no
+    small step leads back: the images of such poses would be rejected as outliers.
+    """
+    state = in_other_assembly_modes(problem, first.state, _PART_OF_MODEL)
+    if state is first.state:
+        return first
+    other = first_minimum(*_hold_undetermined_at_start(problem, state), must_converge=False)
+    return other if other.cost < first.cost else first
 
 
 def _first_minimum_with_free_poses(problem: FitProblem, start_state: State) -> Minimum[State]:
     """First minimum, with a search for better poses of images with large residuals."""
 
     def minimum(state: State, must_converge: bool = True) -> Minimum[State]:
-        return first_minimum(*_held_at_start(problem, state), must_converge=must_converge)
+        return first_minimum(
+            *_hold_undetermined_at_start(problem, state), must_converge=must_converge
+        )
 
     try:
         best = minimum(start_state)
@@ -300,14 +317,14 @@ def _first_minimum_with_free_poses(problem: FitProblem, start_state: State) -> M
     return best
 
 
-def _held_at_start(
+def _hold_undetermined_at_start(
     problem: FitProblem, begin: State
 ) -> tuple[FitProblem, State, Mapping[str, Residuals] | None]:
     """Hold the directions that are open at the start; also return the rows computed there."""
     begin = problem.projected(begin)
     linear = linearize(problem, begin)
     try:
-        held = open_directions(problem, begin, information(problem, begin, linear))
+        held = undetermined_directions(problem, begin, information(problem, begin, linear))
     except NotIdentifiable:  # at the start only, or reported at the minimum
         return problem, begin, linear.rows
     if len(held.basis):
@@ -324,9 +341,9 @@ def _refine_minimum(
     """Refine a first minimum: held directions, rounds, checks, result."""
     refuse_contradicted_values(problem, start, first.state)
     normal = information(problem, first.state, first.linear, problem.loss)
-    held = open_directions(problem, first.state, normal)
-    refuse_other_board(problem, first.state, normal)
-    unheld, state = problem, first.state
+    held = undetermined_directions(problem, first.state, normal)
+    refuse_contradicted_board(problem, first.state, normal)
+    without_held, state = problem, first.state
     try:
         if len(held.basis):
             problem, state = held_at_nominal(problem, state, held)
@@ -340,21 +357,21 @@ def _refine_minimum(
         refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
-        refuse_contradicted_values(unheld, start, state, with_priors=True)
-        _refuse_contradicted(unheld, state)
-        _refuse_undetermined(unheld, state)
+        refuse_contradicted_values(without_held, start, state, with_priors=True)
+        _refuse_contradicted(without_held, state)
+        _refuse_undetermined(without_held, state)
         if isinstance(failure, DidNotConverge):
-            raise naming_stated_values(unheld, failure) from None
+            raise blaming_stated_values(without_held, failure) from None
         raise
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(unheld, start, state, with_priors=True)
+        refuse_contradicted_values(without_held, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if open directions explain a failed fit."""
-    open_directions(problem, state, information(problem, state, linearize(problem, state)))
+    undetermined_directions(problem, state, information(problem, state, linearize(problem, state)))
 
 
 def _refuse_contradicted(problem: FitProblem, state: State) -> None:
@@ -362,7 +379,7 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
     claimed = problem.outlines.covariance
     noise = NoiseModel()
     if len(claimed):
-        noise = noise_of_the_median(problem.offsets(state), claimed)
+        noise = robust_noise(problem.offsets(state), claimed)
     problem = problem.weighted(noise)
     linear = linearize(problem, state)
     refuse_contradicted_priors(problem, state, information(problem, state, linear))
@@ -409,5 +426,5 @@ def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Arra
     state = problem.begin(truth)
     state = state if radii is None else dataclasses.replace(state, radii=radii)
     normal = information(problem, state, linearize(problem, state))
-    open_directions(problem, state, normal)
+    undetermined_directions(problem, state, normal)
     return named_covariance(problem, state, normal.kept_covariance())

@@ -1,8 +1,9 @@
-"""Search for platform poses that readings do not determine: the best of several starts per pose.
+"""Search for better platform poses: the best of several starts per pose.
 
-A few lines in an image are consistent with several poses, and the joint fit converges to the
-nearest. Each pose is therefore searched from random starts with cameras and legs fixed, before the
-fit and again after its first minimum. Errors of the nominal model count as noise.
+Where readings do not determine a pose, a few lines in an image are consistent with several, and the
+joint fit converges to the nearest. Each pose is therefore searched from random starts with cameras
+and legs fixed, before the fit and again after its first minimum. Errors of the nominal model count
+as noise. Where readings determine a pose, another assembly mode has the same readings.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import numpy as np
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State
+from legcal.calibration.tuning import OUTLIER_POSE_COST
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import GaussianPrior, Linearization, linearize
+from legcal.estimation.problem import Frames, GaussianPrior, Linearization, linearize
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import freedoms, pose_equations
 from legcal.machine.rods import first_rods
+from legcal.machine.solved_poses import solve_poses
 
 _SEED, _N_DRAWS = 1965, 16  # random starts of every pose, besides its present value
 _TURN, _SHIFT = 0.4, 0.3  # standard deviation of random starts [rad, mean leg lengths]
@@ -28,7 +31,6 @@ _DAMPING, _SLOW = 1e-3, 0.999  # first damping; ratio of costs of a step without
 _MODEL_PX, _MODEL_LENGTH = 2.0, 0.005  # errors of the nominal model [px], mean leg lengths
 _WIDTH = 3.0  # width of the loss in median residuals
 _RANK = 1e-6  # relative to the largest singular value
-_OUTLIER_COST = 10.0  # cost of a pose over the median
 _OPEN = 0.1  # mean leg lengths or rad: least uncertainty of an undetermined pose
 _BETTER = 0.5  # ratio of costs, below which another pose is accepted
 
@@ -72,7 +74,7 @@ def with_free_poses(problem: FitProblem, state: State) -> State:
     soft = soft.with_parts((replace(legs, prior=legs.prior + near),), ())
     for seed in range(2):
         state = with_better_poses(soft, state, seed=seed)
-        loss = PseudoHuber(_loss_width(soft, state))
+        loss = PseudoHuber(_loss_width(soft, linearize(soft, state)))
         state = minimise(soft, state, loss, max_iterations=40, must_converge=False).state
     return state
 
@@ -83,11 +85,9 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
     *part* of the errors of a nominal model counts as noise.
     """
     problem = _with_model_noise(problem, part, state.mean_length) if part else problem
-    loss = PseudoHuber(_loss_width(problem, state))
+    loss = PseudoHuber(_loss_width(problem, linearize(problem, state)))
     rng, n = np.random.default_rng((_SEED, seed)), len(state.platform_pose.t)
-    spread = np.zeros(problem.d_element)  # readings of a posture follow from its pose
-    spread[:6] = np.repeat([_TURN, _SHIFT * state.mean_length], 3)
-    spread[np.setdiff1d(np.arange(6), freedoms(problem.legs.frame_legs))] = 0.0
+    spread = _spread_of_starts(problem, state)
     best, least = _minimise_poses(problem, state, loss)
     least = _BETTER * least
     for _ in range(_N_DRAWS):
@@ -99,12 +99,64 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
     return best
 
 
+def in_other_assembly_modes(problem: FitProblem, state: State, part: float) -> State:
+    """Move poses with a far larger cost than most to another assembly mode, if that fits better.
+
+    Other poses with the same readings are found by forward kinematics from random starts, with
+    cameras and legs fixed. *part* of the errors of a nominal model counts as noise.
+    """
+    rows = np.flatnonzero(outlier_poses(problem, state))
+    if len(rows) == 0:
+        return state
+    problem = _with_model_noise(problem, part, state.mean_length)
+    loss, n = (
+        PseudoHuber(_loss_width(problem, linearize(problem, state))),
+        len(state.platform_pose.t),
+    )
+
+    def cost_at(trial: State) -> Array:
+        return _cost_of_poses(problem, linearize(problem, trial), loss, n)
+
+    rng, now = np.random.default_rng(_SEED), state.platform_pose.frames
+    several = np.tile(rows, _N_DRAWS)
+    steps = rng.normal(size=(len(several), 6)) * _spread_of_starts(problem, state)[:6]
+    starts = Frames(now.R[several], now.t[several]).moved(steps)
+    solved = solve_poses(state.legs, problem.legs.frame_legs, *starts, problem.lengthening[several])
+    best, least = state, _BETTER * cost_at(state)
+    for draw in range(_N_DRAWS):
+        drawn = slice(draw * len(rows), (draw + 1) * len(rows))
+        R, t = now.R.copy(), now.t.copy()
+        R[rows], t[rows] = solved.R[drawn], solved.t[drawn]
+        postures = problem.postures(state.legs, Frames(R, t).motions)
+        trial = LegConstraints(problem.parameters).with_poses(state, postures)
+        cost = cost_at(trial)
+        best = best.with_chosen(cost < least, trial.platform_pose)
+        least = np.fmin(cost, least)
+    return best
+
+
 def have_outliers(problem: FitProblem, state: State) -> bool:
     """Whether a pose at a minimum has a far larger cost than most."""
-    loss = PseudoHuber(_loss_width(problem, state))
-    cost = _cost_of_poses(problem, linearize(problem, state), loss, len(state.platform_pose.t))
-    judged = cost[_are_determined(problem, state)]
-    return bool(np.any(judged > _OUTLIER_COST * np.median(cost)))
+    return bool(outlier_poses(problem, state).any())
+
+
+def outlier_poses(problem: FitProblem, state: State) -> BoolArray:
+    """Mask of determined poses with a far larger cost than most at a minimum, (n_poses,)."""
+    linear, n = linearize(problem, state), len(state.platform_pose.t)
+    loss = PseudoHuber(_loss_width(problem, linear))
+    cost = _cost_of_poses(problem, linear, loss, n)
+    is_large = cost > OUTLIER_POSE_COST * np.median(cost)
+    if not is_large.any():
+        return np.asarray(is_large)
+    return np.asarray(is_large & _are_determined(problem, state))
+
+
+def _spread_of_starts(problem: FitProblem, state: State) -> Array:
+    """Spread of the random starts of a posture, (6 + n,): standard deviations [rad, m]."""
+    spread = np.zeros(problem.d_element)  # readings of a posture follow from its pose
+    spread[:6] = np.repeat([_TURN, _SHIFT * state.mean_length], 3)
+    spread[np.setdiff1d(np.arange(6), freedoms(problem.legs.frame_legs))] = 0.0
+    return spread
 
 
 def _with_model_noise(problem: FitProblem, part: float, length: float) -> FitProblem:
@@ -126,9 +178,8 @@ def _with_model_noise(problem: FitProblem, part: float, length: float) -> FitPro
     return problem.weighted(noise).with_parts((), softened)
 
 
-def _loss_width(problem: FitProblem, state: State) -> float:
+def _loss_width(problem: FitProblem, linear: Linearization) -> float:
     """Width of the loss in which most residuals are inliers."""
-    linear = linearize(problem, state)
     norms = [
         np.sqrt(linear[factor.name].squared_norms)
         for factor in problem.factors

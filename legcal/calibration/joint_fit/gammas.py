@@ -18,9 +18,9 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.calibration.joint_fit.outline_errors import GAMMA_SIGMA
 from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.tuning import GAMMA_SIGMA
 from legcal.data.measurements import few_views
 from legcal.data.outlines import Outlines
 from legcal.estimation.solver import minimise
@@ -29,7 +29,7 @@ from legcal.geometry.types import Array
 
 GAMMA_RANGE = (1.0, 3.0)  # of trials: from linear to beyond sRGB
 GAMMA_STEP = 0.4  # in ln gamma
-GAMMA_TOLERANCE = 0.12  # in ln gamma; smaller than LIMB_SIGMA
+GAMMA_TOLERANCE = 0.12  # in ln gamma; smaller than LIMB_GAMMA_SIGMA
 MAX_GAMMA_TRIALS = 4  # after the first one
 SIGNIFICANCE = 2.0  # standard deviations
 
@@ -121,7 +121,7 @@ class GammaTrials:
             self.cameras, self.log_gamma.T, self.likelihoods.T, strict=True
         ):
             if views[0] in refused:
-                why = f"fewer of its outlines are usable with {refused[views[0]]:.2f}"
+                why = f"with {refused[views[0]]:.2f}, fewer of its outlines are usable"
             elif np.isfinite(merit).sum() == 1 < len(merit):
                 why = "the fit failed with every other gamma"
             elif (rival := _rival(tried, merit)) is not None:
@@ -129,9 +129,9 @@ class GammaTrials:
             else:
                 continue
             notes.append(
-                f"The gamma of the camera of {few_views(views)} is undecided: {why}; processing in "
-                "the camera is a common cause; write gamma of the views in dataset.yaml if you "
-                "know it, or switch the processing off."
+                f"The gamma of the camera of {few_views(views)} could not be determined: {why}; "
+                "in-camera processing is a common cause; state gamma of the views in dataset.yaml, "
+                "or switch the processing off."
             )
         return tuple(notes)
 

@@ -21,7 +21,7 @@ from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, information
-from legcal.estimation.uncertainty import explained_share
+from legcal.estimation.uncertainty import leverage
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.kinematics import pose_differences
 
@@ -308,9 +308,7 @@ def compare_held_out(
     _refuse_unseen(linear)
     readings = information(problem, state, linear, only=_READINGS)
     _refuse_undetermined(readings)
-    expected = np.eye(2) + explained_share(
-        problem, linear, readings, "outlines", predicted.covariance
-    )
+    expected = np.eye(2) + leverage(problem, linear, readings, "outlines", predicted.covariance)
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
     norm = _norms(linear["outlines"].r, expected)
     limit = problem.settings.rejection * _median_distance(norm)

@@ -19,7 +19,7 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import few
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, information, normal_equations
-from legcal.estimation.uncertainty import explained_share, score_test
+from legcal.estimation.uncertainty import leverage, score_test
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.redundancy import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
@@ -65,7 +65,7 @@ class JudgedReadings:
         return replace(self, wrong=tuple(wrong))
 
 
-def with_rough_readings(problem: FitProblem) -> FitProblem:
+def with_inflated_reading_noise(problem: FitProblem) -> FitProblem:
     """Inflate the noise of redundant readings and put them under the robust loss."""
     if not problem.legs.is_redundant:
         return problem
@@ -79,13 +79,13 @@ def with_rough_readings(problem: FitProblem) -> FitProblem:
     return problem.with_factors(*rough)
 
 
-def like_readings(problem: FitProblem, other: FitProblem) -> FitProblem:
+def with_rejected_readings_of(problem: FitProblem, other: FitProblem) -> FitProblem:
     """Reject the readings that another problem rejects."""
     used = [_used(problem, name) & _used(other, name) for name in _FACTORS]
     return _using(problem, problem, used)
 
 
-def with_judged_readings(problem: FitProblem, state: State) -> tuple[FitProblem, bool]:
+def reject_outlier_readings(problem: FitProblem, state: State) -> tuple[FitProblem, bool]:
     """Reject one outlier per pose where it can be identified; also return whether any was.
 
     At a pose without other measurements any of the suspects is rejected: the remaining readings
@@ -105,7 +105,7 @@ def with_judged_readings(problem: FitProblem, state: State) -> tuple[FitProblem,
     return (_using(problem, problem, used) if is_changed else problem), is_changed
 
 
-def with_agreeing_readings(
+def restore_inlier_readings(
     problem: FitProblem, complete: FitProblem, state: State
 ) -> tuple[FitProblem, bool]:
     """Restore rejected readings that are inliers after all; also return whether any was.
@@ -119,7 +119,7 @@ def with_agreeing_readings(
     limit = problem.settings.rejection * _tests(problem, linear, normal).scale
     linear, used, is_changed = linearize(restored, state), list[BoolArray](), False
     for name in _FACTORS:
-        predicted = explained_share(restored, linear, normal, name)[:, 0, 0]
+        predicted = leverage(restored, linear, normal, name)[:, 0, 0]
         agrees = linear[name].r[:, 0] ** 2 <= limit**2 * (1.0 + predicted)
         restored_now = agrees & _used(complete, name) & ~_used(problem, name)
         used.append(_used(problem, name) | restored_now)
@@ -179,14 +179,14 @@ def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
     reading, was = ("readings", "were") if n > 1 else ("reading", "was")
     return (
         f"{n} {reading} of redundant motors contradict{'s' * (n == 1)} all other measurements and "
-        f"{was} left out: {listed}; check {'them' if n > 1 else 'it'}.",
+        f"{was} rejected: {listed}; check {'them' if n > 1 else 'it'}.",
     )
 
 
 def _in_words(wrong: WrongReading) -> str:
     """Motor, image and error of a rejected reading, in words."""
     scale, unit = SHOWN_IN[wrong.unit]
-    alternatives = f" (or as likely one of {', '.join(wrong.alike)})" if wrong.alike else ""
+    alternatives = f" (or {' or '.join(wrong.alike)}, equally likely)" if wrong.alike else ""
     place = f"{wrong.view}, image {wrong.image}"
     return f"{wrong.motor}{alternatives} in {place} by {scale * wrong.off:+.3g} {unit}"
 
@@ -213,7 +213,7 @@ def _doubts(
             worst = max(of_motor, key=lambda reading: abs(reading.off))
             what = (
                 f"{len(of_motor)} of {n} readings of {legs[leg].motor_label} contradict the other "
-                f"measurements, most of all {_in_words(worst)}; this is not an accident"
+                f"measurements, most of all {_in_words(worst)}: too many to be random"
             )
             doubts.append((what, "check the scale, zero and slip of that motor"))
     undecided = list[str]()
@@ -321,7 +321,7 @@ def _best_scale(problem: FitProblem, linear: Linearization, normal: NormalEquati
     best = int(order[0])
     labels = few([legs[motors[i]].motor_label for i in equal.tolist()])
     if len(equal) > 1:
-        return f"and the scales of {labels} explain it equally well"
+        return f"and scale errors of {labels} explain it equally well"
     return (
         f"and a scale error of {labels} of {100 * score[best] / K[best]:+.2g} % explains most of it"
     )
@@ -334,7 +334,7 @@ def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) 
         used = np.flatnonzero(_used(problem, name))
         if not len(readings):
             continue
-        share = explained_share(problem, linear, normal, name)[used, 0, 0]
+        share = leverage(problem, linear, normal, name)[used, 0, 0]
         redundancy = np.where(1.0 - share > MIN_REDUNDANCY, 1.0 - share, 0.0)
         r = linear[name].r[used, 0]
         parts.append((readings.pose[used], readings.leg[used], r, redundancy))

@@ -33,6 +33,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
+from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_GAMMA_SIGMA, MIN_BIAS_GAIN, POLISHED_BIAS_PX
 from legcal.data.measurements import few_views
 from legcal.estimation.variances import Effects, estimate_variances, expected_variances
 from legcal.geometry.covariances import whitener
@@ -61,19 +62,11 @@ KINDS = (
 PLACES = ("bias of an edge at a place", "tilt of an edge at a place")  # not estimated
 GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the suffix of its names
 N_KINDS = len(KINDS) + 1
-GAMMA_SIGMA = 0.5  # prior on ln gamma: photographs are linear, or near 2.2
 SIDEWAYS = np.sqrt(2.0)  # ratio of the standard deviations of sideways and inward biases
 _MAX_PLACES = 100  # with the most outlines
-# Bias at a place of a polished part, which reflects much the same there in all poses [px]: in
-# photographs of chromed and polished rods with truth, means of an edge in a view scatter by that.
-_POLISHED_BIAS = 0.2
-_MIN_BIAS_GAIN = 6.0  # one set of white residuals in ten to twenty gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
 RECOVERED_SHARE = 0.5  # of an error of ln gamma, recovered by a fit
-# Systematic errors at the limb that look like another gamma, in rendered photographs of machines
-# with a known one: standard deviation of its logarithm.
-LIMB_SIGMA = 0.17
 _VAGUE_SIGMA = 0.25  # of ln gamma, above which it is reported as hardly determined
 
 
@@ -120,7 +113,7 @@ class NoiseModel:
         return np.asarray(np.sum(whitened**2, axis=-1))
 
 
-def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
+def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
     """Estimate the noise from the median outline, robust against less than half outliers.
 
     The difference of the offsets at both ends is independent of the bias, and their sum of the
@@ -449,7 +442,7 @@ def estimated_biases(
     """
     sigma = np.zeros(N_KINDS)
     start = None if near is None else near.shown
-    variances, _ = estimate_variances(Effects(z, K, possible.kind), _MIN_BIAS_GAIN, start)
+    variances, _ = estimate_variances(Effects(z, K, possible.kind), MIN_BIAS_GAIN, start)
     sigma[: len(variances)] = np.sqrt(variances)
     return replace(possible.of_sizes(with_gamma(np.maximum(sigma, least))), shown=variances)
 
@@ -508,7 +501,7 @@ def least_at_places(outlines: ObservedOutlines, shifts: Array) -> Array:
     polished = np.array([part in outlines.polished for part in outlines.parts], dtype=np.bool_)
     at_place = shifts.any(axis=1).reshape(len(shifts), len(PLACES), -1)
     least = np.zeros(at_place.shape[1:])
-    least[0] = _POLISHED_BIAS * at_place[polished[outlines.radius], 0].any(axis=0)
+    least[0] = POLISHED_BIAS_PX * at_place[polished[outlines.radius], 0].any(axis=0)
     return least.ravel()
 
 
@@ -585,7 +578,7 @@ class EstimatedGamma:
         """Standard deviation of its logarithm: fits recover a share of it."""
         unseen = (1.0 / RECOVERED_SHARE - 1.0) * np.log(self.gamma / self.measured_with)
         return float(
-            np.sqrt((self.fitted_sigma / RECOVERED_SHARE) ** 2 + unseen**2 + LIMB_SIGMA**2)
+            np.sqrt((self.fitted_sigma / RECOVERED_SHARE) ** 2 + unseen**2 + LIMB_GAMMA_SIGMA**2)
         )
 
     def __str__(self) -> str:

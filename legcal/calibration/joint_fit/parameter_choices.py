@@ -128,7 +128,7 @@ class KnownParameters:
         """All names of parameters, with synonyms."""
         return (*self.by_name, *self.synonyms)
 
-    def counted(self, name: str) -> str:
+    def canonical(self, name: str) -> str:
         """Return the canonical name."""
         return self.synonyms.get(name, name)
 
@@ -146,7 +146,7 @@ def known_parameters(
     boards: Sequence[FixedBoard] = (),
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
-    by_name, others = _kinematic(machine), _no_parameters(machine)
+    by_name, others = _kinematic(machine), _rejected_names(machine)
     seen: dict[str, KnownParameter] = dict(_radii(machine))
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
@@ -237,7 +237,7 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
     return parameters, synonyms
 
 
-def _no_parameters(machine: Machine) -> dict[str, str]:
+def _rejected_names(machine: Machine) -> dict[str, str]:
     """Names that look like parameters of a machine but are not, with the reason."""
     free = free_coordinates(len(machine.legs), machine.frame_legs)
     known = parametrization_of(machine, twists=True).names
@@ -252,7 +252,7 @@ def _no_parameters(machine: Machine) -> dict[str, str]:
                 others[name] = (
                     f"a coordinate that is zero by the definition of {frame}"
                     if is_zero
-                    else "a coordinate on which nothing depends"
+                    else "a coordinate that has no effect"
                 )
         angles = ("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist")
         names = [f"{leg.name}.{angle}" for angle in angles]
@@ -269,11 +269,11 @@ def _other_lengths(leg: Leg) -> dict[str, str]:
         return {offset: f"a leg of constant length, whose parameter is {length}"}
     if leg.kind is LegKind.ACTUATED:
         return {length: f"a leg with an encoder, whose parameter is {offset}"}
-    reason = "a leg without an encoder, whose length is whatever the platform makes it"
+    reason = "a leg without an encoder, whose length is passive"
     return {offset: reason, length: reason}
 
 
-_DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
+_PAST_TENSE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
 
 
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
@@ -306,7 +306,7 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
     if all(choices.holds(n, by_default=is_held_by_default(n)) for n in names):
         raise UsageError(
-            "The mechanism could not be calibrated: all of its parameters are fixed; fix fewer of "
+            "All parameters of the mechanism are fixed: nothing is left to calibrate; fix fewer of "
             "them."
         )
     return choices
@@ -354,10 +354,10 @@ def _decisions(
 def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
     """Canonical names of the parameters that an override matches."""
     if override.name in known.names:
-        return (known.counted(override.name),)
+        return (known.canonical(override.name),)
     if ":" in override.name:
         return _matching_length(override, known)
-    names = [known.counted(name) for name in known.names if fnmatchcase(name, override.name)]
+    names = [known.canonical(name) for name in known.names if fnmatchcase(name, override.name)]
     return tuple(dict.fromkeys(names))
 
 
@@ -415,16 +415,15 @@ def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
         if ":" not in override.name or lengths[1] <= _MEASURED_RATIO * lengths[0]:
             return ""
         return (
-            f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} "
-            f"between joints that the model has {_with_unit(parameter.nominal, parameter)} apart, "
-            f"needed a distance within {100.0 * (_MEASURED_RATIO - 1.0):.0f} % of that; check the "
-            "number, its unit and between which joints it was measured, or correct the model."
+            f"{override.where} could not be used: {_with_unit(stated.value, parameter)} differs by "
+            f"more than {100.0 * (_MEASURED_RATIO - 1.0):.0f} % from the distance of these joints "
+            f"in the model, {_with_unit(parameter.nominal, parameter)}; check the number, its unit "
+            "and between which joints it was measured, or correct the model."
         )
     return (
-        f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} for "
-        f"{name}, needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far "
-        f"from the nominal {_with_unit(parameter.nominal, parameter)}; check the number and its "
-        "unit."
+        f"{override.where} could not be used: {_with_unit(stated.value, parameter)} for {name} is "
+        f"implausible (nominal {_with_unit(parameter.nominal, parameter)}, accepted "
+        f"{parameter.least:.4g} to {parameter.most:.4g}); check the number and its unit."
     )
 
 
@@ -446,7 +445,7 @@ def _contradiction(
     others = [override for override, decision in several if decision.action != "fixed"]
     stated = {(d.value, d.sigma): override for override, d in several if d.value is not None}
     if fixed and others:
-        done, pair = f"both fixed and {_DONE[others[0].action]}", (fixed[0], others[0])
+        done, pair = f"both fixed and {_PAST_TENSE[others[0].action]}", (fixed[0], others[0])
     elif len(stated) > 1:
         first, second, *_ = stated.values()
         done = "fixed at two values" if fixed else "given two different priors"
@@ -456,8 +455,8 @@ def _contradiction(
     other = next((w.name for w in pair if w.name in known.synonyms), "")
     also = f", which is {other} too," if other else ""  # views that have one camera
     return (
-        f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, "
-        "needed one of them; remove the other."
+        f"{name}{also} could not be {done}: {_quoted(pair[0])} and {_quoted(pair[1])} are in "
+        "conflict; keep one of them."
     )
 
 

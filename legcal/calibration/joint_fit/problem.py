@@ -52,6 +52,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
+from legcal.calibration.tuning import EDGE_BIAS_PX
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.outlines import Outlines
@@ -72,7 +73,7 @@ from legcal.machine.equations import freedoms
 from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import Parametrization, is_held_by_default
-from legcal.machine.rods import readings_of_rods
+from legcal.machine.rods import reading_legs, readings_of_rods
 from legcal.machine.ties import wholly_tied
 from legcal.vision.board import LINKS
 from legcal.vision.camera import (
@@ -85,7 +86,6 @@ from legcal.vision.camera import (
     with_intrinsics,
 )
 
-_EDGE_BIAS_PX = 0.1  # by which light at the limb and blur may move all edges of a camera alike
 _MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of a frame: [rad], and any displacement
 
 
@@ -205,6 +205,22 @@ class FitProblem(EstimationProblem[State]):
         q, read = readings_of_rods(legs, R, t), self.observed.actuator_readings
         q[read.pose, read.actuator] = read.reading
         return Postures(R, t, q)
+
+    @property
+    def lengthening(self) -> Array:
+        """The readings (n_poses, n_legs) as :func:`solve_poses` takes them, NaN where unknown.
+
+        They are s q of actuated legs [m], and q of rods on actuators [m or rad].
+        """
+        legs, of_legs, of_actuators = (
+            self.legs.nominal,
+            self.readings,
+            self.observed.actuator_readings,
+        )
+        table = np.full((self.n_elements, len(legs)), np.nan)
+        table[of_legs.pose, of_legs.leg] = of_legs.length
+        table[of_actuators.pose, of_actuators.leg] = of_actuators.reading
+        return table[:, list(reading_legs(legs))]
 
     def offsets(self, state: State) -> Array:
         """Return the offsets of both ends of outlines from predicted ones, (n, 2) [px]."""
@@ -475,7 +491,7 @@ def _with_edge_bias(
     added to each radius, times their number.
     """
     stated = [name for name in radii if name in priors]
-    relative_bias = _EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
+    relative_bias = EDGE_BIAS_PX / (0.5 * outlines.width_px)  # of a radius
     sigma_of = dict(zip(radii, np.sqrt(len(stated)) * relative_bias * nominal, strict=True))
     wider = {
         n: replace(priors[n], sigma=float(np.hypot(priors[n].sigma, sigma_of[n]))) for n in stated

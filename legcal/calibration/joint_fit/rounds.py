@@ -19,10 +19,10 @@ import numpy as np
 
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
-    like_readings,
-    with_agreeing_readings,
-    with_judged_readings,
-    with_rough_readings,
+    reject_outlier_readings,
+    restore_inlier_readings,
+    with_inflated_reading_noise,
+    with_rejected_readings_of,
 )
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
@@ -35,29 +35,28 @@ from legcal.calibration.joint_fit.outline_errors import (
     estimated_biases,
     expected_biases,
     least_at_places,
-    noise_of_the_median,
     possible_biases,
+    robust_noise,
     shifts_at_places,
     sigmas_at_places,
     with_gamma,
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.measurements import few
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
-from legcal.estimation.uncertainty import explained_share, response, score_test, scores_of_block
+from legcal.estimation.uncertainty import leverage, response, score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.cylinder import EPSILON
 
-_NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
 _READING_ROUNDS = 8  # each rejects at most one reading per pose
 _REJECTION_TOLERANCE = 0.005  # relative decrease of the cost, in rounds that reject outliers
-_PASSING = 1e-6  # tolerance of intermediate minima, in squared sigmas
-_TAPER = 0.2  # relative half-width of the weight's transition at the rejection distance
+_INTERMEDIATE_TOLERANCE = 1e-6  # tolerance of intermediate minima, in squared sigmas
 _ACCEPTED = 0.5  # weight at the rejection distance
 _MIN_REDUNDANCY = 0.05  # mean redundancy of corners
 _MIN_SCALE = 0.1
@@ -67,7 +66,7 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
 @dataclass(frozen=True, eq=False)
-class AtPlaces:
+class RepeatedErrors:
     """Errors of edges that return to places; not estimated as biases."""
 
     sigma: Array  # (2,) of ``PLACES``, root mean squares over all places [px]
@@ -83,7 +82,7 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    at_places: AtPlaces | None = None  # errors shared there, None where there are none
+    at_places: RepeatedErrors | None = None  # errors shared there, None where there are none
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
 
     @property
@@ -108,7 +107,7 @@ class Fit:
         minimum = replace(self.minimum, state=state)
         return replace(self, problem=problem, minimum=minimum, edge_biases=biases)
 
-    def passed(self, relative_tolerance: float = 0.0) -> Fit:
+    def reoptimised(self, relative_tolerance: float = 0.0) -> Fit:
         """Approach the minimum of the problem from the minimum for other weights."""
         return replace(
             self, minimum=_approach_minimum(self.problem, self.minimum, relative_tolerance)
@@ -138,7 +137,7 @@ def first_minimum(
     """
     original, all_outlines = problem, np.ones(len(problem.outlines), dtype=np.bool_)
     is_rough = problem.legs.is_redundant
-    claimed = with_rough_readings(problem.weighted(NoiseModel()))
+    claimed = with_inflated_reading_noise(problem.weighted(NoiseModel()))
     chosen = of_determined_poses(claimed, begin, all_outlines)
     problem, loss = claimed.weighted(NoiseModel(), chosen), claimed.loss
     legs, n = problem.legs, problem.n_kinematic
@@ -146,7 +145,7 @@ def first_minimum(
     length = begin.mean_length
     metre = np.array([1.0 if unit == "m" else 1.0 / length for unit in problem.units[:n]])
     nominal_prior = GaussianPrior(
-        np.arange(n, dtype=np.intp), nominal, _NOMINAL_SIGMA * length * metre
+        np.arange(n, dtype=np.intp), nominal, FIRST_MINIMUM_SIGMA * length * metre
     )
     block = problem.block("legs")
     regularised = problem.with_parts((replace(block, prior=block.prior + nominal_prior),), ())
@@ -155,7 +154,7 @@ def first_minimum(
         begin,
         loss,
         max_iterations=problem.settings.max_iterations,
-        tolerance=_PASSING,
+        tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=_REJECTION_TOLERANCE,
         computed_rows=computed_rows if chosen.all() and not is_rough else None,
         must_converge=must_converge,
@@ -166,7 +165,7 @@ def first_minimum(
     linear = linearize(problem, minimum.state, minimum.linear.rows if same else None)
     cost = robust_cost(problem, linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
-        rough = with_rough_readings(problem)
+        rough = with_inflated_reading_noise(problem)
         cost = robust_cost(rough, linearize(rough, minimum.state), loss)
     return Minimum(minimum.state, linear, cost, minimum.iterations)
 
@@ -201,7 +200,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     _refuse_wrong_axes(fit)
     return replace(
         fit,
-        at_places=_at_places(fit),
+        at_places=_repeated_errors(fit),
         notes=check_convergence(changes, problem.outlines.covariance, problem.settings),
     )
 
@@ -211,21 +210,23 @@ def _without_outliers(fit: Fit) -> Fit:
     given, settings, claimed = fit.problem, fit.problem.settings, fit.problem.outlines.covariance
     # Wrong readings go first, before they bias the fit: the first minimum has inflated noise.
     if given.legs.is_redundant:
-        rough, tolerance = with_rough_readings(given), _REJECTION_TOLERANCE
+        rough, tolerance = with_inflated_reading_noise(given), _REJECTION_TOLERANCE
         rough, minimum = _without_wrong_readings(rough, rough, fit.minimum, tolerance)
-        fit = replace(fit, problem=like_readings(given, rough), minimum=minimum).passed(tolerance)
+        fit = replace(
+            fit, problem=with_rejected_readings_of(given, rough), minimum=minimum
+        ).reoptimised(tolerance)
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before, offsets = fit.accepted, fit.problem.offsets(fit.state)
-        fit = fit.weighted(noise_of_the_median(offsets[before], claimed[before]))
+        fit = fit.weighted(robust_noise(offsets[before], claimed[before]))
         if np.sum(before != fit.accepted) <= settings.error_tolerance * fit.accepted.sum():
             break  # left to the rounds of noise estimation
-        fit = fit.passed(_REJECTION_TOLERANCE)
+        fit = fit.reoptimised(_REJECTION_TOLERANCE)
     _refuse_disagreement(fit)
     for _ in range(_BOARD_ROUNDS if any(map(len, given.boards)) else 0):
         judged = _with_corner_noise(fit.problem, fit.state)
-        fit = replace(fit, problem=judged).passed(_REJECTION_TOLERANCE)
+        fit = replace(fit, problem=judged).reoptimised(_REJECTION_TOLERANCE)
     if given.legs.is_redundant:
-        fit = fit.passed()
+        fit = fit.reoptimised()
         problem, minimum = _without_wrong_readings(fit.problem, given, fit.minimum)
         fit = replace(fit, problem=problem, minimum=minimum)
     return fit
@@ -250,7 +251,7 @@ def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tupl
             )
             are_white = not len(biases) and not len(fit.state.biases)
             fit = fit.with_edge_biases(biases)
-        fit = fit.passed()
+        fit = fit.reoptimised()
         if not fit.accepted.any():
             break
         changes = Changes.of(before, fit)
@@ -280,19 +281,19 @@ def _without_wrong_readings(
 
     Readings of the *complete* problem that agree after the others are rejected are restored, once.
     """
-    may_come_back = True
+    may_restore = True
     for _ in range(_READING_ROUNDS):
-        problem, is_changed = with_judged_readings(problem, minimum.state)
-        if not is_changed and may_come_back:
-            problem, is_changed = with_agreeing_readings(problem, complete, minimum.state)
-            may_come_back = False
+        problem, is_changed = reject_outlier_readings(problem, minimum.state)
+        if not is_changed and may_restore:
+            problem, is_changed = restore_inlier_readings(problem, complete, minimum.state)
+            may_restore = False
         if not is_changed:
             break
         minimum = _approach_minimum(problem, minimum, relative_tolerance)
     return problem, minimum
 
 
-def _at_places(fit: Fit) -> AtPlaces | None:
+def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
     """Return errors at places and their effect on the covariance; None where there are none.
 
     They are estimated where residuals show biases at all; those of polished parts are there anyway.
@@ -315,7 +316,7 @@ def _at_places(fit: Fit) -> AtPlaces | None:
     normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * of_places
     sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
-    return AtPlaces(sigma, moved @ moved.T)
+    return RepeatedErrors(sigma, moved @ moved.T)
 
 
 def _approach_minimum(
@@ -325,7 +326,7 @@ def _approach_minimum(
     return _minimise_near(
         problem,
         near,
-        tolerance=_PASSING,
+        tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=relative_tolerance,
         rate=near.rate,
     )
@@ -366,7 +367,7 @@ def _noise(fit: Fit) -> NoiseModel:
     claimed, used = problem.outlines.covariance, weight > 0.0
     normal = information(problem, fit.state, linear, problem.loss)
     L = np.linalg.cholesky(fit.noise.covariance(claimed))[used]
-    share = explained_share(problem, linear, normal, "outlines")[used]
+    share = leverage(problem, linear, normal, "outlines")[used]
     explained = L @ share @ np.swapaxes(L, -1, -2)  # weighted, as the squares are
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
     return estimate_noise(offsets, explained, claimed[used], weight[used])
@@ -380,8 +381,8 @@ def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
     """
     s = noise.squared_norms(problem.offsets(state), problem.outlines.covariance)
     begin, end = (
-        problem.settings.rejection * (1.0 - _TAPER),
-        problem.settings.rejection * (1.0 + _TAPER),
+        problem.settings.rejection * (1.0 - REJECTION_TAPER),
+        problem.settings.rejection * (1.0 + REJECTION_TAPER),
     )
     part = np.clip((end - np.sqrt(s)) / (end - begin), 0.0, 1.0)
     weight = np.asarray(part**2 * (3.0 - 2.0 * part))
@@ -398,8 +399,8 @@ def _refuse_disagreement(fit: Fit) -> None:
     if 2 * n_accepted < n or rms > most_px:
         raise DidNotConverge(
             f"The joint fit ended with {n - n_accepted} of {n} outlines rejected and an error of "
-            f"{rms:.1f} px (rms) of the others; most must agree, to {most_px:g} px; check camera "
-            "poses, readings and outlines."
+            f"{rms:.1f} px (rms) of the others; more than half must agree within {most_px:g} px. "
+            "Check camera poses, readings and outlines."
         )
 
 
@@ -410,8 +411,8 @@ def _refuse_wrong_axes(fit: Fit) -> None:
     if 2 * wrong > n:
         raise DidNotConverge(
             f"The joint fit ended with errors of {wrong} of {n} axes above {most:g} standard "
-            "deviations; most must agree; check the camera poses, the readings, and the units "
-            "(rad, m) of axes and their sigmas."
+            "deviations; more than half must agree. Check the camera poses, the readings, and the "
+            "units (rad, m) of axes and their sigmas."
         )
 
 
@@ -423,7 +424,7 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
     for board in problem.boards:
         if not len(board):
             continue
-        rows, share = linear[board.name], explained_share(problem, linear, normal, board.name)
+        rows, share = linear[board.name], leverage(problem, linear, normal, board.name)
         redundancies = 1.0 - 0.5 * np.einsum("nqq->n", share)
         norms = rows.squared_norms
         redundancy = max(float(np.mean(redundancies)), _MIN_REDUNDANCY)
@@ -441,9 +442,9 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
             board_name = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
                 f"The joint fit ended with an error of {rms:.1f} px (rms) of the corners of the "
-                f"calibration board{board_name}; most must agree to {settings.largest_rms_px:g} "
-                "px; check that the board did not move on its link, its dimensions, and the "
-                "camera files."
+                f"calibration board{board_name}; most must agree within "
+                f"{settings.largest_rms_px:g} px. Check that the board did not move on its link, "
+                "its dimensions, and the camera files."
             )
     return judged
 
@@ -518,9 +519,9 @@ def check_convergence(
     before, after = unit * changes.before, unit * changes.after
     i = int(np.argmax(np.abs(after - before)))
     last_change = (
-        f"the last round accepted or rejected {changes.n_changed} outlines anew, with "
-        f"{changes.n_accepted} accepted, and changed the standard deviation of one kind of error "
-        f"from {before[i]:.3f} px to {after[i]:.3f} px"
+        f"in the last round, {changes.n_changed} outlines were newly accepted or rejected "
+        f"({changes.n_accepted} are accepted), and one standard deviation of errors changed from "
+        f"{before[i]:.3f} px to {after[i]:.3f} px"
     )
     largest = max(float(before.max()), float(after.max()))
     most_changed = _MAX_CHANGED * changes.n_accepted

@@ -23,7 +23,7 @@ from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
 
-SCALE = "the scale, known from radii alone, by one standard deviation"
+SCALE = "an error of the scale, known from radii alone, by one standard deviation"
 _FEWEST = 3  # radii
 _SPREAD = 0.25  # of their common difference
 _OTHER_LENGTH = 0.0075  # relative change of rods, above which a stated distance is doubted
@@ -57,7 +57,7 @@ def _images_have_length(problem: FitProblem) -> bool:
 
 
 @contextmanager
-def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
+def explaining_missing_scale(problem: FitProblem) -> Iterator[None]:
     """Prepend to a failure that radii alone determine the scale, if they do."""
     try:
         yield
@@ -66,9 +66,9 @@ def naming_missing_lengths(problem: FitProblem) -> Iterator[None]:
             raise
         raise type(failure)(
             [
-                "The joint fit failed, and no measured length fixes the scale: there is neither a "
-                "reading of a leg nor a board, and radii alone hardly determine the platform "
-                "joints; "
+                "The joint fit failed, and no measured length determines the scale: there is "
+                "neither a reading of a leg nor a board, and radii alone hardly determine the "
+                "platform joints; "
                 + (
                     "measure a distance of two joints and state it (--length), or put a "
                     "calibration board on the base."
@@ -128,9 +128,9 @@ def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
         return ()
     way = "shorter" if common < 0.0 else "longer"
     return (
-        f"Rods come out {1e2 * abs(common):.1f} % {way} than the model's: the scale comes from "
-        f"{list_in_words(stated)} alone, and images fit any size; if the model is not that far "
-        "off, the stated distance is wrong: measure it again, or a second one.",
+        f"The fitted rods are {1e2 * abs(common):.1f} % {way} than the model's. The scale comes "
+        f"from {list_in_words(stated)} alone, and images cannot check it: if the model is more "
+        "accurate than that, the stated distance is wrong; measure it again, or a second one.",
     )
 
 
@@ -147,7 +147,7 @@ def _of_radii(problem: FitProblem, state: State) -> tuple[str, ...]:
         return ()
     way = "smaller" if common < 0.0 else "larger"
     return (
-        f"All radii come out {1e2 * abs(common):.0f} % {way} than the model's, so that everything "
-        f"may be that much {way} than it is; check the unit and the scale of the encoders, or the "
-        "radii of the model.",
+        f"All fitted radii are {1e2 * abs(common):.0f} % {way} than the model's, so the whole "
+        "result may be scaled by that factor; check the unit and the scale of the encoders, or "
+        "the radii of the model.",
     )

@@ -24,13 +24,15 @@ from legcal.machine.leg import LegColumns
 from legcal.machine.parameters import is_held_by_default
 from legcal.vision.camera import shared_cameras
 
-FITTED_CAMERA = "cameras as the measurements have them"  # where they contradict their files
+FITTED_CAMERA = (
+    "the camera corrections that the measurements suggest"  # where they contradict their files
+)
 _FOCAL_PART = 0.01  # relative error of the focal length
 _RADIUS_PART = 0.01
 _TWIST_ERROR = np.radians(0.1)
 _CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = {  # relative, px
     "a focal length 1 % longer": ({"fx": _FOCAL_PART, "fy": _FOCAL_PART}, {}),
-    "a principal point 0.1 px further right": ({}, {"cx": 0.1}),
+    "a principal point 0.1 px further to the right": ({}, {"cx": 0.1}),
     "a principal point 0.1 px further down": ({}, {"cy": 0.1}),
 }
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
@@ -111,7 +113,7 @@ def sensitivities(
             step = _twist_steps(problem, state, linear, normal, j)
             twists.setdefault("fixed" if is_fixed else "tied", []).append(step)
     for how, steps_of_twists in twists.items():
-        what = f"twists that are {how}, each 0.1 deg off,"
+        what = f"an error of 0.1 deg in each {how} twist"
         result.append(Sensitivity(what, np.column_stack(steps_of_twists)))
     return tuple(result)
 
@@ -259,9 +261,9 @@ class LensDistortion(WrongIntrinsic):
         (given,), (found,) = self.given, self.given + self.change
         looks = ""
         if abs(found) < 0.5 * abs(given):
-            looks = "; the photographs look as if their lens distortion had been removed"
+            looks = "; the lens distortion of the photographs appears to have been removed"
         elif given == 0.0:
-            looks = "; the photographs look as if their lens distortion had not been removed"
+            looks = "; the lens distortion of the photographs appears not to have been removed"
         return (
             f"The distortion of {self.view} does not agree with the measurements: found k1 = "
             f"{found:.3f} +- {self.sigma[0]:.3f}, given {given:.3f}, {self.apart:.0f} standard "

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.joint_fit.determinacy import HeldDirections, held_spread, named_units
+from legcal.calibration.joint_fit.determinacy import HeldDirections, covariance_of_held, named_units
 from legcal.calibration.joint_fit.diagnostics import (
     MOST_SCATTER,
     DoubtedCamera,
@@ -61,7 +61,7 @@ from legcal.machine.leg import (
     radius_name,
     with_platform_points,
 )
-from legcal.machine.parameters import Parametrization, parametrize
+from legcal.machine.parameters import Parametrization, geometries, parametrize, vector_of
 from legcal.vision.board import Link
 from legcal.vision.camera import Camera
 
@@ -130,6 +130,10 @@ class Estimates:
     def vector(self, names: Sequence[str]) -> Array:
         """Return the values of named parameters, (len(names),)."""
         return np.array([self.values[name] for name in names])
+
+    def with_values(self, values: Mapping[str, float]) -> Estimates:
+        """Replace the values of named parameters."""
+        return replace(self, values={**self.values, **values})
 
     def in_order(self, names: Sequence[str]) -> Estimates:
         """Reorder by *names*, which may have further names."""
@@ -427,7 +431,7 @@ def _kinematic(
     return KinematicUncertainty(
         problem.legs.parametrization,
         of_every(kept),
-        of_every(held_spread(problem, state, held)),
+        of_every(covariance_of_held(problem, state, held)),
         of_every(named),
         held_basis,
         held.directions,
@@ -494,6 +498,10 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     steps = _indices_of(parametrization.names, solution.kinematic.parametrization.names)
+    vector = vector_of(parametrization, geometry, geometries(machine)).tolist()
+    estimates = solution.estimates.with_values(
+        dict(zip(parametrization.names, vector, strict=True))
+    )
     poses = _pose_order(order, dataset).tolist()
     file_pose = {worked: pose for pose, worked in enumerate(poses)}
     readings = solution.quality.redundant_readings
@@ -504,7 +512,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
-        estimates=solution.estimates.in_order(tuple(parameters)),
+        estimates=estimates.in_order(tuple(parameters)),
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),

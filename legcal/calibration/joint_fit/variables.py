@@ -15,6 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.tuning import (
+    ARM_AXIS_SIGMA,
+    ARM_POINT_SIGMA,
+    LOSS_WIDTH,
+    RADIUS_SIGMA,
+    REJECTION,
+)
 from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, DidNotConverge
 from legcal.estimation.problem import EstimationProblem, Frames, Tangent
@@ -50,12 +57,12 @@ _STEP_TOLERANCE = 1e-6  # last step where constraints contradict each other [mea
 class RefinementSettings:
     """Settings of the joint fit; distances of outlines and axes are whitened."""
 
-    radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
-    arm_axis_sigma: float = 0.02  # of the prior on the direction of an arm [rad]
-    arm_point_sigma: float = 0.01  # of its position across, in mean rod lengths
+    radius_sigma: float = RADIUS_SIGMA  # of the prior on radii, as a part of the radius
+    arm_axis_sigma: float = ARM_AXIS_SIGMA  # of the prior on the direction of an arm [rad]
+    arm_point_sigma: float = ARM_POINT_SIGMA  # of its position across, in mean rod lengths
     board_scale_sigma: float = 0.001  # relative, of the dimensions of a board: printers, paper
-    loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
-    rejection: float = 4.5  # distance of rejection; false for one outline in 25,000
+    loss_width: float = LOSS_WIDTH  # where the loss of an outline turns from quadratic to linear
+    rejection: float = REJECTION  # distance of rejection; false for one outline in 25,000
     rejection_rounds: int = 6  # at most, until the rejected outlines stay the same
     noise_rounds: int = 10  # at most, of noise estimation after that
     error_tolerance: float = 0.02  # relative change of these errors at which the rounds end
