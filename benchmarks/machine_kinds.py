@@ -153,7 +153,7 @@ def named_readings(solution: Solution) -> list[str]:
             f"{1e3 * one.off:+.3f} mm off"
             for one in judged.wrong
         ),
-        *judged.doubts,
+        *(what for what, _ in judged.doubts),
     ]
 
 
