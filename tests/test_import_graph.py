@@ -92,6 +92,7 @@ PUBLIC: dict[str, set[str]] = {
         "example",
         "holdout",
         "image_causes",
+        "image_order",
         "image_tables",
         "landmarks",
         "measurements",
