@@ -137,8 +137,17 @@ def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
     write_rows(copy / "measurements.csv", rows[::-1])
     result = calibrate(copy)
     assert not result.verdict.trustworthy
-    assert result.doubts[0].code == "encoder"
+    assert [doubt.code for doubt in result.doubts] == ["encoder"]
     assert "leg2" in result.doubts[0].sentence
+
+
+def test_a_session_whose_images_have_no_order_says_that_changes_were_not_tested(
+    healthy: Dataset,
+) -> None:
+    labels = tuple("p" + "x" * n for n in range(1, 25))
+    m = replace(healthy.measurements, pose_labels=labels)
+    result = calibrate(replace(healthy, measurements=m))
+    assert any("add a column time to measurements.csv" in note for note in result.notes)
 
 
 def test_images_are_ordered_by_times_then_by_the_numbers_of_a_view(healthy: Dataset) -> None:

@@ -114,21 +114,28 @@ def doubts_of(
     corners: Corners | None,
     session: SessionTests,
 ) -> tuple[Doubt, ...]:
-    """Return all that speaks against a result but for the size of its improvement."""
+    """Return all that speaks against a result but for the size of its improvement.
+
+    A change in the course of the session scatters outlines and bends cameras: where one is named,
+    these are not accused as well.
+    """
+    changes = _changes(dataset, solution, platform, session)
+    symptoms = [
+        *_cameras(solution, platform),
+        *_left_out(solution, platform),
+        *_noise(solution),
+    ]
     return (
         *_mistakes(diagnosis),
         *_readings(solution),
         *_legs_left_out(solution),
         *_clicks(dataset, solution),
         *_strayed_cameras(dataset, solution),
-        *_cameras(solution, platform),
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
         *_moved_parameters(dataset, solution, platform),
         *_held_out(held_out),
-        *_changes(dataset, solution, platform, session),
-        *_left_out(solution, platform),
-        *_noise(solution),
+        *(changes or symptoms),
     )
 
 

@@ -100,8 +100,8 @@ class Finding:
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
-        "look for a slipped coupling or a lost home there, and calibrate the images before and "
-        "after it on their own, or take them again",
+        "look for a slipped coupling or a lost home there, and leave the images before it, or "
+        "those after it, out of measurements.csv",
     ),
     "drift": (
         "the zero of the encoder of {subject} drifts by {size} from the first image to the last",

@@ -112,7 +112,7 @@ def _untested(
 ) -> list[str]:
     """Return notes on changes in the course of a session that would not show."""
     m = dataset.measurements
-    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES:
+    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES or session.findings:
         return []
     if not sequences:
         return [
@@ -130,8 +130,8 @@ def _untested(
         return []
     motor = max(hidden, key=lambda name: hidden[name])
     return [
-        f"A slip of an encoder below {1e3 * hidden[motor]:.2g} mm ({motor}) would not show in so "
-        "few images."
+        f"A slip of an encoder below {1e3 * hidden[motor]:.2g} mm ({motor}) would not show in "
+        "these images."
     ]
 
 
