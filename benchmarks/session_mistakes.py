@@ -1,0 +1,194 @@
+"""Verdicts on sessions with one mistake in their course, and on healthy ones beside them.
+
+    OMP_NUM_THREADS=1 python benchmarks/session_mistakes.py [--sessions 40] [--first 0]
+                         [--machines hexapod,...] [--kinds slip,...] [--record FILE]
+
+Outlines of 45 images of a machine whose joints are off are simulated. Two sessions in three have a
+mistake, drawn at a size from harmless to gross: the zero of an encoder slips or drifts, photographs
+come before the platform stands still, a motor has backlash or another scale, commands stand for
+readings, a camera is bumped or refocused, all motors have another scale (``pitch``, which nothing
+in outlines shows). Each is calibrated; the platform error by eq (20) against the true machine is
+compared with what is stated. Printed are sessions that are trusted beyond three stated sigmas, how
+often the first doubt names the mistake of those that harm by more than that, and healthy sessions
+in doubt. FILE keeps sessions as JSON lines; those in it are not done again. About 3 s a session.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from machine_kinds import measured_length
+from scipy.spatial.transform import Rotation
+
+from legcal import (
+    LegcalError,
+    SimulationSettings,
+    calibrate,
+    evaluate,
+    load_dataset,
+    load_mechanism,
+    simulate,
+)
+from legcal.data.dataset import Dataset
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.model import Machine
+from legcal.simulation.settings import Level
+
+MACHINES = "hexapod", "6-sps", "3-rpr", "3-rps", "linear-delta", "hexaglide", "servo-hexapod"
+HEALTHY, PITCH = "healthy", "pitch"
+N_SIGMAS = 3.0
+# Sizes from harmless to gross, and the codes of doubts that name the mistake
+SIZES: dict[str, tuple[float, float, tuple[str, ...]]] = {
+    "slip": (2e-5, 2e-3, ("encoder",)),  # [m] at the joint
+    "drift": (2e-5, 1e-3, ("drift", "encoder")),
+    "backlash": (2e-5, 5e-4, ("backlash",)),
+    "lag": (3e-4, 1e-2, ("lag",)),  # part of the last move
+    "gain": (2e-4, 1e-2, ("gain",)),
+    "commands": (2e-5, 3e-4, ("noise", "left_out")),  # [m]
+    "focal length": (3e-4, 7e-3, ("focal_length", "camera")),
+    "camera": (1e-4, 3e-3, ("camera",)),  # [rad]
+    PITCH: (2e-4, 4e-3, ()),
+}
+
+
+def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator) -> Dataset:
+    """Return a session with a mistake."""
+    m, machine = dataset.measurements, dataset.machine
+    n, j = m.n_rows, int(rng.choice(machine.motors))
+    is_motor = np.equal(machine.reads, j).astype(float)
+    of_leg = np.array([leg.reading_of(1.0) if leg.is_motor else 0.0 for leg in machine.legs])
+    time_of_row = np.linspace(0.0, 1.0, n)
+    later = time_of_row > rng.uniform(0.2, 0.8)
+    moves = np.diff(m.q, axis=0, prepend=m.q[:1])
+    moves[np.diff(m.view, prepend=-1) != 0] = 0.0
+    if kind in ("camera", "focal length"):
+        return _with_rays(dataset, kind, size, int(rng.integers(len(m.views))), later)
+    scatter = rng.normal(size=(n, len(machine.motors)))
+    of_motor = {motor: scatter[:, i] for i, motor in enumerate(machine.motors)}
+    changes: dict[str, Callable[[], Array]] = {
+        "slip": lambda: size * np.outer(later, is_motor * of_leg),
+        "drift": lambda: size * np.outer(time_of_row, is_motor * of_leg),
+        "backlash": lambda: 0.5 * size * np.sign(moves) * is_motor * of_leg,
+        "lag": lambda: size * moves,
+        "gain": lambda: size * m.q * is_motor,
+        "commands": lambda: (
+            size * of_leg * np.column_stack([of_motor.get(i, np.zeros(n)) for i in machine.reads])
+        ),
+        PITCH: lambda: size * m.q,
+    }
+    return replace(dataset, measurements=replace(m, q=m.q + changes[kind]()))
+
+
+def _with_rays(dataset: Dataset, kind: str, size: float, view: int, later: BoolArray) -> Dataset:
+    """Return a session with a camera that was turned or refocused among the images of a view."""
+    o, m = dataset.observations, dataset.measurements
+    assert o is not None
+    rows = np.flatnonzero(m.view == view)
+    changed = np.zeros(m.n_rows, dtype=np.bool_)
+    changed[rows[int(len(rows) * 0.4) :]] = True
+    at = changed[o.row]
+    camera = m.views[view].camera
+    xy = camera.undistort(o.ends[at].reshape(-1, 2))
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    if kind == "camera":
+        rays = np.asarray(Rotation.from_rotvec([0.0, size, 0.0]).apply(rays))
+    else:
+        rays = rays * [1.0 + size, 1.0 + size, 1.0]
+    first, second = np.moveaxis(rays.reshape(-1, 2, 3), 1, 0)
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    h, ends = o.h.copy(), o.ends.copy()
+    h[at] = normal * np.sign(np.sum(normal * h[at], axis=1))[:, None]
+    ends[at] = camera.project(rays).reshape(-1, 2, 2)
+    return replace(dataset, observations=replace(o, h=h, ends=ends))
+
+
+def session(seed: int, name: str, kinds: list[str], scratch: Path) -> dict[str, object]:
+    """Simulate, spoil and calibrate a session."""
+    rng = np.random.default_rng(seed)
+    folder, out = scratch / f"{seed}", scratch / f"{seed}-out"
+    simulate(name, folder, SimulationSettings(level=Level.OUTLINES, seed=seed))
+    truth = next((folder / "truth/models").glob("*.yaml"))
+    nominal: Machine = load_mechanism(name)
+    kind, size = HEALTHY, 0.0
+    dataset = load_dataset(folder)
+    if seed % 3:
+        kind = kinds[int(rng.integers(len(kinds)))]
+        least, most, _ = SIZES[kind]
+        size = float(np.exp(rng.uniform(np.log(least), np.log(most))))
+        dataset = spoiled(dataset, kind, size, rng)
+    priors = [] if nominal.readings_carry_length else measured_length(load_mechanism(truth), rng)
+    line: dict[str, object] = {"seed": seed, "machine": name, "kind": kind, "size": size}
+    begin = time.perf_counter()
+    try:
+        calibration = calibrate(dataset, output=out, use_cache=False, priors=priors)
+    except LegcalError as error:
+        return line | {"refused": type(error).__name__}
+    after = evaluate(out / "calibrated.yaml", truth, dataset=folder)
+    assert calibration.platform is not None
+    return line | {
+        "off_mm": 1e3 * float(after.displacement.mean()),
+        "stated_mm": 1e3 * calibration.platform.sigma.mean_displacement,
+        "trusted": calibration.verdict.trustworthy,
+        "doubts": [doubt.code for doubt in calibration.doubts],
+        "seconds": time.perf_counter() - begin,
+    }
+
+
+def report(lines: list[dict[str, object]]) -> None:
+    """Print what verdicts are worth."""
+    print(
+        f"{'kind':14}{'sessions':>9}{'refused':>9}{'harmful':>9}{'trusted':>9}{'wrongly':>9}"
+        f"{'named first':>13}"
+    )
+    for kind in (HEALTHY, *SIZES):
+        of_kind = [line for line in lines if line["kind"] == kind]
+        judged = [line for line in of_kind if "refused" not in line]
+        harmful = [x for x in judged if x["off_mm"] > N_SIGMAS * x["stated_mm"]]  # type: ignore[operator]
+        named = 0
+        for x in judged:
+            codes = SIZES[kind][2] if kind in SIZES else ()
+            doubts = list(x["doubts"])  # type: ignore[call-overload]
+            named += bool(doubts) and doubts[0] in codes
+        trusted = sum(bool(line["trusted"]) for line in judged)
+        wrongly = sum(bool(line["trusted"]) for line in harmful)
+        print(
+            f"{kind:14}{len(of_kind):9}{len(of_kind) - len(judged):9}{len(harmful):9}{trusted:9}"
+            f"{wrongly:9}{named:13}"
+        )
+
+
+def main() -> None:
+    """Run the sessions that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--machines", default=",".join(MACHINES))
+    parser.add_argument("--kinds", default=",".join(SIZES))
+    parser.add_argument("--record", type=Path)
+    given = parser.parse_args()
+    lines: list[dict[str, object]] = []
+    if given.record is not None and given.record.exists():
+        lines = [json.loads(text) for text in given.record.read_text().splitlines()]
+    done, machines = {line["seed"] for line in lines}, given.machines.split(",")
+    for seed in range(given.first, given.first + given.sessions):
+        if seed in done:
+            continue
+        with TemporaryDirectory() as scratch:
+            name = machines[(seed // 3) % len(machines)]
+            line = session(seed, name, given.kinds.split(","), Path(scratch))
+        print(json.dumps(line), flush=True)
+        lines.append(line)
+        if given.record is not None:
+            with given.record.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+    report(lines)
+
+
+if __name__ == "__main__":
+    main()
