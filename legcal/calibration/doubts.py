@@ -25,6 +25,7 @@ from legcal.calibration.joint_fit.platform import (
     platform_by_parameters,
     poses_at_readings,
 )
+from legcal.calibration.joint_fit.scale import scale_witnesses
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.session_changes import Finding, SessionTests
@@ -134,6 +135,7 @@ def doubts_of(
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
         *_moved_parameters(dataset, solution, platform),
+        *_scale(dataset, solution, platform),
         *_held_out(held_out),
         *(changes or symptoms),
     )
@@ -437,6 +439,56 @@ def _noise(solution: Solution) -> list[Doubt]:
         "outlines, for play, bending, a camera or board that moved, and readings of another moment"
     )
     return [Doubt("noise", what, remedy)]
+
+
+def _scale(dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return whether a scale with a single witness contradicts the model as a whole.
+
+    The scale is that of the nominal lengths by least squares; each has its tolerance.
+    """
+    witnesses = scale_witnesses(solution.posterior.problem)
+    if len(witnesses) != 1:
+        return []
+    machine, kinematic = dataset.machine, solution.kinematic
+    parametrization, nominal = kinematic.parametrization, geometries(machine)
+    names = parametrization.names
+    legs = dict(zip(machine.leg_names, nominal, strict=True))
+    tolerances = machine.tolerance.of_parameters(names, legs, machine.size)
+    is_length = [
+        unit == "m" and solution.estimates.status.get(name) == "estimated" and name in tolerances
+        for name, unit in zip(names, parametrization.units, strict=True)
+    ]
+    at = np.flatnonzero(is_length)
+    length = vector_of(parametrization, nominal, nominal)
+    change = vector_of(parametrization, solution.legs, nominal) - length
+    tolerance = np.array([tolerances[names[i]] for i in at])
+    weight = length[at] / tolerance**2
+    information = float(weight @ length[at])
+    if information <= 0.0:
+        return []
+    by_change = weight / information
+    scale = float(by_change @ change[at])
+    fitted = float(by_change @ kinematic.value_covariance[np.ix_(at, at)] @ by_change)
+    sigma = float(np.sqrt(1.0 / information + fitted))
+    if abs(scale) <= MOST_MOVED * sigma:
+        return []
+    error = None
+    if platform is not None:
+        steps = np.zeros((len(names), 1))
+        steps[at, 0] = scale * length[at]
+        error = moved_by(
+            platform_by_parameters(
+                solution.legs, parametrization, machine.frame_legs, solution.T_Rb_Re
+            ),
+            steps,
+        )
+    way = "larger" if scale > 0.0 else "smaller"
+    what = (
+        f"the machine comes out {100.0 * abs(scale):.1f} % {way} than its model, "
+        f"{abs(scale) / sigma:.0f} times the tolerance, and its scale rests on {witnesses[0]} alone"
+    )
+    remedy = "measure that again, or another length, and state it (--length, --set)"
+    return [Doubt("scale", what, remedy, *_mean(error))]
 
 
 def _held_out(held_out: HeldOut | None) -> list[Doubt]:

@@ -18,7 +18,6 @@ from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import State
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.directions import list_in_words
 from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
@@ -26,7 +25,6 @@ from legcal.machine.rods import actuators_of
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
 _FEWEST = 3  # radii
 _SPREAD = 0.25  # of their common difference
-_OTHER_LENGTH = 0.0075  # relative change of rods, above which a stated distance is doubted
 _LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters with a length
 
 
@@ -104,38 +102,31 @@ def sensitivity_to_scale(
     return (Sensitivity(SCALE, step),)
 
 
-def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return notes on a fitted machine that is a scaled version of its model."""
-    return (*_of_stated_lengths(problem, state), *_of_radii(problem, state))
-
-
-def _of_stated_lengths(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Note on rods of another length, where the scale comes from stated distances alone.
-
-    Images agree with a machine of any size, so that only the nominal model can reveal a wrong one.
-    """
+def scale_witnesses(problem: FitProblem) -> list[str]:
+    """Return what says how large the machine is, besides radii and the nominal model, in words."""
     priors = problem.choices.priors
-    stated = [n for n in priors if ":" in n or ParameterId.parse(n).kind == "length"]
-    if not stated or _images_have_length(problem):
-        return ()
-    rods = [
-        fitted.q0 / nominal.q0 - 1.0
-        for fitted, nominal in zip(state.legs, problem.legs.nominal, strict=True)
-        if nominal.q0 > 0.0
-    ]
-    common = float(np.median(rods)) if rods else 0.0
-    if abs(common) < _OTHER_LENGTH:
-        return ()
-    way = "shorter" if common < 0.0 else "longer"
-    return (
-        f"The fitted rods are {1e2 * abs(common):.1f} % {way} than the model's. The scale comes "
-        f"from {list_in_words(stated)} alone, and images cannot check it: if the model is more "
-        "accurate than that, the stated distance is wrong; measure it again, or a second one.",
-    )
+    lengths = [n for n in priors if ":" in n or ParameterId.parse(n).kind in _LENGTHS]
+    actuators = actuators_of(problem.legs.nominal)
+    read = problem.observed.actuator_readings.actuator.tolist()
+    has_travel = len(problem.readings) > 0 or any(not actuators[a].turns for a in read)
+    boards = ["the calibration board"] * any(len(corners) for corners in problem.boards)
+    return ["the travel of the motors"] * has_travel + boards + [f"the stated {n}" for n in lengths]
+
+
+def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
+    """Return notes on the scale of a machine: its only witness, radii that all differ alike."""
+    witnesses = scale_witnesses(problem)
+    only = list[str]()
+    if len(witnesses) == 1:
+        only.append(
+            f"The scale of the machine rests on {witnesses[0]} alone: an error of that would not "
+            "show in photographs; state a measured length as well (--length, --set).",
+        )
+    return (*only, *_of_radii(problem, state))
 
 
 def _of_radii(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Note on radii that are all larger or smaller than the model's by one factor."""
+    """Return a note on radii that are all larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
     change = (state.radii / nominal - 1.0)[free]
