@@ -236,8 +236,8 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert list(found.unplaced) == ["c1"]
     assert "images show the legs only if left and right are swapped" in str(found.unplaced["c1"])
     assert len([note for note in found.notes if not note.startswith(WITHOUT_GAMMA)]) == 2
-    assert re.match(r"view c2: its T_base_camera is wrong: .*it suits view c3", found.notes[0])
-    assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
+    assert re.match(r"view c2: its T_base_camera is wrong: .*it fits view c3", found.notes[0])
+    assert re.match(r"view c3: its T_base_camera is wrong: .*it fits view c2", found.notes[1])
 
 
 @pytest.mark.parametrize(
