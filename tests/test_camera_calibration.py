@@ -190,7 +190,10 @@ def corrected(seen: BoardImages) -> BoardImages:
                 seen_corners(TRUTH, 5, 8, sheet=SHEET + np.array([4e-3, 0, 0, 0])),
                 "bent differently",
             ),
-            (rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "moved during the readout of its rows"),
+            (
+                rolled(seen_corners(TRUTH, 5, 8, sheet=SHEET)),
+                "moved during the readout of its rows",
+            ),
             (turned(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "turned by half a turn"),
             (mirrored(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "mirrored"),
             (corrected(seen_corners(TRUTH, 5, 8, sheet=SHEET)), "another distortion of the lens"),

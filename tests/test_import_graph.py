@@ -149,6 +149,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.factors",
         "joint_fit.fit",
         "joint_fit.outline_errors",
+        "joint_fit.scale",
         "joint_fit.parameter_choices",
         "joint_fit.platform",
         "joint_fit.problem",

@@ -40,6 +40,7 @@ from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
+from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
 from legcal.calibration.plots import plot_residuals
@@ -165,7 +166,7 @@ def _result_of(calibration: Calibration) -> Result:
         held=solution.kinematic.held_basis.tolist(),
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
-    nominal = geometries(machine)
+    nominal, witness = geometries(machine), single_witness(solution.posterior.problem)
     turned_from = nominal_axes(names, nominal)
     return Result(
         legcal_result=1,
@@ -209,7 +210,7 @@ def _result_of(calibration: Calibration) -> Result:
         platform=_platform(calibration),
         holdout=_holdout(calibration),
         notes=list(calibration.notes),
-        details=list(calibration.solution.details),
+        details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
         overlays=_overlays(calibration),
     )

@@ -113,19 +113,18 @@ def scale_witnesses(problem: FitProblem) -> list[str]:
     return ["the travel of the motors"] * has_travel + boards + [f"the stated {n}" for n in lengths]
 
 
-def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return notes on the scale of a machine: its only witness, radii that all differ alike."""
+def single_witness(problem: FitProblem) -> str:
+    """Return a sentence on a scale that one witness alone says, "" where there are more or none."""
     witnesses = scale_witnesses(problem)
-    only = list[str]()
-    if len(witnesses) == 1:
-        only.append(
-            f"The scale of the machine rests on {witnesses[0]} alone: an error of that would not "
-            "show in photographs; state a measured length as well (--length, --set).",
-        )
-    return (*only, *_of_radii(problem, state))
+    if len(witnesses) != 1:
+        return ""
+    return (
+        f"The scale of the machine rests on {witnesses[0]} alone: an error of that would not show "
+        "in photographs; a measured length beside it would (--length, --set)."
+    )
 
 
-def _of_radii(problem: FitProblem, state: State) -> tuple[str, ...]:
+def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
     """Return a note on radii that are all larger or smaller than the model's by one factor."""
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])

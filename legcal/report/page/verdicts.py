@@ -8,6 +8,7 @@ import numpy as np
 
 from legcal.calibration.doubts import Doubt
 from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.result import Calibration
 from legcal.calibration.verification import Check
@@ -61,6 +62,8 @@ def _grounds(calibration: Calibration) -> list[str]:
             f"Images that were kept aside lie {held_out.rms_px:.3f} px off; "
             f"{held_out.expected_px:.3f} px were expected."
         )
+    if witness := single_witness(calibration.solution.posterior.problem):
+        found.append(witness)
     return found
 
 
