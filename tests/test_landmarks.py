@@ -172,6 +172,13 @@ def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run)
     assert not verdict.trustworthy
     name = m.views[1].name
     assert f"clicks on joints in view {name} (" in verdict.sentence
+    o = solution.outlines
+    without = replace(o, used=o.used & (m.view[o.row] != 1))
+    unplaced = replace(solution, outlines=without)
+    far = replace(dataset, landmarks=replace(clicks, px=away))
+    codes = [doubt.code for doubt in judge(far, unplaced, calibration.steps, ()).doubts]
+    assert "view_left_out" in codes
+    assert "clicks" not in codes
 
 
 def test_a_click_that_a_fit_contradicts_is_named_with_the_joint_that_it_may_show(

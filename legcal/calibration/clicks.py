@@ -19,19 +19,22 @@ MAX_CLICK_SIGMAS = 4.0
 def click_distances(dataset: Dataset, solution: Solution) -> dict[str, tuple[float, float]]:
     """Return how far clicks are from where a fit has their joints, and may be, by view [px].
 
-    Both are medians: a click in two may be on another joint.
+    Both are medians: a click in two may be on another joint. Of a view without an outline in the
+    fit nothing is said: its camera is not one of the fit.
     """
     if dataset.landmarks is None:
         return {}
     clicks, m = dataset.landmarks, dataset.measurements
     view, off = m.view[clicks.row], _off_clicks(dataset.landmarks, dataset, solution)
     own, most = off[np.arange(len(clicks)), clicks.leg, clicks.end], MAX_CLICK_SIGMAS
+    outlines = solution.outlines
+    fitted = np.unique(m.view[outlines.row[outlines.used]])
     return {
         m.views[v].name: (
             float(np.median(own[view == v])),
             most * float(np.median(clicks.sigma_px[view == v])),
         )
-        for v in np.unique(view).tolist()
+        for v in np.intersect1d(view, fitted).tolist()
     }
 
 
