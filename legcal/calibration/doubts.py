@@ -35,6 +35,7 @@ from legcal.data.measurements import few, few_views
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
@@ -121,11 +122,6 @@ def doubts_of(
     these are not accused as well.
     """
     changes = _changes(dataset, solution, platform, session)
-    symptoms = [
-        *_cameras(solution, platform),
-        *_left_out(solution, platform),
-        *_noise(solution),
-    ]
     return (
         *_mistakes(diagnosis),
         *_readings(solution),
@@ -137,8 +133,13 @@ def doubts_of(
         *_moved_parameters(dataset, solution, platform),
         *_scale(dataset, solution, platform),
         *_held_out(held_out),
-        *(changes or symptoms),
+        *(changes or _symptoms(solution, platform)),
     )
+
+
+def _symptoms(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return the doubts that a change in the course of a session would cause as well."""
+    return [*_cameras(solution, platform), *_left_out(solution, platform), *_noise(solution)]
 
 
 def no_improvement(remedy: str) -> Doubt:
@@ -243,6 +244,15 @@ def _mean(error: PlatformError | None, part: float = 1.0) -> tuple[float | None,
     if error is None:
         return None, None
     return part * error.mean_displacement, part * error.mean_rotation
+
+
+def _moved_platform(dataset: Dataset, solution: Solution, steps: Array) -> PlatformError:
+    """Return the motion of the platform by steps (p, 1) of all kinematic parameters."""
+    parametrization, frame_legs = solution.kinematic.parametrization, dataset.machine.frame_legs
+    by_parameters = platform_by_parameters(
+        solution.legs, parametrization, frame_legs, solution.T_Rb_Re
+    )
+    return moved_by(by_parameters, steps)
 
 
 def used_share(outlines: Outlines) -> float:
@@ -359,9 +369,7 @@ def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[
     step_of = dict(zip(names, finding.steps.tolist(), strict=True))
     steps = np.array([[step_of[name]] for name in parametrization.names])
     legs, poses = solution.legs, solution.T_Rb_Re
-    error = moved_by(
-        platform_by_parameters(legs, parametrization, machine.frame_legs, poses), steps
-    )
+    error = _moved_platform(dataset, solution, steps)
     before = error.mean_displacement, error.mean_rotation
     if finding.kind != "encoder":
         return before
@@ -399,12 +407,7 @@ def _moved_parameters(
     if platform is not None:
         steps = np.zeros((len(names), 1))
         steps[far, 0] = change[far]
-        error = moved_by(
-            platform_by_parameters(
-                solution.legs, parametrization, machine.frame_legs, solution.T_Rb_Re
-            ),
-            steps,
-        )
+        error = _moved_platform(dataset, solution, steps)
     moved = []
     for i in far[np.argsort(-times[far], kind="stable")].tolist():
         scale, unit = SHOWN_IN[parametrization.units[i]]
@@ -476,12 +479,7 @@ def _scale(dataset: Dataset, solution: Solution, platform: PlatformAccuracy | No
     if platform is not None:
         steps = np.zeros((len(names), 1))
         steps[at, 0] = scale * length[at]
-        error = moved_by(
-            platform_by_parameters(
-                solution.legs, parametrization, machine.frame_legs, solution.T_Rb_Re
-            ),
-            steps,
-        )
+        error = _moved_platform(dataset, solution, steps)
     way = "larger" if scale > 0.0 else "smaller"
     what = (
         f"the machine comes out {100.0 * abs(scale):.1f} % {way} than its model, "

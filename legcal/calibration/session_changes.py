@@ -27,7 +27,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import kinematic_steps
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements, row_names
-from legcal.estimation.problem import linearize
+from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test
 from legcal.files.quantity import SHOWN_IN
@@ -189,7 +189,7 @@ def session_tests(
     course = _Course.of(posterior, measurements, sequences)
     linear = linearize(problem, state)
     normal = normal_equations(problem, state, linear)
-    hypotheses = [*_of_motors(problem, course), *_of_views(problem, state, course)]
+    hypotheses = [*_of_motors(problem, course), *_of_views(problem, state, linear, course)]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
     tests = [
         _Test(i, holds, at)
@@ -202,7 +202,7 @@ def session_tests(
     ]
     if not tests:
         return SessionTests()
-    scores = _Scores.of(posterior, normal, hypotheses, course.n_blocks)
+    scores = _Scores.of(problem, linear, normal, hypotheses, course.n_blocks)
     least = math.sqrt(chdtri(1.0, SIGNIFICANCE / len(tests)))
     slips = dict[str, list[float]]()
     for test in tests:
@@ -219,7 +219,7 @@ def session_tests(
         test = tests[best]
         hypothesis = hypotheses[test.hypothesis]
         amount, covariance = scores.estimate(test)
-        steps = _effect(posterior, normal, hypothesis, test.holds, amount)
+        steps = _effect(problem, linear, normal, hypothesis, test.holds, amount)
         findings.append(
             Finding(
                 hypothesis.kind,
@@ -469,11 +469,13 @@ def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Arr
     )
 
 
-def _of_views(problem: FitProblem, state: State, course: _Course) -> Iterator[_Hypothesis]:
+def _of_views(
+    problem: FitProblem, state: State, linear: Linearization, course: _Course
+) -> Iterator[_Hypothesis]:
     """Yield what may have changed about the camera of each view; boards would say more."""
     if any(map(len, problem.boards)):
         return
-    o, linear = problem.outlines, linearize(problem, state)
+    o = problem.outlines
     block = course.of_images(o.view, o.pose)
     by_focal = np.sum(
         o.by_intrinsics(("fx", "fy"), problem.keys, state)
@@ -506,13 +508,13 @@ class _Scores:
     @classmethod
     def of(
         cls,
-        posterior: Posterior,
+        problem: FitProblem,
+        linear: Linearization,
         normal: NormalEquations,
         hypotheses: Sequence[_Hypothesis],
         n_blocks: int,
     ) -> _Scores:
         """Compute the scores."""
-        problem = posterior.problem
         columns, c = list[IntArray](), 0
         for hypothesis in hypotheses:
             d = next(iter(hypothesis.columns.values())).shape[-1]
@@ -530,7 +532,6 @@ class _Scores:
                 for k in range(d):
                     rows = np.flatnonzero((block >= 0) & (column[k][block] >= 0))
                     of_factor[rows, :, column[k][block[rows]]] = values[rows, :, k]
-        linear = linearize(problem, posterior.state)
         score, information = score_test(problem, linear, normal, stacked)
         size = sum(np.einsum("nqc,nqc->c", v, v) for v in stacked.values())
         return cls(score, information, np.asarray(size), columns)
@@ -597,18 +598,17 @@ class _Solved(NamedTuple):
 
 
 def _effect(
-    posterior: Posterior,
+    problem: FitProblem,
+    linear: Linearization,
     normal: NormalEquations,
     hypothesis: _Hypothesis,
     holds: BoolArray,
     amount: Array,
 ) -> Array:
     """Return the error of the kinematic parameters (p,) by a number that the fit lacks."""
-    problem: FitProblem = posterior.problem
     changes = {}
     for name, values in hypothesis.columns.items():
         block = hypothesis.block[name]
         in_blocks = (block >= 0) & holds[block]
         changes[name] = np.where(in_blocks[:, None, None], values @ amount[:, None], 0.0)
-    linear = linearize(problem, posterior.state)
     return kinematic_steps(problem, response(problem, linear, normal, changes))[:, 0]

@@ -37,20 +37,9 @@ def has_length(problem: FitProblem) -> bool:
         ParameterId.parse(name).kind for name in stated_parameters(problem) if ":" not in name
     }
     return (
-        _images_have_length(problem)
+        bool(_witnesses_in_images(problem))
         or any(":" in name for name in problem.choices.priors)
         or bool(stated & _LENGTHS)
-    )
-
-
-def _images_have_length(problem: FitProblem) -> bool:
-    """Whether the images come with a measured length: a reading, or a board."""
-    actuators = actuators_of(problem.legs.nominal)
-    read = problem.observed.actuator_readings.actuator.tolist()
-    return (
-        len(problem.readings) > 0
-        or any(len(corners) for corners in problem.boards)
-        or any(not actuators[a].turns for a in read)
     )
 
 
@@ -106,11 +95,16 @@ def scale_witnesses(problem: FitProblem) -> list[str]:
     """Return what says how large the machine is, besides radii and the nominal model, in words."""
     priors = problem.choices.priors
     lengths = [n for n in priors if ":" in n or ParameterId.parse(n).kind in _LENGTHS]
+    return [*_witnesses_in_images(problem), *(f"the stated {name}" for name in lengths)]
+
+
+def _witnesses_in_images(problem: FitProblem) -> list[str]:
+    """Return the measured lengths that images come with: readings, a board."""
     actuators = actuators_of(problem.legs.nominal)
     read = problem.observed.actuator_readings.actuator.tolist()
     has_travel = len(problem.readings) > 0 or any(not actuators[a].turns for a in read)
-    boards = ["the calibration board"] * any(len(corners) for corners in problem.boards)
-    return ["the travel of the motors"] * has_travel + boards + [f"the stated {n}" for n in lengths]
+    has_board = any(len(corners) for corners in problem.boards)
+    return ["the travel of the motors"] * has_travel + ["the calibration board"] * has_board
 
 
 def single_witness(problem: FitProblem) -> str:
