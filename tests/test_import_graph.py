@@ -46,6 +46,8 @@ PUBLIC: dict[str, set[str]] = {
         "family",
         "feasibility",
         "files",
+        "firmware",
+        "firmware_files",
         "home",
         "inspection",
         "kinematics",
