@@ -257,8 +257,8 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
     (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "headings")),
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
-    *((FLAT, {"names": [f"{leg}{unit}" for leg in LEGS]}, (), (name, "mm, um, nm, cm, m, in, ft"))
-      for unit, name in ((" [Zoll]", "'Zoll'"), (" (counts)", "'counts'"), ("_inches", "'inches'"))),
+    *((FLAT, {"names": [leg + unit for leg in LEGS]}, (), (name, "mm, um, nm, cm, m, in, ft"))
+      for unit, name in ((" [Zoll]", "'Zoll'"), (" (counts)", "'counts'"), ("_inch", "'inch'"))),
     (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
     (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),
