@@ -48,6 +48,7 @@ PUBLIC: dict[str, set[str]] = {
         "files",
         "firmware",
         "firmware_files",
+        "hexapod_files",
         "home",
         "inspection",
         "kinematics",

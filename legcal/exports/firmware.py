@@ -23,7 +23,7 @@ from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subjec
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
-from legcal.machine.configurations import workspace
+from legcal.machine.configurations import random_poses
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.machine.firmware_files import read_delta
 from legcal.machine.model import Machine, vectors_A_to_B
@@ -32,6 +32,7 @@ from legcal.version import __version__
 
 DIGITS = 7  # decimals of a number [mm, deg]
 ROUNDS, RANK, SETTLED = 30, 1e-7, 1e-9  # of Gauss-Newton steps [mm, deg]
+N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
 STEP = 1e-4  # of differences [mm, deg]
 UPRIGHT = 0.97  # least cosine of a tower to the vertical
 TURNED = 5.0  # [deg] of all towers from the nominal angles, above which the frame is turned
@@ -57,7 +58,7 @@ def firmware_refusal(name: str) -> Callable[[Subject], str | None]:
             return f"found motors that {'turn' if True in turns else 'slide'}, {needed}"
         up = _upwards(machine)
         for actuator in actuators:
-            if (abs(actuator.axis @ up) > UPRIGHT) is actuator.turns:
+            if (float(abs(actuator.axis @ up)) > UPRIGHT) is actuator.turns:
                 return f"found that '{actuator.joint}' does not move as in a Delta, {needed}"
         return None
 
@@ -78,13 +79,12 @@ def firmware_files(name: str) -> Callable[[Subject, ExportOptions, Path], Render
 def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     machine = subject.machine
     mount = _mounted(machine, firmware)
-    readings, motions = workspace(machine)
-    poses = stacked(motions)
+    readings, poses = _poses_to_print(mount)
     seen = _Seen(mount.steps(readings), mount.nozzle(poses))
     fit = _nearest(firmware, mount.start, seen)
     names = [actuator.joint for actuator in mount.actuators]
-    texts = {key: _text(value) for key, value in firmware.values(fit).items()}
-    texts["M669 A0"] = _text(mount.lowest)
+    texts = {key: number_text(value) for key, value in firmware.values(fit).items()}
+    texts["M669 A0"] = number_text(mount.lowest)
     lines = re.sub(r"\{(.+?)\}", lambda key: texts[key[1]], firmware.lines)
     ideal = read_delta(path, f"; {firmware.title}\n{lines}" if "M66" in lines else lines)
     after, frame = _placed(ideal, seen)
@@ -94,11 +94,13 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
         then = _mounted(subject.nominal, firmware)
         nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
         before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
-    figures = {"remaining_mm": _figures(after)}
-    sentences = [f"{firmware.title} is off by {_in_words(after)} over the workspace."]
+    figures = {"remaining_mm": figures_of(after)}
+    sentences = [f"{firmware.title} is off by {describe_errors(after)} over the workspace."]
     if before is not None:
-        figures["nominal_mm"] = _figures(before)
-        sentences.append(f"With the numbers of the nominal model it is off by {_in_words(before)}.")
+        figures["nominal_mm"] = figures_of(before)
+        sentences.append(
+            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
+        )
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
     if mount.is_turned or moved > 1e-3 or turned > 1e-3:
         sentences.append(
@@ -122,7 +124,7 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     mark = "#" if firmware.name == "klipper" else ";"
     head = [f"{firmware.title} of {comment(subject.name)}, written by legcal {__version__}."]
     text = "".join(f"{mark} {line}\n" for line in [*head, *sentences]) + f"\n{lines}"
-    picture = _picture(firmware.title, seen.nozzle, after, before)
+    picture = picture_of(firmware.title, seen.nozzle, after, before)
     return Rendered(
         (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
         tuple(sentences),
@@ -130,7 +132,8 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     )
 
 
-def _text(value: float) -> str:
+def number_text(value: float) -> str:
+    """Return a number of a configuration [mm, deg]."""
     return f"{round(value, DIGITS) + 0.0:.{DIGITS}f}".rstrip("0").rstrip(".")
 
 
@@ -283,6 +286,15 @@ class _Row:
         return cls(actuator, _MM * across, _MM * rod, _MM * length, _MM * height, stop, top, sign)
 
 
+def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
+    """Return readings (k, n_legs) and poses (k, 3, 4) within the reach of the firmware."""
+    readings, motions = random_poses(mount.machine, N_POSES, SEED)
+    poses = stacked(motions)
+    off = np.linalg.norm(mount.nozzle(poses)[:, :2], axis=1)
+    inside = off <= max(mount.start.reach, float(np.sort(off)[LEAST_POSES]))
+    return readings[inside], poses[inside]
+
+
 # --- least squares ------------------------------------------------------------------------------
 
 
@@ -308,17 +320,17 @@ def _nearest(firmware: Firmware, start: IdealDelta, seen: _Seen) -> IdealDelta:
     def errors(x: Array) -> Array:
         return seen.errors(firmware.moved(start, x[:n]), (unit * x)[n:]).ravel()
 
-    return firmware.moved(start, _least_squares(errors, n + 6)[:n])
+    return firmware.moved(start, least_squares(errors, n + 6)[:n])
 
 
 def _placed(ideal: IdealDelta, seen: _Seen) -> tuple[Array, Array]:
     """Return the errors (k, 3) [mm] of a Delta in its best frame, and the frame (6,)."""
     unit = np.array([1.0] * 3 + [1.0 / np.mean(ideal.rod)] * 3)
-    frame = unit * _least_squares(lambda x: seen.errors(ideal, unit * x).ravel(), 6)
+    frame = unit * least_squares(lambda x: seen.errors(ideal, unit * x).ravel(), 6)
     return seen.errors(ideal, frame), frame
 
 
-def _least_squares(errors: Callable[[Array], Array], n: int) -> Array:
+def least_squares(errors: Callable[[Array], Array], n: int) -> Array:
     """Return the unknowns (n,) of least errors, nearest to zero where several are as good."""
     x = np.zeros(n)
     for _ in range(ROUNDS):
@@ -334,17 +346,19 @@ def _least_squares(errors: Callable[[Array], Array], n: int) -> Array:
 # --- figures ------------------------------------------------------------------------------------
 
 
-def _figures(errors: Array) -> dict[str, float]:
-    sizes = np.linalg.norm(errors, axis=1)
+def figures_of(errors: Array) -> dict[str, float]:
+    """Return the sizes of errors (..., 3)."""
+    sizes = np.linalg.norm(errors, axis=-1)
     return {"rms": float(np.sqrt(np.mean(sizes**2))), "max": float(sizes.max())}
 
 
-def _in_words(errors: Array) -> str:
-    figures = _figures(errors)
+def describe_errors(errors: Array) -> str:
+    """Return the sizes of errors (..., 3) [mm] in words."""
+    figures = figures_of(errors)
     return f"{figures['rms']:.3g} mm rms and {figures['max']:.3g} mm at most"
 
 
-def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
+def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
     """Return the errors at poses of the workspace, from above, as SVG."""
     panels = [(f"{title}: what remains", after)]
     if before is not None:
@@ -359,7 +373,7 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
     magnified = 40.0 / longest
     for k, (label, errors) in enumerate(panels):
         at = np.array([side * (k + 0.5), 0.5 * side])
-        canvas.text(side * k + 12.0, 20.0, f"{label}: {_in_words(errors)}")
+        canvas.text(side * k + 12.0, 20.0, f"{label}: {describe_errors(errors)}")
         for point, error in zip(nozzle, errors, strict=True):
             x, y = at + scale * (point - middle)[:2] * [1.0, -1.0]
             place = " ".join(f"{coordinate:.1f}" for coordinate in point)

@@ -11,6 +11,7 @@ from typing import Any
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.correction import correction_files, correction_refusal
 from legcal.exports.firmware import firmware_files, firmware_refusal
+from legcal.exports.flypt import flypt_files, flypt_refusal
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
 from legcal.exports.mjcf import mjcf_files, mjcf_refusal
@@ -49,6 +50,7 @@ FORMATS: dict[str, Format] = {
         name: Format(firmware_files(name), firmware_refusal(name))
         for name in ("klipper", "reprapfirmware", "marlin")
     },
+    "flypt": Format(flypt_files, flypt_refusal),
     "python": Format(python_files, kinematics_refusal),
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),

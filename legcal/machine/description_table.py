@@ -363,11 +363,16 @@ def read_description(
         content = content_of(path, FILE_KIND).decode(errors="replace")
     except DatasetError as error:
         raise ModelError(error.facts) from error
-    if (of_firmware := firmware_table(path, content, unit, effector)) is not None:
+    if (of_firmware := firmware_table(path, content, unit, given, effector)) is not None:
         table, notes = of_firmware
         stated = {"name": name} if name is not None else {}
         described = described_machine({**table, **stated, **given}, path)
         return replace(described, notes=(*described.notes, *notes))
+    if content.lstrip().startswith("<"):
+        raise ModelError(
+            f"{path}: the table could not be read: found XML, needed a table of joints or the "
+            f"configuration of a firmware; give a URDF or MJCF to legcal inspect {path} --write ."
+        )
     if effector is not None:
         raise ModelError(
             f"{path}: --platform-radius could not be used: found a table of joints, needed the "

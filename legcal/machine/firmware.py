@@ -22,7 +22,7 @@ that they add up to these numbers, which :data:`FIRMWARES` lists:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,6 +62,11 @@ class IdealDelta:
         centred[:, 2] = self.stop
         # Firmwares take the radius without corrections of single towers for a centred nozzle.
         return np.asarray(np.diagonal(self.motors(centred)))
+
+    @property
+    def reach(self) -> float:
+        """The radius of the workspace, as Klipper limits it."""
+        return float(min(np.min(self.radius + self.arm), np.min(self.rod - self.radius)))
 
     def joints(self, motors: Array) -> Array:
         """Return the upper joints of the rods (k, 3, 3) with motors (k, 3)."""
@@ -170,7 +175,7 @@ class Firmware:
         fields = {name: np.array(getattr(ideal, name)) for name in FIELDS}
         for (name, towers), change in zip(self.free(), step.tolist(), strict=True):
             fields[name][list(towers)] += change
-        return replace(ideal, **fields)
+        return IdealDelta(ideal.turns, **fields, stops_at_angles=ideal.stops_at_angles)
 
 
 _KLIPPER = "abc"

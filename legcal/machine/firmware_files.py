@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ import numpy as np
 from legcal.errors import ModelError
 from legcal.geometry.types import Array
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
+from legcal.machine.hexapod_files import NUMBER, Table, flypt_table, linuxcnc_table
 
 EFFECTOR = 0.25  # typical radius of the joints on an effector, in radii of towers, or in arms
 SPACING = 1.4  # typical distance of the two rods of a tower, in radii of the effector
@@ -30,7 +32,6 @@ PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers,
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 HOME = 0.4  # height of home, relative to that of the endstops
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
 
 
@@ -48,32 +49,36 @@ class Configuration:
 
 
 def firmware_table(
-    path: Path, text: str, unit: str | None, effector: float | None
-) -> tuple[dict[str, Any], tuple[str, ...]] | None:
+    path: Path,
+    text: str,
+    unit: str | None = None,
+    given: Mapping[str, Any] = MappingProxyType({}),
+    effector: float | None = None,
+) -> Table | None:
     """Return the table of a configuration and notes; None for a file of another kind.
 
-    *unit* is that of lengths and *effector* the radius of the joints on it, where stated by others.
+    *unit* is that of lengths, *given* has entries of the table and *effector* is the radius of the
+    joints on it, where stated by others.
 
     Raises
     ------
     ModelError
         With a sentence for each number that is missing or impossible.
     """
-    for reads in _READERS:
-        read = reads(path, text)
-        if read is None:
-            continue
-        if not isinstance(read, Configuration):
-            table, notes = read
-            return table | {"unit": _unit(path, table.get("unit"), unit)}, notes
-        unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
-        return _table_of_delta(path, read, unit, effector)
+    for reads in _DELTAS:
+        if (read := reads(path, text)) is not None:
+            unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
+            return _table_of_delta(path, read, unit, effector)
+    for makes in (linuxcnc_table, flypt_table):
+        if (hexapod := makes(path, text, given)) is not None:
+            table, notes = hexapod
+            return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
     return None
 
 
 def read_delta(path: Path, text: str) -> IdealDelta:
     """Return the Delta of a printer's configuration, as the firmware takes it."""
-    read = next(filter(None, (reads(path, text) for reads in (_klipper, _marlin_header, _g_code))))
+    read = next(filter(None, (reads(path, text) for reads in _DELTAS)))
     return read.firmware.ideal(_completed(path, read))
 
 
@@ -104,7 +109,7 @@ def _klipper(path: Path, text: str) -> Configuration | None:
         elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
             key = f"{section}.{match[1]}"
             words[key] = match[2]
-            if re.fullmatch(_NUMBER, match[2]):
+            if re.fullmatch(NUMBER, match[2]):
                 values[key] = float(match[2])
             else:
                 values.pop(key, None)
@@ -153,9 +158,9 @@ def _marlin_header(path: Path, text: str) -> Configuration | None:
     plain = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
     for name, rest in re.findall(r"^\s*#\s*define\s+(\w+)[ \t]+([^\n]*)", plain, re.MULTILINE):
         keys = _DEFINES.get(name.removeprefix("DEFAULT_"), ())
-        numbers = re.fullmatch(rf"[\s{{(]*({_NUMBER}(?:\s*,\s*{_NUMBER})*)f?[\s}})]*", rest)
+        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", rest)
         if numbers:
-            of_name = map(float, re.findall(_NUMBER, numbers[1]))
+            of_name = map(float, re.findall(NUMBER, numbers[1]))
             values |= dict(zip(keys, of_name, strict=False))
     if not re.search(r"^\s*#\s*define\s+(DEFAULT_)?DELTA_\w", plain, re.MULTILINE):
         return None
@@ -165,10 +170,9 @@ def _marlin_header(path: Path, text: str) -> Configuration | None:
             f"{path}: the Marlin configuration could not be used: found DELTA commented out, "
             "needed a Delta; remove the // before '#define DELTA' if it is one."
         )
-    parts = [values.get(key) for key in ("smooth", "effector", "carriage")]
-    if None not in parts:
-        smooth, effector, carriage = map(float, filter(lambda x: x is not None, parts))
-        values.setdefault("M665 R", smooth - effector - carriage)
+    if values.keys() >= {"smooth", "effector", "carriage"}:
+        radius = values["smooth"] - values["effector"] - values["carriage"]
+        values.setdefault("M665 R", radius)
     return Configuration(
         _named("marlin"),
         values,
@@ -187,7 +191,7 @@ def _g_code(path: Path, text: str) -> Configuration | None:
         if not words or words[0] not in ("M665", "M666", "M669"):
             continue
         for letter, numbers in re.findall(
-            rf"([A-Z])\s*({_NUMBER}(?:\s*:\s*{_NUMBER})*)", " ".join(words[1:])
+            rf"([A-Z])\s*({NUMBER}(?:\s*:\s*{NUMBER})*)", " ".join(words[1:])
         ):
             of_letter = [float(x) for x in numbers.split(":")]
             for i, value in enumerate(of_letter):
@@ -300,9 +304,7 @@ def _needed(firmware: Firmware, p: Parameter) -> str:
     return _WORDS[p.field]
 
 
-def _table_of_delta(
-    path: Path, read: Configuration, unit: str, effector: float | None
-) -> tuple[dict[str, Any], tuple[str, ...]]:
+def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float | None) -> Table:
     """Return the table of a Delta, and what was assumed."""
     firmware = read.firmware
     ideal = firmware.ideal(_completed(path, read))
@@ -334,6 +336,7 @@ def _table_of_delta(
             for point, axis, q in zip(shafts, (-along).tolist(), travels, strict=True)
         ]
     top = _nozzle_at(ideal, at_stops)[2]
+    thick = float(np.round(ROD * np.mean(ideal.rod), 2))
     table = {
         "legcal_table": 1,
         "name": path.stem,
@@ -344,7 +347,7 @@ def _table_of_delta(
         "base_joints": (A[:, None] + both).reshape(6, 3).tolist(),
         "platform_joints": (r * out[:, None] + both).reshape(6, 3).tolist(),
         "lengths": np.repeat(ideal.rod, 2).tolist(),
-        "radius": float(np.round(ROD * np.mean(ideal.rod), 2)),
+        "radius": thick,
         "home": {"xyz": [0, 0, float(np.round(HOME * top, 3))], "rpy_deg": [0, 0, 0]},
     }
     assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
@@ -352,8 +355,9 @@ def _table_of_delta(
     return table, (
         *read.notes,
         f"{firmware.title} knows no effector: assumed are {' and '.join(assumed)} "
-        "(--platform-radius states its radius, from which the distance follows). Where rods are "
-        "looked for in photographs depends on both, the numbers of the firmware do not.",
+        "(--platform-radius states its radius, from which the distance follows), and a radius of "
+        f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
+        "depends on these, the numbers of the firmware do not.",
         f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
         f"{firmware.title} counts it, the endstop the upper end of the travel.",
     )
@@ -388,16 +392,16 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             f"a rule 120 deg apart; correct their angles."
         )
     sizes = rod * _IN_MM[unit]
-    if not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):
-        problems.append(
-            f"{start} rods of {rod.min():g} {unit}, needed {SIZES[0]:g} to {SIZES[1]:g} mm; state "
-            "their unit with --unit in or --unit m if they are in another one, or correct them."
-        )
-    elif (np.ptp(sizes) > 0.5 * sizes.max()) or min(ideal.radius.min(), ideal.arm.min()) < 0.0:
+    if (np.ptp(sizes) > 0.5 * sizes.max()) or min(radius.min(), ideal.arm.min()) < 0.0:
         problems.append(
             f"{start} rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of "
             f"{radius.min():g} {unit}, needed rods that are nearly alike and positive numbers; "
             "write all lengths in one unit."
+        )
+    elif not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):
+        problems.append(
+            f"{start} rods of {rod.min():g} {unit}, needed {SIZES[0]:g} to {SIZES[1]:g} mm; state "
+            "their unit with --unit in or --unit m if they are in another one, or correct them."
         )
     elif not ideal.turns and (rod <= radius).any():
         problems.append(
@@ -421,6 +425,8 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
         raise ModelError(problems)
 
 
-_READERS: Sequence[
-    Callable[[Path, str], Configuration | tuple[dict[str, Any], tuple[str, ...]] | None]
-] = (_klipper, _marlin_header, _g_code)
+_DELTAS: Sequence[Callable[[Path, str], Configuration | None]] = (
+    _klipper,
+    _marlin_header,
+    _g_code,
+)
