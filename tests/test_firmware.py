@@ -5,15 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
+from legcal.calibration.pipeline import calibrate
 from legcal.errors import LegcalError
 from legcal.exports.formats import export
 from legcal.geometry.types import Array
+from legcal.machine.configurations import random_poses
+from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
-from legcal.machine.firmware_files import read_delta
+from legcal.machine.firmware_files import firmware_table, read_delta
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 
 KLIPPER = """
 [stepper_a]
@@ -115,6 +122,55 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+def printer_with_errors(folder: Path) -> Machine:
+    """Return a printer whose towers, rods and endstops are not those of its configuration."""
+    rng = np.random.default_rng(3)
+    table, _ = firmware_table(Path("printer"), KLIPPER) or ({}, ())
+    A = np.array(table["base_joints"]).reshape(3, 2, 3)
+    for tower in range(3):
+        turn = Rotation.from_euler("z", rng.normal(0.0, 0.3), degrees=True)
+        A[tower] = turn.apply(A[tower] + rng.normal(0.0, 1.0, 3))  # [mm], z of the endstop
+    rods = np.repeat(np.array(table["lengths"][::2]) + rng.normal(0.0, 0.3, 3), 2)
+    true = table | {"base_joints": A.reshape(6, 3).tolist(), "lengths": rods.tolist()}
+    return create_model(described_machine(true, Path("true")), folder).machine
+
+
+def off_by(text: str, true: Machine) -> float:
+    """Return the error of a firmware's kinematics over the bed of a printer [mm rms].
+
+    Where the bed stands, which probing tells, counts as known.
+    """
+    q, poses = random_poses(true, 400, 5)
+    nozzle = 1e3 * np.array([pose.translation for pose in poses])
+    tops = np.array([actuator.travel[1] for actuator in true.actuators])
+    ideal = read_delta(Path("text"), text)
+    motors = ideal.at_stops - 1e3 * (tops - q[:, ::2])
+    usual = ideal.is_usual(motors)
+    both = ideal.positions(motors)[usual], nozzle[usual]
+    there, nozzle = (points - points.mean(axis=0) for points in both)
+    _, distance = Rotation.align_vectors(nozzle, there)
+    return float(distance / np.sqrt(len(nozzle)))
+
+
+def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> None:
+    nominal, true = machine_of(KLIPPER, tmp_path), printer_with_errors(tmp_path / "true")
+    perfect = ParameterErrors()
+    made = SimulationSettings(Level.OUTLINES, perfect, poses=8, sampling="workspace", seed=4)
+    folder = tmp_path / "session"
+    simulate(true, folder, made)
+    dataset = folder / "dataset.yaml"
+    entries = yaml.safe_load(dataset.read_text()) | {"mechanism": str(nominal.yaml_path)}
+    dataset.write_text(yaml.safe_dump(entries))
+    calibrate(folder, output=tmp_path / "out")
+    exported = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg")
+    before, after = off_by(KLIPPER, true), off_by(exported.paths[0].read_text(), true)
+    assert before > 0.3
+    assert after < before / 5.0
+    assert exported.figures["nominal_mm"]["rms"] == pytest.approx(before, rel=0.3)
+    assert abs(exported.figures["remaining_mm"]["rms"] - after) < 0.01
+    assert b"<svg" in exported.paths[1].read_bytes()
 
 
 # --- hexapods -----------------------------------------------------------------------------------

@@ -287,12 +287,12 @@ class _Row:
 
 
 def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
-    """Return readings (k, n_legs) and poses (k, 3, 4) within the reach of the firmware."""
+    """Return readings (k, n_legs) and poses (k, 3, 4) where a Delta is used."""
     readings, motions = random_poses(mount.machine, N_POSES, SEED)
-    poses = stacked(motions)
-    off = np.linalg.norm(mount.nozzle(poses)[:, :2], axis=1)
-    inside = off <= max(mount.start.reach, float(np.sort(off)[LEAST_POSES]))
-    return readings[inside], poses[inside]
+    usual = mount.start.is_usual(mount.start.at_stops - mount.steps(readings))
+    if usual.sum() < LEAST_POSES:
+        usual[:] = True
+    return readings[usual], stacked(motions)[usual]
 
 
 # --- least squares ------------------------------------------------------------------------------

@@ -27,9 +27,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 
 TOWERS = 3
+FLATTEST = 20.0  # [deg] of a rod from the horizontal at the edge of the bed
 _ALL = (0, 1, 2)
 FIELDS = ("radius", "angle", "rod", "arm", "height", "stop")
 
@@ -63,11 +64,6 @@ class IdealDelta:
         # Firmwares take the radius without corrections of single towers for a centred nozzle.
         return np.asarray(np.diagonal(self.motors(centred)))
 
-    @property
-    def reach(self) -> float:
-        """The radius of the workspace, as Klipper limits it."""
-        return float(min(np.min(self.radius + self.arm), np.min(self.rod - self.radius)))
-
     def joints(self, motors: Array) -> Array:
         """Return the upper joints of the rods (k, 3, 3) with motors (k, 3)."""
         across, up = self.radius, motors
@@ -97,6 +93,11 @@ class IdealDelta:
         y = (rod[0] ** 2 - rod[2] ** 2 + i**2 + j**2 - 2.0 * i * x) / (2.0 * j)
         z = np.sqrt(np.maximum(rod[0] ** 2 - x**2 - y**2, 0.0))
         return np.asarray(C[:, 0] + x[:, None] * ex + y[:, None] * ey - z[:, None] * ez)
+
+    def is_usual(self, motors: Array) -> BoolArray:
+        """Return where (k,) all rods hang as steeply as Deltas are built for."""
+        down = self.joints(motors)[:, :, 2] - self.positions(motors)[:, 2:]
+        return np.asarray((down >= np.sin(np.radians(FLATTEST)) * self.rod).all(axis=1))
 
     def motors(self, positions: Array) -> Array:
         """Return the motors (k, 3) at positions of the nozzle (k, 3), NaN out of reach."""
