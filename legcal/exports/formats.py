@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.correction import correction_files, correction_refusal
+from legcal.exports.firmware import firmware_files, firmware_refusal
+from legcal.exports.flypt import flypt_files, flypt_refusal
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
 from legcal.exports.mjcf import mjcf_files, mjcf_refusal
@@ -48,6 +50,11 @@ FORMATS: dict[str, Format] = {
     "urdf": Format(urdf_files, options=("inertia",)),
     "mjcf": Format(mjcf_files, mjcf_refusal),
     "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
+    **{
+        name: Format(firmware_files(name), firmware_refusal(name))
+        for name in ("klipper", "reprapfirmware", "marlin")
+    },
+    "flypt": Format(flypt_files, flypt_refusal),
     "python": Format(python_files, kinematics_refusal),
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
@@ -84,8 +91,15 @@ class Residual(Document):
     max_dE_rad: Number
 
 
+class Remaining(Document):
+    """Errors of a firmware over the workspace [mm]."""
+
+    rms: Number
+    max: Number
+
+
 class ExportDocument(SparseDocument):
-    """The document of ``legcal export --json``: files, and figures of a correction table."""
+    """The document of ``legcal export --json``: files, and figures of a correction or firmware."""
 
     format: str
     written: list[str]
@@ -94,6 +108,8 @@ class ExportDocument(SparseDocument):
     residual: Residual | None = None  # with the corrected commands
     uncorrected: Residual | None = None
     tested: int | None = None  # number of tested middles of cells
+    remaining_mm: Remaining | None = None  # with the written numbers of a firmware
+    nominal_mm: Remaining | None = None  # with those of the nominal model
     notes: list[str]
 
 
@@ -146,13 +162,24 @@ def export(
             f"{', '.join(formats_of(subject))}."
         )
     rendered = format.render(subject, given, destination)
-    _keep_sources(subject, [destination / file.name for file in rendered.files])
+    places = [_beside(destination, file.name) for file in rendered.files]
+    if format.is_folder:
+        places = [destination / file.name for file in rendered.files]
+    _keep_sources(subject, places)
     if format.is_folder:
         paths = _write_folder(destination, rendered, force=force)
     else:
-        _FILE.write(destination, rendered.files[0].content, force=force)
-        paths = (destination,)
+        paths = tuple(places)
+        for place in paths:
+            _FILE.check_place(place, force=force)
+        for place, file in zip(paths, rendered.files, strict=True):
+            _FILE.write(place, file.content, force=force)
     return Exported(to, paths, rendered.notes, dict(rendered.figures))
+
+
+def _beside(destination: Path, ending: str) -> Path:
+    """Return the place of a file of an export: a picture stands beside, under its name."""
+    return destination.with_name(destination.name + ending) if ending else destination
 
 
 def formats_of(subject: Subject) -> tuple[str, ...]:
