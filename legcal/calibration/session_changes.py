@@ -28,6 +28,7 @@ from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
+from legcal.data.image_choice import images_in_words
 from legcal.data.measurements import Measurements, few_views, row_names
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
@@ -83,6 +84,9 @@ class Finding:
     steps : (p, c) array
         The error of the kinematic parameters of the fit without the number, as in the
         parametrization of its problem; of noise, c independent errors.
+    images : str
+        The images on one side of a change, as options name them: before that of an encoder, the
+        fewer ones beside that of a camera.
     stated : float
         The standard deviation of readings that is stated, of noise alone.
     """
@@ -95,6 +99,7 @@ class Finding:
     between: tuple[str, str] | None
     p_value: float
     steps: Array
+    images: str = ""
     stated: float = 0.0
 
     @property
@@ -118,7 +123,7 @@ class Finding:
     @property
     def remedy(self) -> str:
         """What to do, as a clause."""
-        return _WORDS[self.kind][1].format(subject=self.subject)
+        return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
 _WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
@@ -126,8 +131,8 @@ _WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity")
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
-        "look for a slipped coupling or a lost home there, and leave the images before it, or "
-        "those after it, out of measurements.csv",
+        "look for a slipped coupling or a lost home there, and calibrate with a zero of its own "
+        "before that (--split {subject}@{images})",
     ),
     "drift": (
         "the zero of the encoder of {subject} drifts by {size} from the first image to the last",
@@ -135,12 +140,14 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
     ),
     "camera": (
         "the camera of {subject} moved by {size}",
-        "make the images after it a view of their own in dataset.yaml and measurements.csv",
+        "make the images after it a view of their own in dataset.yaml and measurements.csv, or "
+        "calibrate without those on one side of it (--leave-out {images})",
     ),
     "focal_length": (
         "the focal length of {subject} changed by {size}",
         "switch off autofocus and zoom; make the images after it a view of their own, with a "
-        "camera file of their own",
+        "camera file of their own, or calibrate without those on one side of it "
+        "(--leave-out {images})",
     ),
     "lag": (
         "readings are ahead of the platform by {size} of the last move",
@@ -278,6 +285,7 @@ def session_tests(
                 test.holds.astype(np.float64)[:, None],
                 number.amount[:, None],
             ),
+            _side(measurements, course, hypotheses[test.hypothesis], test),
         )
         for test, number in lacking
     ]
@@ -303,7 +311,7 @@ def session_tests(
                 None,
                 noise.p_value,
                 np.hstack(steps),
-                noise.stated,
+                stated=noise.stated,
             )
         )
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
@@ -325,6 +333,26 @@ def _forward_selection(
         tests = [test for test in tests if test.hypothesis != tests[best].hypothesis]
         solved = [scores.solved(test) for test in tests]
     return lacking, scores
+
+
+def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
+    """Return the images before a change of an encoder; beside that of a camera, the fewer ones."""
+    if test.between is None:
+        return ""
+    names = [view.name for view in measurements.views]
+    is_of_camera = hypothesis.kind != "encoder"
+    sides = []
+    for is_after in (False, True):
+        parts = []
+        for rows in course.rows_in_order:
+            on_side = test.holds[course.block[rows]] == is_after
+            if is_of_camera:
+                on_side &= measurements.view[rows] == names.index(hypothesis.subject)
+            parts.append(rows[on_side])
+        sides.append([rows for rows in parts if len(rows)])
+    if is_of_camera:
+        sides.sort(key=lambda side: sum(map(len, side)))
+    return images_in_words(measurements, sides[0])
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:

@@ -28,7 +28,7 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
-from legcal.data.image_order import image_sequences
+from legcal.data.image_choice import sequences_of
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import IntArray
 
@@ -59,6 +59,11 @@ def judge(
     readings = solution.quality.redundant_readings
     for wrong in () if readings is None else readings.wrong:
         q[wrong.pose, np.equal(machine.reads, machine.reads[wrong.leg])] = np.nan
+    motors = np.array([leg.motor_label for leg in machine.legs], dtype=object)
+    for of, zero in zip(
+        measurements.own_zeros, solution.posterior.state.own_zeros.tolist(), strict=True
+    ):
+        q[np.ix_(of.rows[measurements.first_rows], motors == of.motor)] -= zero
     platform = platform_accuracy(
         machine,
         solution.legs,
@@ -76,8 +81,7 @@ def judge(
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
-    taken_at = {image: facts.taken_at for image, facts in dataset.facts.items()}
-    sequences = image_sequences(measurements, taken_at)
+    sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
     doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
     displacement, rotation = model_error(doubts)
