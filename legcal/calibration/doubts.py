@@ -133,13 +133,19 @@ def doubts_of(
         *_moved_parameters(dataset, solution, platform),
         *_scale(dataset, solution, platform),
         *_held_out(held_out),
-        *(changes or _symptoms(solution, platform)),
+        *(changes or _symptoms(solution, platform, session)),
     )
 
 
-def _symptoms(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+def _symptoms(
+    solution: Solution, platform: PlatformAccuracy | None, session: SessionTests
+) -> list[Doubt]:
     """Return the doubts that a change in the course of a session would cause as well."""
-    return [*_cameras(solution, platform), *_left_out(solution, platform), *_noise(solution)]
+    return [
+        *_cameras(solution, platform),
+        *_left_out(solution, platform),
+        *_noise(solution, session),
+    ]
 
 
 def no_improvement(remedy: str) -> Doubt:
@@ -366,8 +372,8 @@ def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[
     """
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     names = solution.posterior.problem.legs.parametrization.names
-    step_of = dict(zip(names, finding.steps.tolist(), strict=True))
-    steps = np.array([[step_of[name]] for name in parametrization.names])
+    step_of = dict(zip(names, finding.steps, strict=True))
+    steps = np.array([step_of[name] for name in parametrization.names])
     legs, poses = solution.legs, solution.T_Rb_Re
     error = _moved_platform(dataset, solution, steps)
     before = error.mean_displacement, error.mean_rotation
@@ -422,14 +428,15 @@ def _moved_parameters(
     return [Doubt("tolerance", what, remedy, *_mean(error))]
 
 
-def _noise(solution: Solution) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or those of a view or a leg."""
+def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or of a view, leg or period."""
     problem = solution.posterior.problem
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
     if times["all views"] <= MOST_SCATTER:
         times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
         times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
+        times |= {name: scatter.ratio(of) for name, of in session.periods.items()}
     worst = max(times, key=times.__getitem__)
     if times[worst] <= MOST_SCATTER:
         return []
