@@ -35,6 +35,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 
 SIGNIFICANCE = 1e-4  # largest probability of a finding by chance, times the number of tests
 MAX_FINDINGS = 3
+ALL_MOTORS = "all motors"  # subject of a gain that they share
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
 MIN_IMAGES = 3  # on each side of a change
 _MAX_OTHER_VIEWS = 5  # views whose side of a change is tried
@@ -42,6 +43,7 @@ _HUBER = 3.0  # standard deviations from which on outlines count less
 _UNSEEN = 1e-6  # part of the square of a column below which the fit absorbs it
 
 Kind = Literal["encoder", "drift", "camera", "focal_length", "lag", "backlash", "gain"]
+OF_MOTORS: frozenset[Kind] = frozenset(("encoder", "drift", "lag", "backlash", "gain"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -449,11 +451,16 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
                 of_factor, block = {e.factor: wrong}, {e.factor: e.block}
                 label, changes = leg.motor_label, kind == "encoder"
                 yield _Hypothesis(kind, label, of_unit, of_factor, block, changes)
-    columns = {
-        e.factor: (e.by_reading * last_move)[:, None, None]
-        for e, last_move in zip(encoders, moves, strict=True)
-    }
-    yield _Hypothesis("lag", "", "1", columns, {e.factor: e.block for e in encoders}, False)
+    of_all: list[tuple[Kind, str, list[Array]]] = [
+        ("lag", "", moves),
+        ("gain", ALL_MOTORS, [e.reading for e in encoders]),
+    ]
+    for kind, label, numbers_of_all in of_all:
+        columns = {
+            e.factor: (e.by_reading * by)[:, None, None]
+            for e, by in zip(encoders, numbers_of_all, strict=True)
+        }
+        yield _Hypothesis(kind, label, "1", columns, {e.factor: e.block for e in encoders}, False)
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
