@@ -14,8 +14,13 @@ from legcal.files.schema import describe
 LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0}
 ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
 PIXELS: Mapping[str, float] = {"px": 1.0}
-# Units shown in place of metres and radians, and their factors
-SHOWN_IN: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
+# Units shown in place of those of files, and their factors
+SHOWN_IN: Mapping[str, tuple[float, str]] = {
+    "m": (1e3, "mm"),
+    "rad": (math.degrees(1.0), "deg"),
+    "px": (1.0, "px"),
+    "": (1.0, ""),
+}
 
 _NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
 _VALUE = re.compile(_NUMBER, re.ASCII)
