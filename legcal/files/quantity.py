@@ -16,8 +16,13 @@ LENGTH: Mapping[str, float] = {
 }  # fmt: skip
 ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0, "rev": math.tau}
 PIXELS: Mapping[str, float] = {"px": 1.0}
-# Units shown in place of metres and radians, and their factors
-SHOWN_IN: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
+# Units shown in place of those of files, and their factors
+SHOWN_IN: Mapping[str, tuple[float, str]] = {
+    "m": (1e3, "mm"),
+    "rad": (math.degrees(1.0), "deg"),
+    "px": (1.0, "px"),
+    "": (1.0, ""),
+}
 
 _NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
 _VALUE = re.compile(_NUMBER, re.ASCII)
