@@ -8,6 +8,7 @@ coincident frames. Without a block ``legcal`` the tree is closed near its drawn 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -24,6 +25,7 @@ from legcal.machine.bodies import rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
+from legcal.machine.open_joints import with_held_joints
 from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
@@ -39,7 +41,7 @@ from legcal.machine.spanning_tree import (
     sliders_without_travel,
     travel_note,
 )
-from legcal.machine.topology import find_chains, level_rotation, propose_block
+from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
     LOOP_TAGS,
     Problems,
@@ -54,6 +56,7 @@ from legcal.machine.urdf import (
 from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
 XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
+_CLOSING = re.compile(r"closing_(.+)_([12])")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
@@ -77,13 +80,51 @@ def read_source(model: str | Path) -> Source:
     path = find_model(model)
     is_xml = path.suffix.lower() in XML_SUFFIXES
     source = _read_xml(path) if is_xml else read_yaml_source(path)
+    names = {*source.urdf.links, *source.urdf.joints}
+    pairs = source.file.closed_loop
+    if not all(a in names and b in names and a != b for a, b in pairs):
+        return source  # refused later, with the location of the name
+    source = with_held_joints(source)
     if source.file.legcal is not None:
         return source
-    names = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in names for pair in source.file.closed_loop for name in pair):
-        return source  # refused later, with the location of the name
     check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
+        source = _with_arms_as_motors(source)
     return completed(source)
+
+
+def _with_arms_as_motors(source: Source) -> Source:
+    """Return a mechanism without motors with those joints on its base as motors that move rods."""
+    urdf, closures = source.urdf, _closures(source)
+    with suppress(OutOfClass):
+        propose_block(urdf, closures, [], source.path)
+        return source  # moved by hand
+    with suppress(OutOfClass):
+        block = propose_block(urdf, closures, None, source.path)
+        bodies = rigid_bodies(urdf, closures, block.platform_joint)
+        turning = motors_on(bodies, urdf, bodies.body_of[block.base])
+        chains = find_chains(bodies, urdf, block.base, block.platform, turning)
+        moving = {chain.motor for chain in chains}
+        motors = [name for name in turning if name in moving]
+        note = (
+            f"The file names no motors: the {len(motors)} joints on the base that move rods "
+            f"({', '.join(motors)}) were taken as motors; name the motors in <transmission> "
+            "elements if some are not."
+        )
+        return replace(
+            source,
+            file=source.file.model_copy(update={"name_mot": motors}),
+            notes=(*source.notes, note),
+        )
+    return source
+
+
+def _closures(source: Source) -> list[Closure]:
+    """Return the closures of a mechanism in the order of its file."""
+    return [
+        Closure("3d" if kind == "3d" else "6d", first, second)
+        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+    ]
 
 
 def _read_xml(path: Path) -> Source:
@@ -105,7 +146,7 @@ def _read_xml(path: Path) -> Source:
                 line=cast("int", root.sourceline),
             )
         )
-    if any(element.tag in LOOP_TAGS for element in root):
+    if any(element.tag in LOOP_TAGS for element in root) or closing_frames(root, path):
         return read_loop_source(path, content)
     raise OutOfClass(
         Problem(
@@ -258,8 +299,38 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
     return replaced
 
 
+def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
+    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot.
+
+    Raises
+    ------
+    ModelError
+        If one of a pair is missing.
+    """
+    ends: dict[str, dict[str, str]] = {}
+    for element in robot.findall("link"):
+        match = _CLOSING.fullmatch(element.get("name", ""))
+        if match:
+            ends.setdefault(match[1], {})[match[2]] = match[0]
+    for name, numbers in ends.items():
+        if len(numbers) == 1:
+            (number, link) = next(iter(numbers.items()))
+            other = f"closing_{name}_{3 - int(number)}"
+            raise ModelError(
+                Problem(
+                    "the loops could not be closed",
+                    f"the frame '{link}' and no '{other}'",
+                    "both ends of each loop",
+                    f"export the model again with both parts of the mate closing_{name}, or "
+                    f"remove '{link}'",
+                    str(path),
+                )
+            )
+    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+
+
 def read_loop_source(path: Path, content: bytes) -> Source:
-    """Return the mechanism of a URDF with loops.
+    """Return the mechanism of a URDF with loops: elements of its own, or pairs of closing frames.
 
     Motors are the prismatic joints named in ``<transmission>`` or ``<ros2_control>``, or all
     prismatic joints if none is named.
@@ -290,10 +361,16 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         if line:
             robot.append(etree.fromstring(line))
             robot[-1].tail = "\n"
+    named = closing_frames(robot, path)
+    if named:
+        notes.append(
+            f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
+            "joints."
+        )
     written = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
     file = MechanismFile(
-        closed_loop=[frames for frames, _ in pairs],
-        type=[kind for _, kind in pairs],
+        closed_loop=[*(frames for frames, _ in pairs), *named],
+        type=[*(kind for _, kind in pairs), *["3d"] * len(named)],
         name_mot=motors,
     )
     urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
@@ -436,10 +513,7 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
 
 def completed(source: Source) -> Source:
     """Return a mechanism without a block, completed with the closed poses and all travels."""
-    closures = [
-        Closure("3d" if kind == "3d" else "6d", first, second)
-        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
-    ]
+    closures = _closures(source)
     try:
         chain = ClosedChain(source.urdf.text, closures)
     except ModelError as error:

@@ -51,6 +51,7 @@ from legcal.machine.leg import (
     JointType,
     LegChain,
 )
+from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
@@ -94,7 +95,9 @@ _DEVIATION = {  # messages, with an angle [deg]
 }
 
 
-def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machine:
+def load_mechanism(
+    model: str | Path, *, without: Collection[str] = (), leg_radius: float | None = None
+) -> Machine:
     """Return the mechanism of a file, with its legs classified from geometry.
 
     Parameters
@@ -104,6 +107,8 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
         ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
     without : collection of str
         Sliders of legs that are treated as passive although ``name_mot`` lists them.
+    leg_radius : float, optional
+        Radius [m] of the legs that the file draws without a cylinder.
 
     Raises
     ------
@@ -116,7 +121,7 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
     if without:
         left = [name for name in source.file.name_mot if name not in without]
         source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
-    return _load(source)
+    return _load(replace(source, leg_radius=leg_radius))
 
 
 def _load(source: Source) -> Machine:
@@ -135,6 +140,10 @@ def _load(source: Source) -> Machine:
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
+    drawn, round_parts = with_mesh_cylinders(machine, source.leg_radius)
+    if round_parts or drawn is not source.urdf:
+        source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
+        machine = _assemble(source, block, closures)
     urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
     if urdf is not source.urdf:
         machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
