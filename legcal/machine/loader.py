@@ -39,7 +39,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
-from legcal.machine.formats import read_source
+from legcal.machine.formats import proposed_block, read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -79,7 +79,6 @@ from legcal.machine.topology import (
     normals_in_links,
     normals_of_closures,
     plane_of_motion,
-    propose_block,
     propose_frame,
 )
 from legcal.machine.urdf import Urdf, UrdfJoint
@@ -96,7 +95,12 @@ _DEVIATION = {  # messages, with an angle [deg]
 
 
 def load_mechanism(
-    model: str | Path, *, without: Collection[str] = (), leg_radius: float | None = None
+    model: str | Path,
+    *,
+    without: Collection[str] = (),
+    base: str | None = None,
+    platform: str | None = None,
+    leg_radius: float | None = None,
 ) -> Machine:
     """Return the mechanism of a file, with its legs classified from geometry.
 
@@ -107,6 +111,8 @@ def load_mechanism(
         ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
     without : collection of str
         Sliders of legs that are treated as passive although ``name_mot`` lists them.
+    base, platform : str, optional
+        Links of a file without a block ``legcal`` in which several could be meant.
     leg_radius : float, optional
         Radius [m] of the legs that the file draws without a cylinder.
 
@@ -117,7 +123,7 @@ def load_mechanism(
     OutOfClass
         If the method does not support the mechanism.
     """
-    source = read_source(model)
+    source = read_source(model, base, platform)
     if without:
         left = [name for name in source.file.name_mot if name not in without]
         source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
@@ -134,7 +140,7 @@ def _load(source: Source) -> Machine:
         Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
     ]
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
-    block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
+    block = file.legcal or proposed_block(source, file.name_mot)
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))

@@ -55,31 +55,30 @@ def with_mesh_cylinders(machine: Machine, radius: float | None = None) -> tuple[
     )
     axes = _axes(machine, bodies)
     added: dict[str, list[str]] = {}
-    notes: dict[tuple[str, str, float], list[str]] = {}
-    seen = {leg.name for leg in machine.legs if leg.cylinders} if radius is not None else set[str]()
-    if radius is not None:
-        for leg in machine.legs:
-            if leg.name not in seen:
-                seen.add(leg.name)
-                for link, axis in _stated(leg, axes, bodies):
-                    added.setdefault(link, []).append(_drawn(bodies, link, axis, radius))
+    parts: dict[tuple[str, str, float], list[str]] = {}  # legs by mesh, diameter, length
     for link in parse_robot(urdf.path, urdf.content).findall("link"):
         name = link.get("name", "")
         for axis in axes.get(bodies.body_of[name], []):
-            if axis.leg in seen:
+            found = [
+                (part, visual)
+                for visual in link.findall("visual")
+                if (part := _round_part(urdf.path, visual, bodies.T_body_link[name], axis))
+            ]
+            if not found:
                 continue
-            best = None
-            for visual in link.findall("visual"):
-                round_part = _round_part(urdf.path, visual, bodies.T_body_link[name], axis)
-                if round_part is not None and (best is None or _length(round_part) > _length(best)):
-                    best = round_part
-                    file = Path(visual.find("geometry/mesh").get("filename", "")).name  # type: ignore[union-attr]
-            if best is not None:
-                radius_there, start, end = best
-                part = axis._replace(start=start, end=end)
-                added.setdefault(name, []).append(_drawn(bodies, name, part, radius_there))
-                key = file, f"{2e3 * radius_there:.4g}", round(1e3 * (end - start), 1)
-                notes.setdefault(key, []).append(axis.leg)
+            (round_radius, start, end), visual = max(found, key=lambda f: f[0][2] - f[0][1])
+            shown = round_radius if radius is None else radius
+            there = axis._replace(start=start, end=end)
+            added.setdefault(name, []).append(_drawn(bodies, name, there, shown))
+            mesh = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+            key = Path(mesh).name, f"{2e3 * shown:.4g}", round(1e3 * (end - start), 1)
+            parts.setdefault(key, []).append(axis.leg)
+    if radius is not None:
+        seen = {name for names in parts.values() for name in names}
+        for leg in machine.legs:
+            if not leg.cylinders and leg.name not in seen:
+                for link_name, axis in _stated(leg, axes, bodies):
+                    added.setdefault(link_name, []).append(_drawn(bodies, link_name, axis, radius))
     if not added:
         return urdf, []
     robot = parse_robot(urdf.path, urdf.content)
@@ -89,14 +88,11 @@ def with_mesh_cylinders(machine: Machine, radius: float | None = None) -> tuple[
     content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
     written = replace(parse_urdf(urdf.path, content, travel_needed=False), wording=urdf.wording)
     return written, [
-        f"the mesh {file} of {', '.join(legs)} is round with a diameter of {diameter} mm over "
-        f"{length:g} mm, which was taken as the visible cylinder; give --leg-radius if it is not."
-        for (file, diameter, length), legs in notes.items()
+        f"the mesh {mesh} of {', '.join(legs)} is round over {length:g} mm: this part was taken as "
+        f"the visible cylinder, with a diameter of {diameter} mm; give --leg-radius if it has "
+        "another."
+        for (mesh, diameter, length), legs in parts.items()
     ]
-
-
-def _length(part: tuple[float, float, float]) -> float:
-    return part[2] - part[1]
 
 
 def _axes(machine: Machine, bodies: Bodies) -> dict[str, list[Axis]]:

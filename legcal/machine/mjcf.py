@@ -692,21 +692,16 @@ def _without_loose_bodies(
     urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
     """Return the tree without free bodies outside all closures, and the names of these."""
-    loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
+    moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
+    loose = {
+        link
+        for links, closed in moving_groups(urdf, frames)
+        if not closed and moved.isdisjoint(links)
+        for link in links
+    }
     if not loose:
         return urdf, []
     joints = [j for j in urdf.joints.values() if j.child in loose]
-    other = [j.name for j in joints if j.moves and j.type != "floating"]
-    if other:
-        raise OutOfClass(
-            Problem(
-                "the mechanism could not be read",
-                f"joints of something else beside it ('{other[0]}')",
-                "one mechanism in the file",
-                "remove the other bodies",
-                str(urdf.path),
-            )
-        )
     for joint in joints:
         del tree.joints[joint.name]
     for link in loose:

@@ -38,6 +38,8 @@ class Source:
     poses: Mapping[str, RigidTransform] | None = None
     is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
     drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
+    base: str | None = None  # stated links of a file without a block
+    platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
 
 

@@ -7,7 +7,7 @@ underscore, if these are distinct. The frames are defined by the legs whose join
 triangle, or are farthest apart in a plane.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -151,11 +151,16 @@ def _paths(
 
 
 def propose_block(
-    urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str] | None, path: Path
+    urdf: Urdf,
+    closures: Sequence[Closure],
+    motors: Sequence[str] | None,
+    path: Path,
+    ends: tuple[str | None, str | None] = (None, None),
 ) -> LegcalBlock:
     """Return the default block ``legcal`` for a file without one.
 
-    Without *motors* all revolute joints on the base may be motors of arms.
+    Without *motors* all revolute joints on the base may be motors of arms. The links of base and
+    platform may be stated as *ends*.
 
     Raises
     ------
@@ -165,10 +170,13 @@ def propose_block(
     bodies = rigid_bodies(urdf, closures, None)
     root, problems = bodies.body_of[urdf.root], list[OutOfClass]()
     blocks = dict[str, LegcalBlock]()
-    for base in (root, *_joined_bodies(bodies, urdf, root)):
+    bases = [root, *_joined_bodies(bodies, urdf, root)]
+    if ends[0] is not None:
+        bases = [bodies.body_of[ends[0]]]
+    for base in bases:
         on_base = motors_on(bodies, urdf, base) if motors is None else motors
         try:
-            blocks[base] = _block_on(bodies.body_of, base, urdf, closures, on_base, path)
+            blocks[base] = _block_on(base, urdf, closures, on_base, path, ends)
         except OutOfClass as error:
             problems.append(error)
         if root in blocks:
@@ -206,12 +214,12 @@ def motors_on(bodies: Bodies, urdf: Urdf, base: str) -> list[str]:
 
 
 def _block_on(
-    body_of: Mapping[str, str],
     base: str,
     urdf: Urdf,
     closures: Sequence[Closure],
     motors: Sequence[str],
     path: Path,
+    ends: tuple[str | None, str | None],
 ) -> LegcalBlock:
     """Return the default block ``legcal`` with a body as the base.
 
@@ -224,18 +232,23 @@ def _block_on(
     bodies = rigid_bodies(urdf, closures, None)
     real = replace(bodies, connections=_without_virtual(bodies, urdf))
     carried = [bodies.body_of[j.child] for j in virtual]
-    base_link = urdf.root
-    if base != body_of[urdf.root] or not _is_used(urdf, closures, urdf.root):
+    root = bodies.body_of[urdf.root]
+    base_link = ends[0] or urdf.root
+    if ends[0] is None and (base != root or not _is_used(urdf, closures, urdf.root)):
         base_link = _main_link(urdf, closures, bodies, base)
-    platform = _platform_body(real, base, base_link, carried, urdf, path, motors)
+    if ends[1] is None:
+        platform = _platform_body(real, base, base_link, carried, urdf, path, motors)
+    else:
+        platform = bodies.body_of[ends[1]]
     carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
         base, platform}]  # fmt: skip
     joint = carrier[0].name if carrier else None
     link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
+    link = ends[1] or link
     bodies = rigid_bodies(urdf, closures, joint)
     chains = in_order(find_chains(bodies, urdf, base_link, link, motors), motors, urdf)
     needed = n_frame_legs(spatial=plane_of_motion(chains) is None)
-    if len(chains) < needed and base != body_of[urdf.root]:
+    if len(chains) < needed and base != root and ends[0] is None:
         raise OutOfClass(
             Problem(
                 "this is not a platform on legs",
@@ -665,9 +678,18 @@ def _not_a_chain(
         course = (
             f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         )
-        moved = "a motor in name_mot that moves this link"
-        needed = f"joints whose centres are fixed in the base, or {moved}"
+        needed = (
+            "joints whose centres are fixed in the base, or a motor in name_mot that moves this "
+            "link itself"
+        )
         remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
+        if first.joint in motors:
+            between = _name(steps[1].connection) if len(steps) > 1 else "another joint"
+            course = (
+                f"carries {n_onward} rods on link '{body}' behind {between}, which stands between "
+                f"them and the motor '{first.joint}'"
+            )
+            remedy = f"make {between} fixed if it does not move, otherwise "
     else:
         course = f"shares link '{body}' with another leg or branches there"
     return Problem(
