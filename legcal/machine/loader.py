@@ -26,6 +26,7 @@ from legcal.machine.classification import (
     actuator_of,
     joint_tolerance,
     leg_of,
+    parallel,
 )
 from legcal.machine.cylinders import (
     at_visible_heights,
@@ -65,10 +66,11 @@ from legcal.machine.parameters import geometries, n_frame_legs, parametrization_
 from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
-from legcal.machine.spanning_tree import Source
+from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
+    VIRTUAL,
     Normals,
     any_joint,
     check_bodies,
@@ -140,7 +142,13 @@ def _load(source: Source) -> Machine:
         Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
     ]
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
-    block = file.legcal or proposed_block(source, file.name_mot)
+    if file.name_mot:
+        _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
+    try:
+        block = file.legcal or proposed_block(source, file.name_mot)
+    except OutOfClass:
+        _check_plane_of_arms(urdf, source.path)
+        raise
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
@@ -633,15 +641,35 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             )
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
-        raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                "a planar machine whose joints at A move on carriages or arms",
-                "a machine in space, or sliders along the legs",
-                "this machine cannot be calibrated with legcal",
-                str(path),
-            )
-        )
+        raise OutOfClass(_plane_of_arms("whose joints at A move on carriages or arms", path))
+
+
+def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
+    """Check that a machine without sliders moves in space.
+
+    Raises
+    ------
+    OutOfClass
+        If all axes are parallel: a planar machine of arms, such as a five-bar or a 3-RRR.
+    """
+    moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
+    poses = reference_poses(urdf)
+    axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
+    if len(axes) < 2 or any(joint.type == "prismatic" for joint in moving):
+        return
+    if all(parallel(axes[0], axis) for axis in axes):
+        raise OutOfClass(_plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path))
+
+
+def _plane_of_arms(kind: str, path: Path) -> Problem:
+    """Return the problem of a planar machine that has no sliders along its legs."""
+    return Problem(
+        "this mechanism is not supported",
+        f"a planar machine {kind}",
+        "a machine in space, or sliders along the legs",
+        "this machine cannot be calibrated with legcal",
+        str(path),
+    )
 
 
 def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
