@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.correction import correction_files, correction_refusal
@@ -20,6 +20,10 @@ from legcal.exports.robot_files import ros_files, urdf_files
 from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
 from legcal.files.folder import OutputFile, OutputKind, result_folder
 from legcal.files.schema import Document, Number, SparseDocument
+from legcal.machine.model import Machine
+
+if TYPE_CHECKING:
+    from legcal.calibration.result_folder import EarlierResult
 
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
@@ -110,7 +114,7 @@ class ExportDocument(SparseDocument):
 
 
 def export(
-    source: str | Path | Subject,
+    source: str | Path | Machine | EarlierResult | Subject,
     to: str,
     path: str | Path,
     *,
@@ -121,8 +125,9 @@ def export(
 
     Parameters
     ----------
-    source : path, name or Subject
-        A result folder, its ``result.json``, or a mechanism.
+    source : path, name, Machine or EarlierResult
+        A result folder, its ``result.json``, what :func:`legcal.load_result` returned, or a
+        mechanism.
     to : str
         One of ``FORMATS``.
     path : path

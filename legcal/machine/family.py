@@ -7,7 +7,7 @@ that sink with the reading, and two parallel rods on each. For further numbers, 
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
 from legcal.machine.description_table import described_machine, read_description
 from legcal.machine.dimensions import Dimensions
+from legcal.machine.model_builder import Created, create_model
 from legcal.option_fields import flag
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
@@ -35,6 +36,50 @@ _BESIDE = {  # options that may be given beside a table, and their entries in it
     "leg_radius": "radius",
     "height": "home",
 }
+
+
+def new(
+    table: str | Path | None = None,
+    output: str | Path = ".",
+    *,
+    force: bool = False,
+    **dimensions: str | float,
+) -> Created:
+    """Write a model, YAML and URDF, from a table of joints or a few dimensions.
+
+    Parameters
+    ----------
+    table : path, optional
+        A table of legs, as for ``legcal new``; None with a family.
+    output : path
+        The folder of ``models/`` and ``urdf/``.
+    force : bool
+        Replace existing files.
+    **dimensions
+        The options of ``legcal new``: ``family``, ``unit``, ``name``, ``type``, ``height``, ...
+        Lengths are in ``unit``, "mm" or "m".
+
+    Returns
+    -------
+    Created
+        The machine as loaded again, the paths, and notes on what was assumed.
+
+    Raises
+    ------
+    UsageError, ModelError
+        With one sentence for each problem of the table or the dimensions.
+    OutOfResources
+        If the folder cannot be written.
+    """
+    known = [field.name for field in fields(Dimensions)]
+    if unknown := [name for name in dimensions if name not in known]:
+        raise UsageError(
+            f"The model could not be written: found the dimension '{unknown[0]}', needed some of "
+            f"{', '.join(known)}; correct its name."
+        )
+    given = Dimensions(**dimensions)  # type: ignore[arg-type]
+    path = None if table is None else Path(table)
+    return create_model(description_of(path, given), Path(output), force=force)
 
 
 def description_of(table: Path | None, given: Dimensions) -> Description:
