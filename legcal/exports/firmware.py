@@ -27,7 +27,7 @@ from legcal.machine.configurations import random_poses
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.machine.firmware_files import read_delta
 from legcal.machine.model import Machine, vectors_A_to_B
-from legcal.pages.svg import BLUE, DIM, GREY, Canvas, ticks
+from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
 
 DIGITS = 7  # decimals of a number [mm, deg]
@@ -369,8 +369,10 @@ def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) ->
     middle = 0.5 * (nozzle.min(axis=0) + nozzle.max(axis=0))
     scale = (side - 2.0 * edge) / max(float(np.ptp(nozzle[:, :2], axis=0).max()), 1e-6)
     most = max(float(np.linalg.norm(errors, axis=1).max()) for _, errors in panels)
-    longest = max(next(iter(ticks(0.0, max(most, 1e-6), 1)[::-1])), 1e-9)
-    magnified = 40.0 / longest
+    power = 10.0 ** np.floor(np.log10(max(most, 1e-6)))
+    lengths = power * np.array([1.0, 2.0, 5.0])
+    longest = float(lengths[lengths <= max(most, power)].max())
+    magnified = 30.0 / longest
     for k, (label, errors) in enumerate(panels):
         at = np.array([side * (k + 0.5), 0.5 * side])
         canvas.text(side * k + 12.0, 20.0, f"{label}: {describe_errors(errors)}")

@@ -230,13 +230,14 @@ def _list(code: str, of_field: str) -> tuple[Parameter, ...]:
     )
 
 
-_PROBE = (
-    "photographs do not see the bed: probe it once more (heights of the endstops alone, not radius "
-    "and rods)"
-)
+_BED = "photographs do not see the bed: "
 _KLIPPER_AFTER = (
     "replace the same lines of printer.cfg and those of its SAVE_CONFIG block, then RESTART and "
-    "G28; " + _PROBE
+    f"G28; {_BED}level it by a bed_mesh, because DELTA_CALIBRATE replaces radius and angles"
+)
+_DUET_AFTER = (
+    "replace the same values in config.g and delete those of config-override.g, then M999 and "
+    f"G28; {_BED}calibrate the endstops alone (G30 S3)"
 )
 
 FIRMWARES = (
@@ -284,8 +285,7 @@ FIRMWARES = (
         "tower_{}",
         "M665 L{M665 L0}:{M665 L1}:{M665 L2} R{M665 R} H{M665 H} X{M665 X} Y{M665 Y} Z{M665 Z}\n"
         "M666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "replace the same values in config.g and delete those of config-override.g, then M999 and "
-        "G28; " + _PROBE,
+        _DUET_AFTER,
     ),
     Firmware(
         "reprapfirmware",
@@ -304,8 +304,7 @@ FIRMWARES = (
         "M669 K10 R{M669 R} U{M669 U0}:{M669 U1}:{M669 U2} L{M669 L0}:{M669 L1}:{M669 L2} "
         "H{M669 H0}:{M669 H1}:{M669 H2} A{M669 A0}:{M669 A1} X{M669 X} Y{M669 Y} Z{M669 Z}\n"
         "M666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "replace the same values in config.g and delete those of config-override.g, then M999 and "
-        "G28; " + _PROBE,
+        _DUET_AFTER,
         turns=True,
         stops_at_angles=True,
     ),
@@ -328,8 +327,8 @@ FIRMWARES = (
         "tower_{}",
         "M665 L{M665 L} R{M665 R} H{M665 H} A{M665 A} B{M665 B} C{M665 C} X{M665 X} Y{M665 Y} "
         "Z{M665 Z}\nM666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "send these lines, then M500 and G28 (with DELTA_RADIUS_TRIM_TOWER in Configuration.h left "
-        "out or zero); " + _PROBE,
+        "send these lines, then M500 and G28 (DELTA_RADIUS_TRIM_TOWER in Configuration.h must be "
+        f"zero or left out); {_BED}set its height alone (G33 P1) and level it (G29)",
         least=frozenset({"M665 H"}),
     ),
 )
