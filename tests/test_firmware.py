@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.pipeline import calibrate
 from legcal.errors import LegcalError
@@ -17,6 +17,7 @@ from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.firmware_files import firmware_table, read_delta
+from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
 from legcal.simulation.dataset import simulate
@@ -122,6 +123,55 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+DOCUMENTED = {
+    # angles of towers, radius, rods and the centred nozzle at each endstop, from the documentation
+    "klipper": ([209.6, 330, 90.45], 168.2, [330.25, 330.75, 330.25], [301.35, 300.9, 300.6]),
+    "reprapfirmware": ([209.6, 330.25, 90.1], 131.15, [289.1, 288.7, 289.4], [305.55, 305, 305.05]),
+    "marlin": ([210.12, 329.69, 90.05], 124.3, [250.6, 250.1, 250.5], [253.1, 252.7, 253.45]),
+}
+ARMS = {
+    # and the arms, the heights of their shafts, the endstops as height or angle
+    "klipper-arms": (
+        [30, 150.8, 270], 35.4, [322, 321.25, 322], [168.5, 168.5, 169], [411.2] * 3,
+        [250, 250, 251.5],
+    ),
+    "reprapfirmware-arms": (
+        [210.3, 329.8, 90.15], 48.2, [221, 220.4, 220.7], [101.5, 101.2, 100.9],
+        [242, 242.5, 241.6], [62.2, 61.7, 62.1],
+    ),
+}  # fmt: skip
+NOZZLE = np.array([12.0, -34.0, 56.0])
+
+
+@pytest.mark.parametrize("name", [*DOCUMENTED, *ARMS])
+def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
+    name: str, tmp_path: Path
+) -> None:
+    machine = machine_of(CONFIGURATIONS[name], tmp_path)
+    pose = RigidTransform.from_translation(1e-3 * NOZZLE)
+    q = inverse_kinematics(machine, pose)[::2]
+    tops = np.array([actuator.travel[1] for actuator in machine.actuators])
+    angles, radius, rods, *others = (DOCUMENTED | ARMS)[name]
+    towers = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.radians(angles)]
+    for i, (out, rod) in enumerate(zip(towers, rods, strict=True)):
+        if name in DOCUMENTED:
+            stop = others[0][i]
+            away = float(np.linalg.norm((NOZZLE - radius * out)[:2]))
+            assert 1e3 * q[i] == pytest.approx(NOZZLE[2] + np.sqrt(rod**2 - away**2), abs=1e-6)
+            assert 1e3 * tops[i] == pytest.approx(stop + np.sqrt(rod**2 - radius**2), abs=1e-6)
+            continue
+        arm, height, stop = (numbers[i] for numbers in others)
+
+        def elbow(angle: float, out: Array = out, arm: float = arm, z: float = height) -> Array:
+            return (radius + arm * np.cos(angle)) * out + [0, 0, z + arm * np.sin(angle)]
+
+        assert np.linalg.norm(elbow(q[i]) - NOZZLE) == pytest.approx(rod, abs=1e-6)
+        if name == "reprapfirmware-arms":
+            assert np.degrees(tops[i]) == pytest.approx(stop, abs=1e-6)
+        else:
+            assert np.linalg.norm(elbow(tops[i]) - [0, 0, stop]) == pytest.approx(rod, abs=1e-6)
 
 
 def printer_with_errors(folder: Path) -> Machine:

@@ -102,13 +102,11 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
             f"With the numbers of the nominal model it is off by {describe_errors(before)}."
         )
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
-    if mount.is_turned or moved > 1e-3 or turned > 1e-3:
-        sentences.append(
-            f"Its frame is {moved:.3g} mm and {turned:.3g} deg from "
-            + ("the base link turned so that its towers stand as in the firmware"
-               if mount.is_turned else "the base link")
-            + "."
-        )  # fmt: skip
+    ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
+    ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
+    ways += [f"with z = 0 {mount.lift:g} mm below, where the bed may be"] * bool(mount.lift)
+    if ways:
+        sentences.append(f"Its frame is the base link, {', '.join(ways)}.")
     letters = "ABC" if firmware.name == "klipper" else "XYZ"
     sentences.append(
         "Towers: "
@@ -151,6 +149,7 @@ class _Mounted:
     tops: Array  # (3,) readings at the endstops [m or rad]
     signs: Array  # (3,) 1 where readings grow upwards
     start: IdealDelta
+    lift: float = 0.0  # of the origin of the base link over z = 0 [mm]
 
     @property
     def _columns(self) -> list[int]:
@@ -177,7 +176,20 @@ class _Mounted:
 
     def nozzle(self, poses: Array) -> Array:
         """Return the origin of the platform link (k, 3) at poses [mm]."""
-        return np.asarray(_MM * poses[:, :, 3] @ self.frame)
+        return np.asarray(_MM * poses[:, :, 3] @ self.frame + [0.0, 0.0, self.lift])
+
+    def over_bed(self) -> _Mounted:
+        """Return it with z = 0 under the whole workspace, where its motors are not above z = 0."""
+        start = self.start
+        if (start.height if start.turns else start.stop).min() > 0.0:
+            return self
+        lift = float(np.ceil(-start.positions(np.full((1, TOWERS), self.lowest))[0, 2]))
+        raised = replace(
+            start,
+            height=start.height + lift * start.turns,
+            stop=start.stop + lift * (not start.stops_at_angles),
+        )
+        return replace(self, start=raised, lift=lift)
 
 
 def _joint(actuator: Actuator | None) -> str | None:
@@ -226,7 +238,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     start = IdealDelta(
         firmware.turns,
         radius=np.array([np.linalg.norm(row.across) for row in rows]),
-        angle=nominal + off if "angle" in firmware.nominal else angles % 360.0,
+        angle=nominal + off if "angle" in firmware.nominal else np.round(angles, 9) % 360.0,
         rod=np.array([row.rod for row in rows]),
         arm=np.array([row.arm for row in rows]),
         height=np.array([row.height for row in rows]),
@@ -240,7 +252,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
             start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_at_angles=False
         )
     start = firmware.ideal(firmware.values(start))
-    return _Mounted(
+    mounted = _Mounted(
         machine,
         frame,
         is_turned,
@@ -249,6 +261,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         np.array([row.sign for row in rows]),
         start,
     )
+    return mounted.over_bed()
 
 
 @dataclass(frozen=True, eq=False)
