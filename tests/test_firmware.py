@@ -87,6 +87,28 @@ MARLIN_HEADER = """
   #define DELTA_DIAGONAL_ROD_TRIM_TOWER { 0.2, -0.3, 0.1 }
 #endif
 """
+LINUXCNC = """
+setp lineardeltakins.R 130.25
+setp lineardeltakins.L 269.5
+[JOINT_0]
+HOME_OFFSET = 412.5
+[JOINT_1]
+HOME_OFFSET = 413.0
+[JOINT_2]
+HOME_OFFSET = 411.75
+"""
+LINUXCNC_ARMS = """
+setp rotarydeltakins.platformradius 40.5
+setp rotarydeltakins.footradius 0
+setp rotarydeltakins.thighlength 160
+setp rotarydeltakins.shinlength 320.5
+[JOINT_0]
+HOME_OFFSET = -30
+[JOINT_1]
+HOME_OFFSET = -31
+[JOINT_2]
+HOME_OFFSET = -29.5
+"""
 CONFIGURATIONS = {
     "klipper": KLIPPER,
     "klipper-arms": KLIPPER_ARMS,
@@ -94,6 +116,8 @@ CONFIGURATIONS = {
     "reprapfirmware-arms": DUET_ARMS,
     "marlin": MARLIN,
     "marlin-header": MARLIN_HEADER,
+    "linuxcnc": LINUXCNC,
+    "linuxcnc-arms": LINUXCNC_ARMS,
 }
 
 
@@ -130,6 +154,12 @@ DOCUMENTED = {
     "klipper": ([209.6, 330, 90.45], 168.2, [330.25, 330.75, 330.25], [301.35, 300.9, 300.6]),
     "reprapfirmware": ([209.6, 330.25, 90.1], 131.15, [289.1, 288.7, 289.4], [305.55, 305, 305.05]),
     "marlin": ([210.12, 329.69, 90.05], 124.3, [250.6, 250.1, 250.5], [253.1, 252.7, 253.45]),
+    "linuxcnc": (
+        [90, 210, 330],
+        130.25,
+        [269.5] * 3,
+        (np.array([412.5, 413, 411.75]) - np.sqrt(269.5**2 - 130.25**2)).tolist(),
+    ),
 }
 ARMS = {
     # and the arms, the heights of their shafts, the endstops as height or angle
@@ -141,8 +171,8 @@ ARMS = {
         [210.3, 329.8, 90.15], 48.2, [221, 220.4, 220.7], [101.5, 101.2, 100.9],
         [242, 242.5, 241.6], [62.2, 61.7, 62.1],
     ),
+    "linuxcnc-arms": ([270, 30, 150], 40.5, [320.5] * 3, [160] * 3, [0] * 3, [30, 31, 29.5]),
 }  # fmt: skip
-NOZZLE = np.array([12.0, -34.0, 56.0])
 
 
 @pytest.mark.parametrize("name", [*DOCUMENTED, *ARMS])
@@ -150,16 +180,19 @@ def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
     name: str, tmp_path: Path
 ) -> None:
     machine = machine_of(CONFIGURATIONS[name], tmp_path)
-    pose = RigidTransform.from_translation(1e-3 * NOZZLE)
+    nozzle = np.array([12.0, -34.0, -300.0 if name == "linuxcnc-arms" else 56.0])
+    pose = RigidTransform.from_translation(1e-3 * nozzle)
     q = inverse_kinematics(machine, pose)[::2]
     tops = np.array([actuator.travel[1] for actuator in machine.actuators])
+    if name == "linuxcnc-arms":  # counts downwards
+        q, tops = -q, -np.array([actuator.travel[0] for actuator in machine.actuators])
     angles, radius, rods, *others = (DOCUMENTED | ARMS)[name]
     towers = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.radians(angles)]
     for i, (out, rod) in enumerate(zip(towers, rods, strict=True)):
         if name in DOCUMENTED:
             stop = others[0][i]
-            away = float(np.linalg.norm((NOZZLE - radius * out)[:2]))
-            assert 1e3 * q[i] == pytest.approx(NOZZLE[2] + np.sqrt(rod**2 - away**2), abs=1e-6)
+            away = float(np.linalg.norm((nozzle - radius * out)[:2]))
+            assert 1e3 * q[i] == pytest.approx(nozzle[2] + np.sqrt(rod**2 - away**2), abs=1e-6)
             assert 1e3 * tops[i] == pytest.approx(stop + np.sqrt(rod**2 - radius**2), abs=1e-6)
             continue
         arm, height, stop = (numbers[i] for numbers in others)
@@ -167,8 +200,8 @@ def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
         def elbow(angle: float, out: Array = out, arm: float = arm, z: float = height) -> Array:
             return (radius + arm * np.cos(angle)) * out + [0, 0, z + arm * np.sin(angle)]
 
-        assert np.linalg.norm(elbow(q[i]) - NOZZLE) == pytest.approx(rod, abs=1e-6)
-        if name == "reprapfirmware-arms":
+        assert np.linalg.norm(elbow(q[i]) - nozzle) == pytest.approx(rod, abs=1e-6)
+        if name != "klipper-arms":
             assert np.degrees(tops[i]) == pytest.approx(stop, abs=1e-6)
         else:
             assert np.linalg.norm(elbow(tops[i]) - [0, 0, stop]) == pytest.approx(rod, abs=1e-6)

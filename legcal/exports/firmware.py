@@ -82,11 +82,12 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     readings, poses = _poses_to_print(mount)
     seen = _Seen(mount.steps(readings), mount.nozzle(poses))
     fit = _nearest(firmware, mount.start, seen)
-    names = [actuator.joint for actuator in mount.actuators]
     texts = {key: number_text(value) for key, value in firmware.values(fit).items()}
     texts["M669 A0"] = number_text(mount.lowest)
     lines = re.sub(r"\{(.+?)\}", lambda key: texts[key[1]], firmware.lines)
-    ideal = read_delta(path, f"; {firmware.title}\n{lines}" if "M66" in lines else lines)
+    mark = ";" if "M66" in lines else "#"
+    head = f"{mark} {firmware.title} of {comment(subject.name)}, written by legcal {__version__}.\n"
+    ideal = read_delta(path, f"{head}{lines}")
     after, frame = _placed(ideal, seen)
     before = None
     if subject.nominal is not None:
@@ -107,21 +108,16 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     ways += [f"with z = 0 {mount.lift:g} mm below, where the bed may be"] * bool(mount.lift)
     if ways:
         sentences.append(f"Its frame is the base link, {', '.join(ways)}.")
-    letters = "ABC" if firmware.name == "klipper" else "XYZ"
-    sentences.append(
-        "Towers: "
-        + ", ".join(f"{a} is '{comment(b)}'" for a, b in zip(letters, names, strict=True))
-        + "; the endstops are where their travel ends at the top."
-    )
+    motors = zip(firmware.motors, mount.actuators, strict=True)
+    named = ", ".join(f"{motor} is '{comment(actuator.joint)}'" for motor, actuator in motors)
+    sentences.append(f"Motors: {named}; the endstops are where their travel ends at the top.")
     if gains := other_gains(machine):
         sentences.append(
             f"Motors move by their steps times {gains}: divide the steps per mm (rotation_distance "
             "multiplied) by it first, these numbers assume it done."
         )
     sentences.append(f"To use it, {firmware.after}.")
-    mark = "#" if firmware.name == "klipper" else ";"
-    head = [f"{firmware.title} of {comment(subject.name)}, written by legcal {__version__}."]
-    text = "".join(f"{mark} {line}\n" for line in [*head, *sentences]) + f"\n{lines}"
+    text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
     picture = picture_of(firmware.title, seen.nozzle, after, before)
     return Rendered(
         (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
@@ -187,7 +183,7 @@ class _Mounted:
         raised = replace(
             start,
             height=start.height + lift * start.turns,
-            stop=start.stop + lift * (not start.stops_at_angles),
+            stop=start.stop + lift * (not start.stops_are_motors),
         )
         return replace(self, start=raised, lift=lift)
 
@@ -243,13 +239,13 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         arm=np.array([row.arm for row in rows]),
         height=np.array([row.height for row in rows]),
         stop=np.array([row.stop for row in rows]),
-        stops_at_angles=True,
+        stops_are_motors=True,
     )
-    if not firmware.stops_at_angles:  # the nozzle centred, under each tower's own endstop
+    if not firmware.stops_are_motors:  # the nozzle centred, under each tower's own endstop
         C = start.joints(start.stop[None])[0]
         across = np.linalg.norm(C[:, :2], axis=1)
         start = replace(
-            start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_at_angles=False
+            start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_are_motors=False
         )
     start = firmware.ideal(firmware.values(start))
     mounted = _Mounted(
@@ -261,7 +257,8 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         np.array([row.sign for row in rows]),
         start,
     )
-    return mounted.over_bed()
+    has_height = any(p.field == "height" for p in firmware.parameters)
+    return mounted.over_bed() if has_height or not firmware.turns else mounted
 
 
 @dataclass(frozen=True, eq=False)
