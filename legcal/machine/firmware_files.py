@@ -39,6 +39,7 @@ PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers,
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
+_BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 _IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
 
 
@@ -192,7 +193,7 @@ def _g_code(path: Path, text: str) -> Configuration | None:
     """Return the numbers of M665, M666 and M669 of Marlin or RepRapFirmware."""
     values, unit = dict[str, float](), None
     for line in text.splitlines():
-        words = re.split(r"[;(]", re.sub(r"^\s*(?:N\d+|echo:)\s*", "", line))[0].upper().split()
+        words = re.split(r"[;(]", _BEFORE_CODE.sub("", line))[0].upper().split()
         if words and words[0] in ("G20", "G21"):
             unit = {"G20": "in", "G21": "mm"}[words[0]]
         if not words or words[0] not in ("M665", "M666", "M669"):
