@@ -133,18 +133,24 @@ def doubts_of(
         *_moved_parameters(dataset, solution, platform),
         *_scale(dataset, solution, platform),
         *_held_out(held_out),
-        *(changes or _symptoms(solution, platform, session)),
+        *_symptoms(solution, platform, session, {change.code for change in changes}),
+        *changes,
     )
 
 
 def _symptoms(
-    solution: Solution, platform: PlatformAccuracy | None, session: SessionTests
+    solution: Solution, platform: PlatformAccuracy | None, session: SessionTests, named: set[str]
 ) -> list[Doubt]:
-    """Return the doubts that a change in the course of a session would cause as well."""
+    """Return the doubts that a change in the course of a session would cause as well.
+
+    A model that was led away scatters readings too, so that these explain nothing but noise.
+    """
+    if named - {"reading_noise"}:
+        return []
     return [
         *_cameras(solution, platform),
         *_left_out(solution, platform),
-        *_noise(solution, session),
+        *(() if named else _noise(solution, session)),
     ]
 
 
@@ -353,16 +359,18 @@ def _changes(
 ) -> list[Doubt]:
     """Return what changed in the course of the session, and readings that do not follow motors.
 
-    It counts where it displaces the platform by more than that is known to.
+    It counts where it displaces the platform by more than that is known to; scatter of readings
+    also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
     """
     doubts = []
+    scatters = "reading_noise" if _noise(solution, session) else ""
     for finding in session.findings:
         effect = None if platform is None else _effect_of(finding, dataset, solution)
         if platform is None or effect is None:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
-        elif effect[0] > platform.sigma.mean_displacement:
+        elif effect[0] > platform.sigma.mean_displacement or finding.kind == scatters:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
-    return doubts
+    return [doubt for doubt in doubts if doubt.code != "reading_noise"] or doubts
 
 
 def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[float, float]:
