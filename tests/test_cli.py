@@ -26,7 +26,7 @@ from legcal.simulation.settings import ParameterErrors
         ),
         pytest.param(
             ["export", "hexapod", "--to", "correction", "-o", "missing.csv", "--json"],
-            {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2", "plotly", "matplotlib"},
+            {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2", "matplotlib"},
             "needed a result",
             marks=pytest.mark.system,
         ),
@@ -34,7 +34,7 @@ from legcal.simulation.settings import ParameterErrors
             ["calibrate", "missing", "-o", "out", "--json"],
             {
                 *("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.sparse.csgraph"),
-                *("trimesh", "plotly"),
+                "trimesh",
             },
             "missing",
         ),

@@ -163,6 +163,7 @@ PUBLIC: dict[str, set[str]] = {
         "location.locate",
         "location.urdf",
         "pipeline",
+        "quantities",
         "result",
         "result_folder",
         "summary",

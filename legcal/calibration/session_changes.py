@@ -62,6 +62,9 @@ Kind = Literal[
     "eccentricity",
     "reading_noise",
 ]
+OF_MOTORS: frozenset[Kind] = frozenset(
+    ("encoder", "drift", "lag", "backlash", "gain", "pitch", "eccentricity", "reading_noise")
+)
 
 
 @dataclass(frozen=True, eq=False)

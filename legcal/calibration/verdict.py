@@ -15,6 +15,7 @@ from legcal.calibration.doubts import (
     doubts_of,
     model_error,
     no_improvement,
+    nominal_lengths,
     worst_first,
 )
 from legcal.calibration.four_steps import Steps
@@ -29,6 +30,7 @@ from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_choice import sequences_of
+from legcal.data.measurements import few
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import IntArray
 
@@ -101,6 +103,7 @@ def judge(
             *notes,
             *Note.about(Topic.IMAGES, click_notes(dataset, solution)),
             *Note.about(Topic.READINGS, commanded(dataset)),
+            *Note.about(Topic.MODEL, _asked_lengths(dataset, solution, doubts)),
             *Note.about(Topic.READINGS, _untested(dataset, sequences, session, platform)),
             *closeness(dataset.folder, measurements.n_rows, platform),
         ),
@@ -108,6 +111,17 @@ def judge(
         corners,
         tuple(diagnosis),
     )
+
+
+def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]) -> list[str]:
+    """Return a note on stated lengths that are the nominal ones, where no doubt asks for them."""
+    stated = nominal_lengths(dataset, solution)
+    if not stated or any(doubt.code == "nominal_length" for doubt in doubts):
+        return []
+    return [
+        f"The stated {few(stated)} is the nominal length to all digits: measure it and state that, "
+        "or leave it out."
+    ]
 
 
 def _untested(

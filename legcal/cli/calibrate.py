@@ -70,8 +70,8 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="JOINT:JOINT=VALUE+-SIGMA",
-            help="A measured distance of two joints: leg1.base:leg3.base=400+-0.05mm, or of both "
-            "ends of a rod. Rotary motors do not determine the scale; one distance does.",
+            help="A measured distance of two joints: leg1.base:leg3.base=MEASURED+-0.05mm, or of "
+            "both ends of a rod. Rotary motors do not determine the scale; one distance does.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -264,8 +264,8 @@ def _lengths(stated: Sequence[str]) -> list[str]:
         if ":" not in text.partition("=")[0]:
             raise UsageError(
                 f"The length {describe(text)} could not be used: found no two joints, needed two "
-                "with a colon between them; write leg1.base:leg3.base=400+-0.05mm, or both ends "
-                "of a rod, leg1.base:leg1.platform."
+                "with a colon between them; write leg1.base:leg3.base=MEASURED+-0.05mm, or both "
+                "ends of a rod, leg1.base:leg1.platform."
             )
     return list(stated)
 

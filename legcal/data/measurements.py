@@ -62,6 +62,7 @@ class View:
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
     hand_held: bool = False  # one image of a hand-held camera, which only the board can place
     by_landmarks: bool = False  # whether the rough pose comes from clicks on joints
+    is_placed: bool = False  # whether enough clicks agree that it is the camera, and not a start
 
     def uses(self, leg: str) -> bool:
         """Return whether a leg, by its name, is used in this view."""

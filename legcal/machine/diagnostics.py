@@ -139,7 +139,10 @@ def _unseen_notes(machine: Machine) -> list[str]:
     else:
         who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
         add = "add one to each"
-    return [f"{who} cannot be seen in images; {add} with its radius."]
+    return [
+        f"{who} cannot be seen in images; {add} with its radius, or write a model that has them "
+        "with: legcal inspect FILE --leg-radius MM --write DIR."
+    ]
 
 
 def _motor_notes(machine: Machine) -> list[str]:

@@ -354,9 +354,12 @@ def occluders_of(
             radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
             low, high = corners[:, 2].min(), corners[:, 2].max()
             occluder = replace(occluder, corners=prism(radius, (float(low), float(high))))
-        try:
-            occluder.planes  # noqa: B018
-        except QhullError:  # flat
+        if solid.triangles is None:
+            try:
+                occluder.planes  # noqa: B018
+            except QhullError:  # flat
+                continue
+        elif np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)[-1] <= EMPTY:
             continue
         occluders.append(occluder)
     return tuple(occluders)
