@@ -128,7 +128,11 @@ def test_a_stated_length_tells_a_pitch_that_all_motors_share(healthy: Dataset, p
     length = 1e3 * float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))
     stretched = _with_readings(lambda q: q * (1.0 + part))(healthy)
     result = calibrate(stretched, priors=[f"leg1.base:leg3.base={length:.3f}±0.05mm"])
-    assert [doubt.code for doubt in result.doubts] == ["pitch"] * (part > 0.0)
+    m = stretched.measurements
+    session = session_tests(result.solution.posterior, m, image_sequences(m, {}))
+    assert [one.kind for one in session.findings] == ["pitch"] * (part > 0.0)
+    assert all(abs(one.amount - part) < 4.0 * one.sigma < 0.6 * part for one in session.findings)
+    assert [doubt.code for doubt in result.doubts] == ["scale"] * (part > 0.0)
 
 
 def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
