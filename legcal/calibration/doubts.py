@@ -36,7 +36,7 @@ from legcal.calibration.joint_fit.scale import (
 )
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.session_changes import ALL_MOTORS, OF_MOTORS, Finding, SessionTests
+from legcal.calibration.session_changes import OF_MOTORS, Finding, SessionTests
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import few, few_views
@@ -140,7 +140,7 @@ def doubts_of(
     changes = _Changes.of(dataset, solution)
     course = _changes(dataset, solution, platform, session)
     # A scale that all motors share is one witness of the scale against the others
-    is_of_scale = any(one.subject == ALL_MOTORS for one in session.findings)
+    is_of_scale = any(one.kind == "pitch" for one in session.findings)
     scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
     causes = scale or course
     motors = {one.subject for one in session.findings} if course else set[str]()
@@ -154,7 +154,7 @@ def doubts_of(
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
         *_nominal_lengths(dataset, solution, platform, changes),
-        *(causes or _symptoms(dataset, solution, platform, changes, held_out)),
+        *(causes or _symptoms(dataset, solution, platform, changes, held_out, session)),
     )
 
 
@@ -164,6 +164,7 @@ def _symptoms(
     platform: PlatformAccuracy | None,
     changes: _Changes,
     held_out: HeldOut | None,
+    session: SessionTests,
 ) -> list[Doubt]:
     """Return the doubts that a change in the course of a session, or two scales, cause as well."""
     return [
@@ -171,7 +172,7 @@ def _symptoms(
         *_held_out(held_out),
         *_cameras(solution, platform),
         *_left_out(solution, platform),
-        *_noise(solution),
+        *_noise(solution, session),
     ]
 
 
@@ -400,8 +401,8 @@ def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[
     """
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     names = solution.posterior.problem.legs.parametrization.names
-    step_of = dict(zip(names, finding.steps.tolist(), strict=True))
-    steps = np.array([[step_of[name]] for name in parametrization.names])
+    step_of = dict(zip(names, finding.steps, strict=True))
+    steps = np.array([step_of[name] for name in parametrization.names])
     legs, poses = solution.legs, solution.T_Rb_Re
     error = _moved_platform(dataset, solution, steps)
     before = error.mean_displacement, error.mean_rotation
@@ -507,14 +508,15 @@ def _moved_parameters(
     return [Doubt("tolerance", what, remedy, *_mean(error))]
 
 
-def _noise(solution: Solution) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or those of a view or a leg."""
+def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or of a view, leg or period."""
     problem = solution.posterior.problem
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
     if times["all views"] <= MOST_SCATTER:
         times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
         times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
+        times |= {name: scatter.ratio(of) for name, of in session.periods.items()}
     worst = max(times, key=times.__getitem__)
     if times[worst] <= MOST_SCATTER:
         return []

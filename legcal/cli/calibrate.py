@@ -84,6 +84,25 @@ def calibrate(
             rich_help_panel=_TESTS,
         ),
     ] = None,
+    leave_out: Annotated[
+        str,
+        typer.Option(
+            "--leave-out",
+            metavar="IMAGES",
+            help="Leave images out of the fit: p22, p22..p45 in the order in which they were "
+            "taken, c2 for a view, c2:p22 for one of its images; separated by commas.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = "",
+    split: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="MOTOR@IMAGES",
+            help="The encoder of MOTOR had another zero in these images (leg4@p01..p21), as before "
+            "a slip; the model has that of the others. May be repeated.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = None,
     check: Annotated[
         Path | None,
         typer.Option(
@@ -127,6 +146,8 @@ def calibrate(
             "--set": settings or None,
             "--length": length,
             "--holdout": holdout,
+            "--leave-out": leave_out or None,
+            "--split": split,
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
             "--overlays": overlays or None,
@@ -163,6 +184,8 @@ def calibrate(
         "criteria": criteria,
         "use_cache": not fresh,
         "holdout": holdout,
+        "leave_out": leave_out,
+        "split": split or (),
         "overlays": overlays,
     }
     arguments |= overrides_of_settings(settings or ())

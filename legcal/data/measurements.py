@@ -69,6 +69,15 @@ class View:
         return self.legs is None or leg in self.legs
 
 
+@dataclass(frozen=True, eq=False)
+class OwnZero:
+    """Images in which the encoder of a motor has a zero of its own."""
+
+    motor: str  # its label
+    rows: BoolArray  # (n_rows,)
+    images: str  # as they were named
+
+
 @brief
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -88,6 +97,7 @@ class Measurements:
     pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     time: Array | None = None  # (n_rows,) when images were taken [s], NaN where unknown
+    own_zeros: tuple[OwnZero, ...] = ()
 
     @property
     def n_rows(self) -> int:

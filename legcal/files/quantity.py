@@ -11,11 +11,18 @@ from numbers import Real
 from legcal.errors import UsageError
 from legcal.files.schema import describe
 
-LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0}
-ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
+LENGTH: Mapping[str, float] = {
+    "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048
+}  # fmt: skip
+ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0, "rev": math.tau}
 PIXELS: Mapping[str, float] = {"px": 1.0}
-# Units shown in place of metres and radians, and their factors
-SHOWN_IN: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
+# Units shown in place of those of files, and their factors
+SHOWN_IN: Mapping[str, tuple[float, str]] = {
+    "m": (1e3, "mm"),
+    "rad": (math.degrees(1.0), "deg"),
+    "px": (1.0, "px"),
+    "": (1.0, ""),
+}
 
 _NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
 _VALUE = re.compile(_NUMBER, re.ASCII)
@@ -26,6 +33,17 @@ _PLACEHOLDERS = {
 }
 _PLACEHOLDER = re.compile("|".join(_PLACEHOLDERS))
 _PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
+
+COUNTS = r"\s*(\d+(?:\.\d*)?)\s*(?:counts?|steps?|ticks?)\s*/\s*([a-z]+)\s*"  # 80 counts/mm
+
+
+def unit_size(name: str, units: Mapping[str, float]) -> float | None:
+    """Return the size of a unit, also of counts with a stated scale; None if it is not known."""
+    counts = re.fullmatch(COUNTS, name)
+    if counts is None:
+        return units.get(name)
+    size = units.get(counts[2])
+    return None if size is None or float(counts[1]) == 0.0 else size / float(counts[1])
 
 
 def split_quantity(text: str) -> tuple[float, str]:
