@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -106,7 +106,15 @@ class ParameterTable:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return (self[k] for k in range(len(self)))
 
-    def __getitem__(self, row: int) -> dict[str, Any]:
+    @overload
+    def __getitem__(self, row: int) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> ParameterTable: ...
+
+    def __getitem__(self, row: int | slice) -> dict[str, Any] | ParameterTable:
+        if isinstance(row, slice):
+            return replace(self, rows=self.rows[row], digits=self.digits[row])
         return dict(zip(self.columns, self.rows[row], strict=True))
 
     def cells(self) -> list[tuple[str, ...]]:
