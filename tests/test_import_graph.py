@@ -95,7 +95,7 @@ PUBLIC: dict[str, set[str]] = {
         "example",
         "holdout",
         "image_causes",
-        "image_order",
+        "image_choice",
         "image_tables",
         "landmarks",
         "measurements",
