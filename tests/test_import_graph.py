@@ -82,6 +82,7 @@ PUBLIC: dict[str, set[str]] = {
         "image_file",
         "photograph_comparison",
         "point_pose",
+        "sight",
         "visibility",
     },
     "data": {
@@ -144,7 +145,6 @@ PUBLIC: dict[str, set[str]] = {
         "examination",
         "examination_page",
         "identify.identifiability",
-        "identify.predicted_observations",
         "identify.report",
         "joint_fit.factors",
         "joint_fit.fit",
@@ -152,6 +152,8 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.scale",
         "joint_fit.parameter_choices",
         "joint_fit.platform",
+        "joint_fit.predicted",
+        "joint_fit.predicted_noise",
         "joint_fit.problem",
         "joint_fit.variables",
         "link_joints",
@@ -166,7 +168,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"information", "laid_board", "places", "planned_session", "request", "session"},
+    "planning": {"laid_board", "places", "planned_session", "request", "session"},
     "exports": {"formats", "subject"},
     "scene": {"motions", "shapes"},
     "report": {

@@ -36,13 +36,16 @@ from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, 
 from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
+from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.estimation.problem import Frames, linearize
+from legcal.estimation.square_root import marginal_rows
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -114,6 +117,8 @@ class Contributions:
         Camera poses relative to the board count as exact, so that all cameras share the six
         unknowns of the board.
         """
+        if not T_base_camera:
+            return self
         names, turn = list(self.names), np.eye(len(self.names))
         for view, T in T_base_camera.items():
             R = T.rotation.as_matrix().T
@@ -126,6 +131,41 @@ class Contributions:
         merge[np.arange(len(names)), [kept.index(name) for name in names]] = 1.0
         turn = turn @ merge
         return replace(self, names=tuple(kept), rows=self.rows @ turn, known=self.known @ turn)
+
+    def of_shared(self) -> Contributions:
+        """Eliminate the unknowns of single views."""
+        is_own = np.array([": " in name for name in self.names])
+        shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
+        rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
+        return self._stacked(
+            tuple(self.names[i] for i in shared), rows, self.known[~with_own][:, shared]
+        )
+
+    def with_more(self, others: Sequence[Contributions]) -> Contributions:
+        """Add images of other cameras at the same machine; all without unknowns of single views."""
+        names = {name: i for i, name in enumerate(self.names)}
+        rows, known = [self.all_gains()], [self.known]
+        for other in others:
+            n_before = len(names)
+            columns = np.array([names.setdefault(name, len(names)) for name in other.names])
+            is_new = other.known[:, columns >= n_before].any(axis=1)
+            for table, more in ((rows, other.all_gains()), (known, other.known[is_new])):
+                wide = np.zeros((len(more), len(names)))
+                wide[:, columns] = more
+                table.append(wide)
+        stacked = (
+            np.concatenate([np.pad(x, ((0, 0), (0, len(names) - x.shape[1]))) for x in table])
+            for table in (rows, known)
+        )
+        return self._stacked(tuple(names), *stacked)
+
+    def _stacked(self, names: tuple[str, ...], rows: Array, known: Array) -> Contributions:
+        """Return rows (m, n) as those of one image."""
+        nothing = np.zeros((1, len(rows)))
+        site = np.zeros(1, dtype=np.intp)
+        return Contributions(
+            names, rows[None], known, self.basis, nothing, site, np.zeros((1, len(rows), 0))
+        )
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""
@@ -194,11 +234,14 @@ class Predictor:
 
 
 def readings_at(legs: Sequence[Leg], R: Array, t: Array) -> Array:
-    """Return readings (n, n_legs) at poses; zero for legs without a joint at A that moves."""
+    """Return the readings (n, n_legs) of motors at poses [m or rad], and zero for other legs."""
     q = np.zeros((len(t), len(legs)))
     for j, leg in enumerate(legs):
-        if leg.actuator is not None:  # it has joints at A where readings say
-            q[:, j] = reading_of_rod(leg, R @ leg.B + t)
+        end = R @ leg.B + t
+        if leg.actuator is not None:
+            q[:, j] = reading_of_rod(leg, end)
+        elif leg.kind is LegKind.ACTUATED:
+            q[:, j] = leg.sign * (np.linalg.norm(end - leg.A, axis=1) - leg.q0)
     return q
 
 
@@ -215,8 +258,8 @@ def information_of_images(
     known_length: float | None = None,  # mean leg length of weak priors; without it there are none
 ) -> Contributions:
     """Return the information of the joint fit, linearised at a start."""
-    with_arms = _with_arms(legs, choices)
-    problem = build_fit(legs, measurements, outlines, board=board, choices=with_arms)
+    usual = _as_calibrated(legs, choices)
+    problem = build_fit(legs, measurements, outlines, board=board, choices=usual)
     biases = possible_biases(problem.outlines, legs.names)
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
     state = problem.begin(start)
@@ -224,16 +267,16 @@ def information_of_images(
     return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
 
 
-def _with_arms(legs: FittedLegs, choices: Choices) -> Choices:
-    """Add lines of arms as unknowns, also where no image shows one."""
+def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
+    """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
     seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]
     sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen)
-    arms = {
-        name: Prior(0.0, sigma)
-        for name, sigma in sigmas.items()
-        if name not in choices.fixed and name not in choices.free
-    }
-    return replace(choices, priors=arms | dict(choices.priors))
+    twist = float(np.radians(TWIST_SIGMA_DEG))
+    names = legs.parametrization.names
+    sigmas |= {name: twist for name in names if ParameterId.parse(name).kind == "twist"}
+    chosen = {*choices.fixed, *choices.free}
+    usual = {name: Prior(0.0, sigma) for name, sigma in sigmas.items() if name not in chosen}
+    return replace(choices, priors=usual | dict(choices.priors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,6 +438,7 @@ def _are_lengths(problem: FitProblem) -> BoolArray:
 def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
     """Return a name for each kept unknown; those of one view begin with ``VIEW:``."""
     names = [""] * problem.n_kept
+    are_alike = len(set(problem.outlines.cameras)) == 1  # all views share one camera
     for block in problem.variables:
         where = problem.where(block.name)
         labels = block.labels or tuple(str(i) for i in range(block.n_unknowns))
@@ -403,7 +447,7 @@ def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
             head = max(owners, key=len, default="")
             rest = label.removeprefix(f"{head}.")
             if block.name == "cameras" or (block.name == "biases" and rest == "gamma"):
-                names[i] = f"camera {rest}"  # all views share one
+                names[i] = f"camera {rest if are_alike else label}"
             elif block.name == "biases" and head:
                 names[i] = f"{head}: {rest}"
             else:
