@@ -21,7 +21,7 @@ from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
 from legcal.machine.occluders import Occluder, PlacedOccluders
 from legcal.machine.rods import arms_at, ends_in_base, readings_of_rods
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.visibility import (
     in_picture,
     least_length,
@@ -170,9 +170,7 @@ def visible_parts(
     u_seen, M = u_part[image, part], A[image, body[part]]
     h = outlines_of_axis(u_seen, M, radius[part])
     axis = M[:, None] + np.stack([first_end, last_end], axis=1)[..., None] * u_seen[:, None]
-    # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
-    touching = EPSILON[:, None, None] * radius[part][:, None, None, None] * h[:, :, None]
-    ends = camera.project(axis[:, None] - touching)
+    ends = camera.project(axis[:, None] + steps_to_outlines(h, radius[part])[:, :, None])
     length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
     width_px = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean(axis=1)
     is_long = (length_px >= least_length(width_px)) | (stated is not None)
