@@ -85,6 +85,7 @@ PUBLIC: dict[str, set[str]] = {
         "image_file",
         "photograph_comparison",
         "point_pose",
+        "sight",
         "visibility",
     },
     "data": {
@@ -147,7 +148,6 @@ PUBLIC: dict[str, set[str]] = {
         "examination",
         "examination_page",
         "identify.identifiability",
-        "identify.predicted_observations",
         "identify.report",
         "joint_fit.factors",
         "joint_fit.fit",
@@ -155,6 +155,8 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.scale",
         "joint_fit.parameter_choices",
         "joint_fit.platform",
+        "joint_fit.predicted",
+        "joint_fit.predicted_noise",
         "joint_fit.problem",
         "joint_fit.variables",
         "link_joints",
@@ -170,7 +172,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"information", "laid_board", "places", "planned_session", "request", "session"},
+    "planning": {"laid_board", "places", "planned_session", "request", "session"},
     "exports": {"formats", "subject"},
     "scene": {"motions", "shapes"},
     "report": {
