@@ -4,11 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cad_exports import LENGTH, RADIUS, SHAFT, write_mjcf, write_urdf
+from ankles import ROD, write_ankle
+from cad_exports import LENGTH, RADIUS, SHAFT, write_head_mjcf, write_head_urdf
 
 from legcal import load_mechanism
+from legcal.machine.home import home_of_legs
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.model_writer import write_model
+from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
+from legcal.machine.parameters import (
+    geometries,
+    moved_legs,
+    parametrization_of,
+    reframed,
+    vector_of,
+)
 from legcal.machine.topology import level_rotation
 
 
@@ -25,7 +34,7 @@ def _check(machine: Machine, radius: float = RADIUS, length: float = LENGTH) -> 
     assert (level.inv() * machine.home.rotation).magnitude() < np.radians(0.1)
 
 
-@pytest.mark.parametrize("write", [write_urdf, write_mjcf])
+@pytest.mark.parametrize("write", [write_head_urdf, write_head_mjcf])
 def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -> None:
     machine = load_mechanism(write(tmp_path / "from"))  # type: ignore[operator]
     _check(machine)
@@ -43,3 +52,33 @@ def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -
     written = load_mechanism(write_model(machine, tmp_path / "to")[0])
     _check(written)
     assert written.leg_names == machine.leg_names
+
+
+def test_an_ankle_of_two_cranks_and_a_universal_joint_loads_and_is_written(tmp_path: Path) -> None:
+    machine = load_mechanism(write_ankle(tmp_path / "from"))
+    assert [leg.type for leg in machine.legs] == ["RSS", "RSS", "U"]
+    assert machine.mobility == len(machine.motors) == machine.motor_rank == 2
+    np.testing.assert_allclose([leg.q0 for leg in machine.legs[:2]], ROD, atol=1e-12)
+    np.testing.assert_allclose(machine.legs[2].A, 0.0, atol=1e-12)
+    # Other numbers of all legs, with those of the universal joint, are in the files.
+    parametrization = parametrization_of(machine, twists=True)
+    steps = 1e-3 * np.random.default_rng(2).uniform(-1.0, 1.0, len(parametrization))
+    wanted = moved_legs(geometries(machine), parametrization.place, steps)
+    wanted = reframed(wanted, machine.frame_legs)
+    write_urdf(machine, wanted, tmp_path / "calibrated.urdf")
+    home = home_of_legs(machine, wanted, 0.05)
+    write_calibrated_yaml(
+        machine, tmp_path / "calibrated.yaml", "calibrated.urdf", home=home, legs=wanted
+    )
+    written = load_mechanism(tmp_path / "calibrated.yaml")
+    values = [
+        vector_of(parametrization, legs, geometries(machine))
+        for legs in (geometries(written), wanted)
+    ]
+    names = [
+        name
+        for name in parametrization.names
+        if "gain" not in name and not name.startswith("pitch.platform_axis")
+    ]
+    of_names = [parametrization.names.index(name) for name in names]
+    np.testing.assert_allclose(values[0][of_names], values[1][of_names], rtol=0, atol=1e-9)

@@ -51,6 +51,7 @@ from legcal.machine.leg import (
     EquationKind,
     JointType,
     LegChain,
+    redirected,
 )
 from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
@@ -245,6 +246,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     names = list(block.legs)
     base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
+    frame_legs = tuple(names.index(name) for name in base_frame)
+    legs = redirected(legs, frame_legs) if normals is None else legs
     legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
     solids = visual_solids(urdf)
     occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
@@ -256,7 +259,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         platform=block.platform,
         platform_joint=block.platform_joint,
         legs=with_covers(legs, occluders),
-        frame_legs=tuple(names.index(name) for name in base_frame),
+        frame_legs=frame_legs,
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
         home_configuration=chain.neutral(),
