@@ -76,3 +76,10 @@ def mesh_file(urdf_path: Path, name: str) -> Path | None:
             if (folder / tail).is_file():
                 return folder / tail
     return None
+
+
+def ray_caster(vertices: Array, triangles: IntArray | None) -> Any:
+    """Return the ray caster of trimesh for triangles: Embree, or a far slower one without it."""
+    import trimesh  # 30 MB and half a second: imported only for meshes
+
+    return trimesh.Trimesh(vertices, triangles, process=False).ray

@@ -253,6 +253,7 @@ class Created:
     machine: Machine  # the model as loaded again
     yaml_path: Path
     urdf_path: Path
+    notes: tuple[str, ...] = ()  # on what was assumed
 
 
 def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
@@ -273,7 +274,7 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
             "--output, or --force to replace them."
         )
     try:
-        return _write(machine, described.source, output)
+        return replace(_write(machine, described.source, output), notes=tuple(described.notes))
     except OSError as error:
         raise OutOfResources(
             f"{output}: the model could not be written: found '{error.strerror}', needed a folder "

@@ -190,7 +190,7 @@ def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[s
     return Choices(priors={f"{rod.name}.length": Prior(rod.q0, sigma)}), (
         f"Angle readings do not determine the scale; the plan assumes that the rod of {rod.name} "
         f"is measured to {1e3 * sigma:.2g} mm (legcal calibrate --length "
-        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * sigma:.2g}mm, with the measured value).",
+        f"{ends}=MEASURED±{1e3 * sigma:.2g}mm).",
     )
 
 

@@ -20,7 +20,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
 from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
-from legcal.machine.meshes import mesh_file, read_mesh
+from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
 from legcal.machine.urdf import number_list, origins_of, parse_robot
@@ -475,10 +475,7 @@ def pose_machine(
 @lru_cache(maxsize=8)  # several cameras see one machine, and there may be thousands of machines
 def _caster(posed: PosedMachine) -> Any:
     """Return the ray caster of a machine."""
-    import trimesh  # 30 MB and half a second: only where there are solids
-    from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-    return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
+    return ray_caster(posed.vertices, posed.faces)
 
 
 @lru_cache(maxsize=256)  # links share shapes, and each camera sees all of them
