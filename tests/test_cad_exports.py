@@ -1,5 +1,6 @@
 """Machines as CAD exports draw them: whole robots of meshes, with loops between named frames."""
 
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import numpy as np
@@ -82,3 +83,25 @@ def test_an_ankle_of_two_cranks_and_a_universal_joint_loads_and_is_written(tmp_p
     ]
     of_names = [parametrization.names.index(name) for name in names]
     np.testing.assert_allclose(values[0][of_names], values[1][of_names], rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def reachy_mini() -> Path:
+    """The descriptions of the robot Reachy Mini, as its package has them."""
+    try:
+        found = files("reachy_mini") or []
+    except PackageNotFoundError:
+        pytest.skip("reachy_mini is not installed: pip install --no-deps reachy_mini")
+    (urdf,) = [Path(str(f.locate())) for f in found if f.match("urdf/robot.urdf")]
+    return urdf.parents[1]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("name", ["urdf/robot.urdf", "mjcf/reachy_mini.xml"])
+def test_a_robot_that_people_have_loads_unedited(reachy_mini: Path, name: str) -> None:
+    machine = load_mechanism(reachy_mini / name)
+    _check(machine, radius=0.0025, length=0.085)
+    said = " ".join(machine.diagnostics)
+    assert "'yaw_body'" in said
+    assert "close no loop and are held as drawn" in said
+    assert "joints of the platform are level over those of the base" in said
