@@ -1,15 +1,19 @@
 """Machines as CAD exports draw them: whole robots of meshes, with loops between named frames."""
 
+import re
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from ankles import ROD, write_ankle
 from cad_exports import LENGTH, RADIUS, SHAFT, write_head_mjcf, write_head_urdf
 
-from legcal import load_mechanism
+from legcal import load_mechanism, plan
+from legcal.errors import ModelError
 from legcal.machine.home import home_of_legs
+from legcal.machine.mesh_cylinders import cylinder_about_z
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
 from legcal.machine.parameters import (
@@ -83,6 +87,63 @@ def test_an_ankle_of_two_cranks_and_a_universal_joint_loads_and_is_written(tmp_p
     ]
     of_names = [parametrization.names.index(name) for name in names]
     np.testing.assert_allclose(values[0][of_names], values[1][of_names], rtol=0, atol=1e-9)
+
+
+def test_a_leg_without_a_round_part_gets_a_stated_radius(tmp_path: Path) -> None:
+    path = write_head_urdf(tmp_path / "from", mesh=False)
+    machine = load_mechanism(path)
+    assert not any(leg.cylinders for leg in machine.legs)
+    assert "--leg-radius" in " ".join(machine.diagnostics)
+    with pytest.raises(ModelError, match="no leg with a visible cylinder"):
+        plan(machine)
+    _check(load_mechanism(path, leg_radius=0.002), radius=0.002)
+    # A square bar is no rod, and a stated radius overrides that of a mesh.
+    assert cylinder_about_z(*_bar(4)) is None
+    found = cylinder_about_z(*_bar(32))
+    assert found is not None
+    np.testing.assert_allclose(found, (0.003, 0.0, 0.09), atol=1e-3)
+    _check(load_mechanism(write_head_urdf(tmp_path), leg_radius=0.002), radius=0.002)
+
+
+def _bar(sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and triangles of a prism of 3 mm radius along z."""
+    bar = trimesh.creation.cylinder(0.003, height=0.09, sections=sides)
+    return np.add(bar.vertices, [0.0, 0.0, 0.045]), np.asarray(bar.faces)
+
+
+REFUSED: dict[str, tuple[str, str, str]] = {
+    "half-a-loop": ("head.urdf", '<link name="closing_3_2"/>', "found the frame 'closing_3_1' and"),
+    "two-parents": (
+        "two.urdf",
+        '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
+        '<joint name="j" type="fixed"><parent link="a"/><child link="c"/></joint>'
+        '<joint name="k" type="fixed"><parent link="b"/><child link="c"/></joint></robot>',
+        "gives the link 'c' a second parent",
+    ),
+    "gazebo": ("model.sdf", '<?xml version="1.0"?>\n<sdf version="1.6"><model/></sdf>', "an SDF"),
+    "linuxcnc": ("m.hal", "# hexapod\nloadrt genhexkins\nsetp x 1\n", "legcal new .*m.hal -o DIR"),
+    "printer": ("printer.cfg", "[printer]\nkinematics: delta\n", "legcal new .*printer.cfg"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_files_of_other_programs_and_open_loops_get_their_sentence(
+    name: str, tmp_path: Path
+) -> None:
+    file, text, message = REFUSED[name]
+    path = tmp_path / file
+    if file == "head.urdf":
+        write_head_urdf(tmp_path)
+        frame = r'<joint name="closing_3_2_frame".*?</joint>'
+        text = re.sub(frame, "", path.read_text(), flags=re.S).replace(text, "")
+    path.write_text(text)
+    with pytest.raises(ModelError, match=message):
+        load_mechanism(path)
+
+
+def test_a_file_is_xml_by_its_content(tmp_path: Path) -> None:
+    path = write_head_urdf(tmp_path).rename(tmp_path / "head.urdf.txt")
+    _check(load_mechanism(path))
 
 
 @pytest.fixture(scope="module")
