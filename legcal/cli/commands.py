@@ -23,7 +23,7 @@ from legcal.cli.options import (
     write_page,
 )
 from legcal.errors import UsageError, printable
-from legcal.vision.distortion import DistortionModel
+from legcal.vision.distortion import CameraProgram, DistortionModel
 
 if TYPE_CHECKING:
     from legcal.calibration.detection import Detection
@@ -34,21 +34,22 @@ def camera(
     images: Annotated[
         list[str],
         typer.Argument(
-            metavar="IMAGES...", help="Photographs of the board: files, folders, patterns."
-        ),
-    ],
-    board: Annotated[
-        str,
-        typer.Option(
-            metavar="SPEC",
-            help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
-            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
-            "block board.",
+            metavar="IMAGES...",
+            help="Photographs of the board: files, folders, patterns; with --to a camera file.",
         ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
     ],
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SPEC",
+            help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
+            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
+            "block board, or a target of Kalibr or Basalt.",
+        ),
+    ] = None,
     model: Annotated[
         DistortionModel | None,
         typer.Option(help="Distortion model; by default chosen by the images."),
@@ -56,6 +57,10 @@ def camera(
     picture: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
+    ] = None,
+    to: Annotated[
+        CameraProgram | None,
+        typer.Option(help="Convert a camera file of any program into the form of this one."),
     ] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
@@ -65,7 +70,21 @@ def camera(
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.report.images import camera_table
+    from legcal.vision.camera_export import convert_camera
 
+    if to is not None:
+        if len(images) != 1 or board is not None or as_json:
+            raise UsageError(
+                "The camera could not be converted: found photographs, --board or --json with "
+                "--to, needed a single camera file; calibrate first, and convert the result."
+            )
+        convert_camera(Path(images[0]), to, output)
+        return
+    if board is None:
+        raise UsageError(
+            "The camera could not be calibrated: found no --board, needed the board in the "
+            "photographs; write --board chessboard:9x6:25mm for one of 9 x 6 squares of 25 mm."
+        )
     calibration = calibrate_camera(
         images,
         board,
