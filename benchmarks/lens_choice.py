@@ -13,95 +13,26 @@ percentile); processor seconds of a choice. ``--table`` prints every set.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from camera_sessions import (
+    WIDE_LENSES,
+    WIDE_SIZE,
+    corners_at_the_edge,
+    projection_errors,
+    wide_camera,
+)
+
+from legcal.calibration.camera_calibration.lens import chosen_lens
 from legcal.geometry.types import Array
-from legcal.perception.board_adjustment import BoardImages
-from legcal.vision.board import Board
-from legcal.vision.camera import Camera, intrinsic_names, project_with_derivatives
-from legcal.vision.image_file import ImageSize
-
-SIZE = ImageSize(1280, 960)
-BOARD = Board("chessboard", 9, 7, 1.0)
-NOISE_PX = 0.03
-MIDDLE, EDGE = (0.0, 0.55), (0.85, 1.05)  # distance from the centre, in half diagonals of 600 px
-MIN_CORNERS = 16
-LENSES = {
-    "plumb_bob": (1100.0, [-0.28, 0.11, 4e-4, -3e-4, -0.02]),
-    "rational_polynomial": (850.0, [0.55, -0.08, 4e-4, -3e-4, 0.01, 0.9, 0.02, 0.01]),
-    "thin_prism": (
-        850.0,
-        [0.55, -0.08, 4e-4, -3e-4, 0.01, 0.9, 0.02, 0.01, 2e-3, -4e-4, -1.5e-3, 3e-4],
-    ),
-    "equidistant": (564.0, [0.0705, -0.0234, 0.0164, -0.0014]),
-}
-
-
-def lens(model: str) -> Camera:
-    """Return the true camera with a lens of a model."""
-    f, coefficients = LENSES[model]
-    K = np.array([[f, 0.0, 651.0], [0.0, 0.999 * f, 497.0], [0.0, 0.0, 1.0]])
-    return Camera(K, SIZE.width, SIZE.height, np.array(coefficients), model)  # type: ignore[arg-type]
-
-
-def edge_set(camera: Camera, n_images: int, n_edge: int, rng: np.random.Generator) -> BoardImages:
-    """Return the corners of boards of which the last *n_edge* are near corners of the image."""
-    size = np.array([camera.width, camera.height])
-    centre = BOARD.points.mean(axis=0)
-    image: list[Array] = []
-    points, px = [], []
-    while len(image) < n_images:
-        is_edge = len(image) >= n_images - n_edge
-        turn = rng.choice([0.6, 2.5, 3.8, 5.6]) if is_edge else rng.uniform(0.0, 2.0 * np.pi)
-        away = 600.0 * rng.uniform(*(EDGE if is_edge else MIDDLE))
-        at = 0.5 * size + away * np.array([np.cos(turn), np.sin(turn)])
-        if not np.all((at > 30.0) & (at < size - 30.0)):
-            continue
-        ray = np.array([*camera.undistort(at), 1.0])
-        ray /= np.linalg.norm(ray)
-        lean, slope = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(5.0, 40.0))
-        R = Rotation.from_rotvec(0.6 * np.cross([0.0, 0.0, 1.0], ray))
-        R = R * Rotation.from_rotvec(slope * np.array([np.cos(lean), np.sin(lean), 0.0]))
-        R = R * Rotation.from_rotvec([0.0, 0.0, rng.uniform(-0.4, 0.4)])
-        distance = rng.uniform(9.0, 15.0) * camera.K[0, 0] / 564.0
-        T = RigidTransform.from_components(distance * ray - R.apply(centre), R)
-        P = T.apply(BOARD.points)
-        ahead = P[:, 2] > 0.05 * distance
-        seen = camera.project(np.where(ahead[:, None], P, [0.0, 0.0, 1.0]))
-        back = camera.undistort(seen)  # polynomials fold far points back into the image
-        is_true = np.linalg.norm(back - P[:, :2] / P[:, 2:], axis=1) < 1e-3
-        inside = ahead & is_true & np.all((seen > 4.0) & (seen < size - 5.0), axis=1)
-        if np.count_nonzero(inside) < MIN_CORNERS:
-            continue
-        image.append(np.full(np.count_nonzero(inside), len(image)))
-        points.append(BOARD.points[inside])
-        px.append(seen[inside])
-    exact = np.concatenate(px)
-    return BoardImages(
-        np.concatenate(image).astype(np.intp),
-        np.concatenate(points),
-        exact + NOISE_PX * rng.standard_normal(exact.shape),
-        np.full(len(exact), NOISE_PX),
-    )
-
-
-def projection_errors(truth: Camera, chosen: ChosenLens) -> Array:
-    """Return errors of the projection over the whole image, in stated standard deviations."""
-    camera = chosen.fit.adjusted.camera
-    u, v = np.meshgrid(np.linspace(0, truth.width - 1, 17), np.linspace(0, truth.height - 1, 13))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    xy = truth.undistort(pixels)
-    xy = xy[np.linalg.norm(truth.distort(xy) - pixels, axis=1) < 0.01]
-    off = camera.distort(xy) - truth.distort(xy)
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    J = project_with_derivatives(camera, rays, intrinsic_names(camera))[2]
-    covariance = J @ chosen.fit.covariance @ np.swapaxes(J, 1, 2)
-    return np.asarray(np.sqrt(np.sum(off**2, axis=1) / np.trace(covariance, axis1=1, axis2=2)))
+from legcal.vision.distortion import DistortionModel
 
 
 @dataclass(frozen=True)
@@ -115,13 +46,13 @@ class Outcome:
     reason: str
 
 
-def outcome(model: str, n_images: int, number: int) -> Outcome:
+def outcome(model: DistortionModel, n_images: int, number: int) -> Outcome:
     """Return the choice for a set of a lens."""
-    truth = lens(model)
-    rng = np.random.default_rng([49, list(LENSES).index(model), number])
-    seen = edge_set(truth, n_images, 1 + number % 10, rng)
+    truth = wide_camera(model)
+    rng = np.random.default_rng([49, list(WIDE_LENSES).index(model), number])
+    seen = corners_at_the_edge(truth, n_images, 1 + number % 10, rng)
     begin = time.process_time()
-    chosen = chosen_lens(seen, SIZE)
+    chosen = chosen_lens(seen, WIDE_SIZE)
     seconds = time.process_time() - begin
     if chosen is None:
         return Outcome("none", n_images, np.full(1, np.inf), seconds, "")
@@ -129,7 +60,7 @@ def outcome(model: str, n_images: int, number: int) -> Outcome:
     return Outcome(
         fit.adjusted.camera.model,
         len(fit.left_out),
-        projection_errors(truth, chosen),
+        projection_errors(truth, fit.adjusted.camera, fit.covariance),
         seconds,
         chosen.reason,
     )
@@ -141,11 +72,11 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=25)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--images", type=int, default=35)
-    parser.add_argument("--lens", choices=LENSES, action="append")
+    parser.add_argument("--lens", choices=WIDE_LENSES, action="append")
     parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
     print("lens                 right  left out   within 3  median  p95 of max  seconds")
-    for model in options.lens or LENSES:
+    for model in options.lens or WIDE_LENSES:
         outcomes = []
         for number in range(options.first, options.first + options.sets):
             outcomes.append(result := outcome(model, options.images, number))

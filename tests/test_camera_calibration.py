@@ -14,9 +14,13 @@ from camera_sessions import (
     NOISE_PX,
     PINHOLE,
     SIZE,
+    WIDE_SIZE,
+    corners_at_the_edge,
     drawings,
+    projection_errors,
     seen_corners,
     together,
+    wide_camera,
 )
 from thinned import thinned
 
@@ -237,6 +241,29 @@ def test_images_choose_the_lens_model() -> None:
     assert chosen.validated_px is not None
     residual_px = np.sqrt(np.mean(np.sum(chosen.fit.adjusted.residual**2, axis=1)))
     assert residual_px < chosen.validated_px < 1.5 * residual_px
+
+
+@pytest.mark.parametrize(
+    "model", ["equidistant", pytest.param("rational_polynomial", marks=pytest.mark.slow)]
+)
+def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
+    model: DistortionModel,
+) -> None:
+    """The many in the middle suit plumb_bob, which leaves the others out."""
+    truth = wide_camera(model)
+    seen = corners_at_the_edge(truth, 19, 2, np.random.default_rng(3))
+    plain = robust_fit(seen, WIDE_SIZE, "plumb_bob")
+    assert plain is not None
+    assert {17, 18} <= set(plain.left_out)
+    chosen = chosen_lens(seen, WIDE_SIZE)
+    assert chosen is not None
+    assert chosen.fit.adjusted.camera.model == model
+    assert chosen.fit.left_out == {}
+    assert "19 images agree on it" in chosen.reason
+    fit = chosen.fit
+    errors = projection_errors(truth, fit.adjusted.camera, fit.covariance)
+    assert np.quantile(errors, 0.9) < 3.0  # corners of the image may be far from any board
+    assert sigmas(fit)[:4].max() < 0.3
 
 
 def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_of() -> None:

@@ -67,16 +67,16 @@ CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
 
 def _lens_of_name(name: object) -> object:
     """Return the lens model of a name; None for an empty one."""
-    model = {alias: model for model, lens in DISTORTION_MODELS.items() for alias in lens.aliases}
     if name in (None, ""):
         return None
-    if not isinstance(name, str) or name not in {**model, **DISTORTION_MODELS}:
-        raise BadValue(
-            f"the lens model {describe(name)}",
-            f"one that legcal reads ({', '.join(DISTORTION_MODELS)})",
-            _CALIBRATE,
-        )
-    return model.get(name, name)
+    for model, lens in DISTORTION_MODELS.items():
+        if name in (model, *lens.aliases):
+            return model
+    raise BadValue(
+        f"the lens model {describe(name)}",
+        f"one that legcal reads ({', '.join(DISTORTION_MODELS)})",
+        _CALIBRATE,
+    )
 
 
 _CALIBRATE = "calibrate the camera with legcal camera, or with such a lens in its program"
@@ -380,8 +380,7 @@ def _from_kalibr(document: Mapping[str, Any], path: Path) -> Camera:
             "pinhole-radtan or pinhole-equi, or with legcal camera."
         )
     entry = validate(KalibrEntry, block, path, prefix)
-    fx, fy, cx, cy = entry.intrinsics
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = _pinhole(*entry.intrinsics)
     coefficients, problems = entry.distortion_coeffs, []
     needed = 0 if block["distortion_model"] == "none" else 4
     if len(coefficients) != needed and (needed or any(coefficients)):
@@ -389,6 +388,11 @@ def _from_kalibr(document: Mapping[str, Any], path: Path) -> Camera:
         problems.append(_wrong_count(path, str(block["distortion_model"]), n, str(needed)))
     coefficients = (coefficients + 4 * [0.0])[:needed]
     return _checked(path, K, entry.resolution, entry.distortion_model, coefficients, problems)
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Return a camera matrix (3, 3)."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _only(cameras: Sequence[str], path: Path) -> str:
@@ -464,8 +468,7 @@ def _of_parameters(
         )
     value = dict(zip(names, parameters, strict=True))
     fx, fy = (value.get(name, value.get("f", 0.0)) for name in ("fx", "fy"))
-    cx, cy = value["cx"] - first_pixel, value["cy"] - first_pixel
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = _pinhole(fx, fy, value["cx"] - first_pixel, value["cy"] - first_pixel)
     coefficients = [value.get(name, 0.0) for name in DISTORTION_MODELS[model].coefficients]
     return _checked(path, K, size, model, coefficients)
 

@@ -61,8 +61,7 @@ def robust_fit(
 ) -> RobustFit | None:
     """Return the fit of the camera without outliers; None if no adjustment succeeds."""
     n_images = int(corners.image[-1]) + 1
-    claimed = corners.sigma_px
-    corners = replace(corners, sigma_px=np.hypot(claimed, float(np.median(claimed))))
+    claimed, corners = corners.sigma_px, evened(corners)
     agreed = agreeing_images(corners, size, model, first)
     if agreed is None:
         return None
@@ -112,6 +111,12 @@ def robust_fit(
         ratio,
         adjusted.clusters.covariance(ratio),
     )
+
+
+def evened(corners: BoardImages) -> BoardImages:
+    """Return corners of which none claims to be far better than the others."""
+    claimed = corners.sigma_px
+    return replace(corners, sigma_px=np.hypot(claimed, float(np.median(claimed))))
 
 
 def _scattered(claimed: Array, is_kept: BoolArray, residual: Array) -> Array:

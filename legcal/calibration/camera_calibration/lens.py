@@ -1,8 +1,8 @@
 """The choice of the lens model: images that agree on it, then cross-validation image by image.
 
 Every model is fitted to all images before any is left out. A richer model is taken where it
-explains images that contradict the simpler one, and others no worse, or where it predicts held-out
-images better by a signed-rank test over images.
+explains images that contradict the simpler one, and others no worse, where it predicts held-out
+images better by a signed-rank test over images, or where all images together make it likelier.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtr, stdtr
+from scipy.special import chdtri, ndtr, stdtr
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
+from legcal.calibration.camera_calibration.adjustment import RobustFit, evened, robust_fit
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import AdjustedBoard, BoardImages, adjust_board
@@ -28,7 +28,7 @@ _RINGS = 6  # rings about the principal point with equal numbers of corners
 _OF_RING = 3  # smallest number of corners of an image in a ring
 _SIGNIFICANCE = 1e-3  # significance level of a radial trend
 _TREND_OF_SCATTER = 0.3  # radial trend worth a warning, relative to the scatter of corners
-_BETTER = 0.01  # significance level of a better prediction of images
+_BETTER = 0.01  # significance level of a better prediction, and of a likelihood ratio
 _MIN_RANKED = 4  # smallest number of images that decide
 _LARGE_GAIN = np.log(2.0)  # ratio of mean squares that decides if every image has it
 
@@ -122,33 +122,48 @@ def given_lens(corners: BoardImages, size: ImageSize, model: DistortionModel) ->
 
 def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
     """Return the fit of the simplest adequate lens model; None if no adjustment succeeds."""
-    plain, best = robust_fit(corners, size, SIMPLEST), None
-    if plain is not None:
-        best = ChosenLens(plain, f"{SIMPLEST}: no richer model predicts images better")
-    for model in _RICHER:
-        first = from_scratch(corners, size, model)
-        if first is None or (best is not None and not _may_lead(best.fit, first, corners)):
+    best: ChosenLens | None = None
+    first_of_best: AdjustedBoard | None = None
+    even = evened(corners)
+    for model in (SIMPLEST, *_RICHER):
+        first = from_scratch(even, size, model)
+        if first is None:
             continue
+        if best is not None and first_of_best is not None and not best.fit.left_out:
+            gain = np.log(
+                _mean_squares(first_of_best.residual, even) / _mean_squares(first.residual, even)
+            )
+            if not _is_positive(gain) and not _is_likelier(first, first_of_best, even):
+                continue
         fit = robust_fit(corners, size, model, first)
         if fit is None:
             continue
-        rich = ChosenLens(fit, f"{model}: no simpler model fits")
-        reason = _lead(best, rich) if best is not None else rich.reason
+        if best is None or first_of_best is None:
+            alone = "no richer model predicts images better"
+            if model != SIMPLEST:
+                alone = "no simpler model fits"
+            best, first_of_best = ChosenLens(fit, f"{model}: {alone}"), first
+            continue
+        rich = ChosenLens(fit, "")
+        reason = _lead(best, rich, is_likelier=_is_likelier(first, first_of_best, even))
         if reason:
-            best = replace(rich, reason=reason)
+            best, first_of_best = replace(rich, reason=reason), first
     return best
 
 
-def _may_lead(simple: RobustFit, rich: AdjustedBoard, corners: BoardImages) -> bool:
-    """Return whether a richer model can be better, by its first fit to all images."""
-    if simple.left_out:
-        return True
-    simple_squares = _mean_squares(simple.adjusted.residual, simple.corners)
-    gain = np.log(simple_squares / _mean_squares(rich.residual, corners)[list(simple.images)])
-    return _is_positive(gain)
+def _is_likelier(rich: AdjustedBoard, simple: AdjustedBoard, corners: BoardImages) -> bool:
+    """Return whether a richer model is likelier with all images, by the likelihood ratio.
+
+    Errors are scaled by the larger of their scatter and of the disagreement of images.
+    """
+    k, k_simple = (len(intrinsic_names(adjusted.camera)) for adjusted in (rich, simple))
+    dof = max(2 * len(corners.px) - 6 * len(rich.T_camera_board) - k, 1)
+    ratio = max(rich.clusters.ratio(), 2.0 * rich.cost / dof, 1e-30)
+    gain = 2.0 * (simple.cost - rich.cost) / ratio
+    return bool(gain > chdtri(max(k - k_simple, 1), _BETTER))
 
 
-def _lead(simple: ChosenLens, rich: ChosenLens) -> str:
+def _lead(simple: ChosenLens, rich: ChosenLens, *, is_likelier: bool) -> str:
     """Return the reason for a richer model; "" without one."""
     model, other = rich.fit.adjusted.camera.model, simple.fit.adjusted.camera.model
     n, n_other = len(rich.fit.images), len(simple.fit.images)
@@ -158,10 +173,14 @@ def _lead(simple: ChosenLens, rich: ChosenLens) -> str:
         np.array([squares[k] for k in common]) for squares in (simple_squares, rich_squares)
     )
     gain = np.log(simple_px2 / rich_px2)
-    if n > n_other and not _is_positive(-gain):
-        return f"{model}: {n} images agree on it, {n_other} on {other}"
-    if n < n_other or not _is_positive(gain):
+    if n < n_other or _is_positive(-gain):
         return ""
+    if n > n_other:
+        return f"{model}: {n} images agree on it, {n_other} on {other}"
+    if not _is_positive(gain):
+        if simple.fit.left_out or not is_likelier:
+            return ""
+        return f"{model}: all {n} images together fit it better than {other}, beyond chance"
     rms = [float(np.sqrt(np.mean(px2))) for px2 in (rich_px2, simple_px2)]
     return (
         f"{model}: it predicts images that it has not seen to {rms[0]:.3f} px (rms), {other} to "
