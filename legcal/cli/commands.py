@@ -35,12 +35,14 @@ def camera(
         list[str],
         typer.Argument(
             metavar="IMAGES...",
-            help="Photographs of the board: files, folders, patterns; with --to a camera file.",
+            help="Photographs of the board: files, folders, patterns; with --to a camera file, "
+            "with --compare two.",
         ),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
-    ],
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="The camera file to write."),
+    ] = None,
     board: Annotated[
         str | None,
         typer.Option(
@@ -62,6 +64,9 @@ def camera(
         CameraProgram | None,
         typer.Option(help="Convert a camera file of any program into the form of this one."),
     ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare two camera files over the image.")
+    ] = False,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
@@ -69,9 +74,25 @@ def camera(
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
-    from legcal.report.images import camera_table
+    from legcal.calibration.camera_calibration.projection import compare_cameras
+    from legcal.report.images import camera_table, comparison_table
     from legcal.vision.camera_export import convert_camera
+    from legcal.vision.camera_file import read_camera
 
+    if compare:
+        if len(images) != 2 or board is not None or output is not None:
+            raise UsageError(
+                "The cameras could not be compared: found other arguments than two camera files, "
+                "needed legcal camera A B --compare; leave out the others."
+            )
+        comparison = compare_cameras(*(read_camera(Path(image)) for image in images))
+        show(as_json, comparison.document, lambda: comparison_table(comparison))
+        return
+    if output is None:
+        raise UsageError(
+            "The camera could not be written: found no --output, needed the file to write; add -o "
+            "camera_info.yaml."
+        )
     if to is not None:
         if len(images) != 1 or board is not None or as_json:
             raise UsageError(
