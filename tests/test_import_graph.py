@@ -76,6 +76,7 @@ PUBLIC: dict[str, set[str]] = {
         "board",
         "board_file",
         "camera",
+        "camera_export",
         "camera_file",
         "cylinder",
         "distortion",
