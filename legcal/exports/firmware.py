@@ -161,7 +161,8 @@ class _Mounted:
 
     def steps(self, readings: Array) -> Array:
         """Return the way (k, 3) of the motors from their endstops, downwards [mm or deg]."""
-        return self._size * self.signs * (self.tops - readings[:, self._columns])
+        gains = np.array([actuator.gain for actuator in self.actuators])
+        return self._size * self.signs * gains * (self.tops - readings[:, self._columns])
 
     @property
     def lowest(self) -> float:

@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import ModelError
+from legcal.files.quantity import LENGTH
 from legcal.geometry.types import Array
+from legcal.machine.description_csv import MAX_NUMBER
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
 from legcal.machine.hexapod_files import (
     LINEAR_UNITS,
@@ -40,7 +42,6 @@ MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
-_IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
 
 
 @dataclass
@@ -305,6 +306,12 @@ def _shown(key: str) -> str:
 
 def _completed(path: Path, read: Configuration) -> dict[str, float]:
     """Return the values of all parameters, with defaults; refuse those that are missing."""
+    for key, value in read.values.items():
+        if not abs(value) < MAX_NUMBER:
+            raise ModelError(
+                f"{path}: {_shown(key)} could not be used: found {value:g}, needed a number below "
+                f"{MAX_NUMBER:g}; correct it."
+            )
     values, missing = dict[str, float](), list[Parameter]()
     for p in read.firmware.parameters:
         value = read.values.get(p.key)
@@ -415,11 +422,16 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             f"{ideal.angle[i - 1]:g} and {ideal.angle[i]:g} deg, needed towers around the bed, as "
             f"a rule 120 deg apart; correct their angles."
         )
-    sizes = rod * _IN_MM[unit]
-    if (np.ptp(sizes) > 0.5 * sizes.max()) or min(radius.min(), ideal.arm.min()) < 0.0:
+    sizes = 1e3 * LENGTH[unit] * rod
+    least = min(radius.min(), ideal.arm.min() if ideal.turns else np.inf)
+    if not least > 0.0:
+        problems.append(
+            f"{start} a radius or arm of {least:g} {unit}, needed a positive length; correct it."
+        )
+    elif np.ptp(sizes) > 0.5 * sizes.max():
         problems.append(
             f"{start} rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of "
-            f"{radius.min():g} {unit}, needed rods that are nearly alike and positive numbers; "
+            f"{radius.min():g} {unit}, needed rods that are nearly alike; "
             "write all lengths in one unit."
         )
     elif not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):
