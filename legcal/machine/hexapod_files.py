@@ -265,7 +265,7 @@ def rig_in(path: Path, text: str) -> tuple[Rig, Array, float]:
     needed = (*SIDES, "Range", "Middle")
     if missing := [key for key in needed if not 0.0 < values.get(key, 0.0) < MAX_NUMBER]:
         raise ModelError(
-            f"{path}: the rig could not be read: found no positive {' and '.join(missing)} below {MAX_NUMBER:g}, needed "
+            f"{path}: the rig could not be read: found no positive {' and '.join(missing)}, needed "
             "the sides L1 to L4, Middle and Range of the actuators; write them as 'L1: 1030'."
         )
     centre = np.array([values.get(f"COR{axis}", 0.0) for axis in "XYZ"])
