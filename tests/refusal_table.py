@@ -946,8 +946,6 @@ def _overrides() -> Iterable[Refusal]:
     planar: list[tuple[str, str, tuple[str, ...]]] = [
         ("height", "--set leg1.base.z", ("leg1.base.z",)),
         ("axis", "--set leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
-        ("contradicted", "--set leg1.offset=0.24", ("leg1.offset", "0.24")),
-        ("contradicted-prior", "--set leg1.offset=240+-0.1mm", ("leg1.offset", "0.24")),
     ]
     for name, words, named in planar:
         yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-axes")
@@ -1549,9 +1547,6 @@ def _results() -> Iterable[Refusal]:
         ("model", remove("result/calibrated.yaml"), ("calibrated.yaml",)),
     ]
     yield from _spoiled("result", "calibrate {in}/set --check {in}/result", "result", rows)
-    yield Refusal(
-        "result-other-machine", "calibrate {in} --check {in}/none", ("none",), "3-rps-axes"
-    )
 
 
 def _scenes() -> Iterable[Refusal]:
