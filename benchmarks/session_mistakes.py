@@ -5,16 +5,18 @@
 
 Outlines of 45 images of a machine whose joints are off are simulated. Two sessions in three have a
 mistake, drawn at a size from harmless to gross: the zero of an encoder slips or drifts, photographs
-come before the platform stands still, a motor has backlash or another scale, commands stand for
-readings, a camera is bumped or refocused, all motors have another scale (``pitch``, which nothing
-in outlines shows). Each is calibrated; the platform error by eq (20) against the true machine is
-compared with what is stated. Printed are sessions that are trusted beyond three stated sigmas, how
-often the first doubt names the mistake of those that harm by more than that, and healthy sessions
-in doubt. FILE keeps sessions as JSON lines; those in it are not done again. About 3 s a session.
+come before the platform stands still, a motor has backlash, another scale or an error once a turn,
+commands stand for readings, a camera is bumped or refocused, all motors have another scale
+(``pitch``, which nothing in outlines shows). Each is calibrated; the platform error by eq (20)
+against the true machine is compared with what is stated. Printed are sessions that are trusted
+beyond three stated sigmas, how often the first doubt names the mistake of those that harm by more
+than that, and healthy sessions in doubt. FILE keeps sessions as JSON lines; those in it are not
+done again. About 3 s a session.
 """
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +25,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from machine_kinds import measured_length
-from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from changed_rays import turned, with_rays, zoomed
 
 from legcal import (
     LegcalError,
@@ -35,13 +40,14 @@ from legcal import (
     simulate,
 )
 from legcal.data.dataset import Dataset
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.simulation.settings import Level
 
 MACHINES = "hexapod", "6-sps", "3-rpr", "3-rps", "linear-delta", "hexaglide", "servo-hexapod"
 HEALTHY, PITCH = "healthy", "pitch"
 N_SIGMAS = 3.0
+SCREW_PITCH = 0.005  # [m]
 # Sizes from harmless to gross, and the codes of doubts that name the mistake
 SIZES: dict[str, tuple[float, float, tuple[str, ...]]] = {
     "slip": (2e-5, 2e-3, ("encoder",)),  # [m] at the joint
@@ -49,7 +55,8 @@ SIZES: dict[str, tuple[float, float, tuple[str, ...]]] = {
     "backlash": (2e-5, 5e-4, ("backlash",)),
     "lag": (3e-4, 1e-2, ("lag",)),  # part of the last move
     "gain": (2e-4, 1e-2, ("gain",)),
-    "commands": (2e-5, 3e-4, ("noise", "left_out")),  # [m]
+    "commands": (2e-5, 3e-4, ("reading_noise",)),  # [m]
+    "eccentricity": (2e-5, 5e-4, ("eccentricity", "gain")),  # [m]
     "focal length": (3e-4, 7e-3, ("focal_length", "camera")),
     "camera": (1e-4, 3e-3, ("camera",)),  # [rad]
     PITCH: (2e-4, 4e-3, ()),
@@ -67,7 +74,12 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator) 
     moves = np.diff(m.q, axis=0, prepend=m.q[:1])
     moves[np.diff(m.view, prepend=-1) != 0] = 0.0
     if kind in ("camera", "focal length"):
-        return _with_rays(dataset, kind, size, int(rng.integers(len(m.views))), later)
+        rows = np.flatnonzero(m.view == int(rng.integers(len(m.views))))
+        changed = np.zeros(n, dtype=np.bool_)
+        changed[rows[int(len(rows) * 0.4) :]] = True
+        return with_rays(dataset, changed, turned(size) if kind == "camera" else zoomed(size))
+    turn = np.array([2.0 * np.pi if leg.reads_angle else SCREW_PITCH for leg in machine.legs])
+    phase = rng.uniform(0.0, 2.0 * np.pi)
     scatter = rng.normal(size=(n, len(machine.motors)))
     of_motor = {motor: scatter[:, i] for i, motor in enumerate(machine.motors)}
     changes: dict[str, Callable[[], Array]] = {
@@ -79,33 +91,10 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator) 
         "commands": lambda: (
             size * of_leg * np.column_stack([of_motor.get(i, np.zeros(n)) for i in machine.reads])
         ),
+        "eccentricity": lambda: size * is_motor * of_leg * np.sin(2.0 * np.pi * m.q / turn + phase),
         PITCH: lambda: size * m.q,
     }
     return replace(dataset, measurements=replace(m, q=m.q + changes[kind]()))
-
-
-def _with_rays(dataset: Dataset, kind: str, size: float, view: int, later: BoolArray) -> Dataset:
-    """Return a session with a camera that was turned or refocused among the images of a view."""
-    o, m = dataset.observations, dataset.measurements
-    assert o is not None
-    rows = np.flatnonzero(m.view == view)
-    changed = np.zeros(m.n_rows, dtype=np.bool_)
-    changed[rows[int(len(rows) * 0.4) :]] = True
-    at = changed[o.row]
-    camera = m.views[view].camera
-    xy = camera.undistort(o.ends[at].reshape(-1, 2))
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    if kind == "camera":
-        rays = np.asarray(Rotation.from_rotvec([0.0, size, 0.0]).apply(rays))
-    else:
-        rays = rays * [1.0 + size, 1.0 + size, 1.0]
-    first, second = np.moveaxis(rays.reshape(-1, 2, 3), 1, 0)
-    normal = np.cross(first, second)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    h, ends = o.h.copy(), o.ends.copy()
-    h[at] = normal * np.sign(np.sum(normal * h[at], axis=1))[:, None]
-    ends[at] = camera.project(rays).reshape(-1, 2, 2)
-    return replace(dataset, observations=replace(o, h=h, ends=ends))
 
 
 def session(seed: int, name: str, kinds: list[str], scratch: Path) -> dict[str, object]:

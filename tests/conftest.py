@@ -99,10 +99,10 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
             return None
         return replace(source, path=path, urdf=replace(source.urdf, path=urdf))
 
-    def read_once(model: str | Path) -> Source:
+    def read_once(model: str | Path, *stated: str | None) -> Source:
         path = find_model(model)
-        if path.suffix != ".yaml" or not path.is_file():
-            return read(model)
+        if path.suffix != ".yaml" or not path.is_file() or any(stated):
+            return read(model, *stated)
         content = path.read_bytes()
         source = as_read_before(path, content)
         if source is None:

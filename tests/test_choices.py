@@ -66,6 +66,9 @@ def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
         choose(["leg1.base:leg3.base=550±0.05m"], parameters=delta)
     with pytest.raises(UsageError, match=r"0.45 m differs by more than 15 % .* 0.5567 m"):
         choose(["leg1.base:leg3.base=450±0.05mm"], parameters=delta)
+    for text in ("MEASURED±SIGMAmm", "MEASURED+-0.05mm"):
+        with pytest.raises(UsageError, match="replace MEASURED by the measured value"):
+            choose([f"leg1.base:leg3.base={text}"], parameters=delta)
 
 
 def test_the_four_ways_to_state_a_prior_are_one() -> None:

@@ -17,7 +17,14 @@ from hexapod_example import Run
 from lxml import html
 from simulated import simulated
 
-from legcal import calibrate, load_dataset, load_result
+from legcal import (
+    SimulationSettings,
+    calibrate,
+    load_dataset,
+    load_mechanism,
+    load_result,
+    simulate,
+)
 from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.cross_validation import cross_validate
 from legcal.calibration.joint_fit.diagnostics import DoubtedCamera
@@ -25,7 +32,9 @@ from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.result import Calibration
 from legcal.calibration.verdict import judge
 from legcal.errors import DatasetError
+from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
+from legcal.simulation.settings import Level
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +154,49 @@ def test_a_doubt_is_raised_by_what_it_is_about(
     assert not calibration.verdict.is_to_be_refused
     assert calibration.verdict.sentence.startswith("In doubt: the platform moves by ")
     assert "known to " in calibration.verdict.sentence
+
+
+def _length(machine: Machine, other: str, times: float = 1.0) -> str:
+    """Return the distance of the base joints of leg1 and another leg as somebody stated it."""
+    base = dict(zip(machine.leg_names, machine.A_base, strict=True))
+    length = 1e3 * times * float(np.linalg.norm(base["leg1"] - base[other]))
+    return f"leg1.base:{other}.base={length:.6f}+-0.05mm"
+
+
+@pytest.mark.parametrize(
+    ("times", "wrong"),
+    [
+        ((1.02,), "the stated leg1.base:leg2.base"),
+        ((1.02, 1.02), "the travel of the motors"),
+        ((1.0, 1.0), ""),
+    ],
+)
+def test_the_witness_of_the_scale_that_others_contradict_is_named_alone(
+    times: tuple[float, ...], wrong: str, session: Path
+) -> None:
+    true = load_mechanism(next((session / "truth/models").glob("*.yaml")))
+    stated = [_length(true, f"leg{k}", x) for k, x in enumerate(times, 2)]
+    calibration = calibrate(session, priors=stated)
+    assert [one.code for one in calibration.doubts] == (["scale"] if wrong else [])
+    for doubt in calibration.doubts:
+        assert "says that the machine is 2 % larger than" in doubt.what
+        assert f"the likelier wrong is {wrong}, as the others agree without it" in doubt.what
+        assert doubt.sigma_dX_m is not None
+        assert calibration.platform is not None
+        assert doubt.sigma_dX_m > calibration.platform.sigma.mean_displacement
+
+
+def test_a_stated_length_that_is_the_nominal_one_is_asked_about(
+    session: Path, tmp_path: Path
+) -> None:
+    nominal = _length(load_dataset(session).machine, "leg2")
+    beside_travel = calibrate(session, priors=[nominal])
+    assert any("is the nominal length to all digits" in note for note in beside_travel.notes)
+    settings = SimulationSettings(level=Level.OUTLINES, poses=6, views=2)
+    folder = simulate("delta", tmp_path / "set", settings).folder
+    alone = calibrate(folder, priors=[_length(load_dataset(folder).machine, "leg3")])
+    assert [one.code for one in alone.doubts] == ["nominal_length"]
+    assert "was it measured?" in alone.verdict.sentence
 
 
 def _judged(calibration: Calibration, **changes: Any) -> Calibration:

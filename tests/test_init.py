@@ -57,7 +57,7 @@ def table(
     columns = columns or {}
     lines = [[*columns, *names]]
     for k in range(n):
-        numbers = [f"{factor * (q + add):.6g}" for q in readings(k)]
+        numbers = [f"{factor * (q + add):.12g}" for q in readings(k)]
         lines.append([*(cells[k] for cells in columns.values()), *numbers])
     text = "\n".join(separator.join(line) for line in lines) + "\n"
     if separator != ",":
@@ -218,6 +218,9 @@ def test_tables_are_read_as_spreadsheets_write_them(
         ([f"Leg {j} (um)" for j in range(1, 7)], 1e3, 0.0, ()),
         ([f"q{j}_cm" for j in range(1, 7)], 0.1, 0.0, ()),
         ([str(j) for j in range(6)], 0.1, 0.0, ("--unit", "cm")),
+        ([f"L{j} [in]" for j in range(1, 7)], 1.0 / 25.4, 0.0, ()),
+        ([f"L{j} [80 counts/mm]" for j in range(1, 7)], 80.0, 0.0, ()),
+        (LEGS, 40.0, 0.0, ("--unit", "40 steps/mm")),
         ([f"LEG{j}_prismatic/mm" for j in range(1, 7)], 1.0, 345.0, ("--lengths",)),
         (LEGS, 1e-3, 345.0, ("--lengths",)),
     ],
@@ -254,6 +257,8 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
     (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "headings")),
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
+    *((FLAT, {"names": [leg + unit for leg in LEGS]}, (), (name, "mm, um, nm, cm, m, in, ft"))
+      for unit, name in ((" [Zoll]", "'Zoll'"), (" (counts)", "'counts'"), ("_inch", "'inch'"))),
     (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
     (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from csv_rows import read_rows, write_rows
 from machines import regular
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 from simulated import simulated
 
+import legcal
 from legcal import evaluate, load_mechanism
 from legcal.calibration.evaluation import Evaluation
 from legcal.errors import DidNotConverge, ModelError
@@ -162,3 +165,32 @@ def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path:
     shorter_than_nothing = replace(truth, legs=(replace(short, q0=-1.0), *legs))
     with pytest.raises(DidNotConverge, match="the model does not reach row"):
         evaluate(shorter_than_nothing, truth, dataset=made.folder)
+
+
+def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good_home(
+    tmp_path: Path,
+) -> None:
+    """A hexapod whose platform is turned by 90 degrees can turn with all motors locked."""
+    made = legcal.new(
+        output=tmp_path,
+        family="hexapod",
+        unit="mm",
+        base_radius=200,
+        platform_radius=100,
+        height=300,
+        min_length=250,
+        max_length=420,
+    ).machine
+    content = yaml.safe_load(made.yaml_path.read_text())
+    turned = made.home.rotation * Rotation.from_euler("z", 90, degrees=True)
+    content["legcal"]["home"]["quat_xyzw"] = turned.as_quat().tolist()
+    made.yaml_path.write_text(yaml.safe_dump(content))
+    machine = load_mechanism(made.yaml_path)
+    (note,) = [note for note in machine.diagnostics if "is singular at home" in note]
+    assert "can turn about (0, 0, 1) and move along (0, 0, 1) of the base there" in note
+    found = re.search(r"xyz \[(.*?)\], quat_xyzw \[(.*?)\]", note)
+    assert found is not None
+    xyz, quat = ([float(x) for x in group.split(",")] for group in found.groups())
+    content["legcal"]["home"] = {"xyz": xyz, "quat_xyzw": quat}
+    made.yaml_path.write_text(yaml.safe_dump(content))
+    assert not any("singular" in note for note in load_mechanism(made.yaml_path).diagnostics)

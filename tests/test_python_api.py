@@ -7,11 +7,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hexapod_example import ROOT, Run
 from matplotlib import pyplot
+from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
@@ -129,3 +131,74 @@ def test_the_examples_of_the_page_on_python_print_what_it_says(
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         assert printed.getvalue() == expected
+
+
+def test_poses_are_taken_as_programs_have_them() -> None:
+    import pinocchio as pin
+
+    machine = legcal.load_mechanism("hexapod")
+    turned = machine.home * RigidTransform.from_rotation(Rotation.from_euler("z", 5, degrees=True))
+    expected = legcal.inverse_kinematics(machine, turned)
+    matrix = turned.as_matrix()
+    for pose in (matrix, matrix.tolist(), pin.SE3(matrix)):
+        np.testing.assert_allclose(legcal.inverse_kinematics(machine, pose), expected, atol=1e-12)
+        there = legcal.forward_kinematics(machine, expected.tolist(), pose)
+        np.testing.assert_allclose(there.as_matrix(), matrix, atol=1e-9)
+        assert legcal.singularity(machine, pose) == pytest.approx(
+            legcal.singularity(machine, turned), rel=1e-9
+        )
+        assert legcal.Follower(machine, pose).pose.translation == pytest.approx(matrix[:3, 3])
+    for pose, problem in (
+        (np.stack([matrix, matrix]), r"shape \(2, 4, 4\)"),
+        ("home", "found a str"),
+        (2.0 * matrix, "no rigid motion"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "no rigid motion"),
+        (np.full((4, 4), np.nan), "no rigid motion"),
+        (RigidTransform.from_translation([0.0, 0.0, 400.0]), r"399\.6\d\d m from home"),
+    ):
+        with pytest.raises(UsageError, match=problem):
+            legcal.inverse_kinematics(machine, pose)
+
+
+def test_readings_are_taken_by_leg_or_by_motor_and_in_metres_and_radians() -> None:
+    delta, hexapod = legcal.load_mechanism("delta"), legcal.load_mechanism("hexapod")
+    lowered = RigidTransform.from_translation([0.0, 0.0, -0.01]) * delta.home
+    q = legcal.inverse_kinematics(delta, lowered)
+    of_motors = q[list(delta.motors)]
+    assert len(of_motors) == len(delta.motor_names) == 3
+    pose = legcal.forward_kinematics(delta, of_motors)
+    np.testing.assert_allclose(pose.as_matrix(), lowered.as_matrix(), atol=1e-9)
+    for machine, readings, problem in (
+        (delta, np.degrees(of_motors), "probably in degrees"),
+        (hexapod, [70.0] * 6, "probably in mm"),
+        (delta, [0.1] * 4, "or \\(3,\\), one for each motor"),
+        (hexapod, [0.07] * 3, "needed \\(6,\\), one for each leg;"),
+    ):
+        with pytest.raises(UsageError, match=problem):
+            legcal.forward_kinematics(machine, readings)
+
+
+def test_models_are_written_and_exported_without_the_command_line(
+    example_run: Run, tmp_path: Path
+) -> None:
+    created = legcal.new(
+        output=tmp_path,
+        family="hexapod",
+        unit="mm",
+        base_radius=200,
+        platform_radius=100,
+        height=300,
+        min_length=280,
+        max_length=420,
+    )
+    assert isinstance(created.machine, legcal.Machine)
+    assert created.yaml_path.is_file()
+    with pytest.raises(UsageError, match="found the dimension 'radius', needed some of family"):
+        legcal.new(output=tmp_path, family="hexapod", radius=1.0)
+    loaded = legcal.load_result(example_run.output)
+    sources: tuple[Any, ...] = (loaded, example_run.output, loaded.machine)
+    for k, source in enumerate(sources):
+        legcal.export(source, "json", tmp_path / f"{k}.json")
+    texts = [(tmp_path / f"{k}.json").read_text() for k in range(2)]
+    assert texts[0] == texts[1]
+    assert loaded.table()[:2][1] == loaded.table()[1]

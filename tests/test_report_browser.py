@@ -42,80 +42,117 @@ def page(example_run: Run, browser: Any) -> Any:
     return browser
 
 
-def _draw_all(browser: Any) -> None:
-    """Bring every plot into sight and wait until it is drawn."""
-    from selenium.webdriver.support.wait import WebDriverWait
+def _is_drawn(browser: Any, scene: str) -> bool:
+    """Return whether a canvas has more colours than that of its paper."""
+    return bool(
+        browser.execute_script(
+            """const canvas = document.getElementById(arguments[0]);
+            const { width, height } = canvas;
+            const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+            return new Set(new Uint32Array(data.buffer)).size > 20;""",
+            scene,
+        )
+    )
 
-    def is_drawn(_: Any) -> bool:
-        return plot.get_dom_attribute("data-drawn") is not None
 
-    for plot in browser.find_elements("css selector", ".plot"):
-        browser.execute_script("arguments[0].scrollIntoView()", plot)
-        WebDriverWait(browser, PATIENCE).until(is_drawn)
+def _moved(browser: Any, name: str, value: int) -> dict[str, Any]:
+    """Set a control of the machine's scene; return its lines by the names of the legend."""
+    layers = browser.execute_script(
+        """const form = document.querySelector("form[data-for=machine-scene]");
+        form.elements[arguments[0]].value = arguments[1];
+        form.elements[arguments[0]].dispatchEvent(new Event("input", {bubbles: true}));
+        return document.getElementById("machine-scene").layers;""",
+        name,
+        value,
+    )
+    return {layer["name"]: np.array(layer["lines"]) for layer in layers if "name" in layer
+            and layer["name"] != "cameras"}  # fmt: skip
 
 
 def test_everything_is_drawn_without_an_error(page: Any) -> None:
-    _draw_all(page)
-    assert _errors(page) == []
-    assert len(page.find_elements("css selector", ".plot .gl-container canvas")) >= 2
-    points = page.find_elements("css selector", "#residuals-leg .scatterlayer .point")
-    assert len(points) > 500
+    assert all(_is_drawn(page, scene) for scene in ("machine-scene", "platform-space"))
+    points = page.execute_script(
+        "return [...document.querySelectorAll('.charts [data-points]')].map("
+        "(path) => path.getBBox().width)"
+    )
+    assert len(points) == 5 * 6 + 1  # of each leg, and all of them
+    assert min(points) > 10.0
     pictures = page.execute_script(
         "return [...document.querySelectorAll('.crop image')].map((i) => i.getBBox().width)"
     )
     assert len(pictures) == 40
     assert min(pictures) > 0
+    assert _errors(page) == []
 
 
 def test_sliders_move_the_machine(page: Any) -> None:
-    _draw_all(page)
+    still = _moved(page, "factor", 0)
+    np.testing.assert_allclose(still["calibrated"], still["nominal"], atol=1e-15)
+    nominal, once = (_moved(page, "factor", 1)[name] for name in ("nominal", "calibrated"))
+    assert 1e-4 < np.abs(once - nominal).max() < 1e-2
+    ten = _moved(page, "factor", 4)
+    np.testing.assert_allclose(ten["calibrated"] - nominal, 10.0 * (once - nominal), atol=1e-9)
+    rings = next(name for name in ten if "1 sigma" in name)
 
-    def moved(name: str, value: int) -> Any:
-        return page.execute_script(
-            """const form = document.querySelector("form[data-for=machine-scene]");
-            form.elements[arguments[0]].value = arguments[1];
-            form.elements[arguments[0]].dispatchEvent(new Event("input", {bubbles: true}));
-            return document.getElementById("machine-scene").data.slice(0, 2).map((t) => t.x);""",
-            name,
-            value,
-        )
+    def sizes(lines: Any) -> Any:
+        return np.ptp(lines, axis=1).max(axis=1)
 
-    def trace(number: int, key: str) -> Any:
-        return page.execute_script(
-            "return document.getElementById('machine-scene').data[arguments[0]][arguments[1]]",
-            number,
-            key,
-        )
-
-    def largest_ring() -> float:
-        heights = np.array(trace(6, "z"), float)
-        rings = np.split(heights, np.flatnonzero(np.isnan(heights)))
-        return float(max(np.ptp(ring[1:]) for ring in rings if len(ring) > 1))
-
-    nominal, calibrated = moved("factor", 0)
-    assert calibrated == nominal
-    largest = largest_ring()
-    nominal, calibrated = moved("factor", 1)
-    apart = [abs(a - b) for a, b in zip(nominal, calibrated, strict=True) if a is not None]
-    assert 1e-4 < max(apart) < 1e-2
-    _, ten_times = moved("factor", 4)
-    assert (
-        max(
-            abs(b - n - 10.0 * (a - n))
-            for a, b, n in zip(calibrated, ten_times, nominal, strict=True)
-            if n is not None
-        )
-        < 1e-9
-    )
-    assert largest > 0.0
-    assert largest_ring() == pytest.approx(largest, rel=1e-6)  # as its legend says
-    assert moved("pose", 7)[0] != nominal
-    assert [trace(k, "name") for k in (0, 1)] == ["nominal", "calibrated"]
-    grey, blue = moved("mode", 1)
-    apart = [abs(a - b) for a, b in zip(grey, blue, strict=True) if a is not None]
-    assert 0.01 < max(apart) < 0.1  # m: a deviation of 0.1 mm is seen without the slider
-    assert trace(0, "name") == "calibrated"
+    assert sizes(ten[rings]).max() > 0.0
+    np.testing.assert_allclose(sizes(ten[rings]), sizes(still[rings]), atol=1e-12)  # as said
+    assert np.abs(_moved(page, "pose", 7)["nominal"] - nominal).max() > 1e-3
+    moved = _moved(page, "mode", 1)
+    grey, blue = moved["calibrated"], moved["moved along the direction"]
+    assert 0.01 < np.abs(blue - grey).max() < 0.1  # m: 0.1 mm is seen without the slider
     assert _errors(page) == []
+
+
+def test_a_scene_is_turned_and_zoomed(page: Any) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    canvas = page.find_element("id", "platform-space")
+
+    def picture() -> str:
+        return str(page.execute_script("return arguments[0].toDataURL()", canvas))
+
+    show = "arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})"
+    page.execute_script(show, canvas)
+    before = picture()
+    ActionChains(page).drag_and_drop_by_offset(canvas, 60, 20).perform()
+    turned = picture()
+    page.execute_script(
+        "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -300, cancelable: true}))",
+        canvas,
+    )
+    assert len({before, turned, picture()}) == 3
+    assert _is_drawn(page, "platform-space")
+    assert _errors(page) == []
+
+
+def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    place = """const charts = document.querySelector(".charts");
+    const { links } = JSON.parse(charts.querySelector("script").textContent);
+    const svg = charts.querySelectorAll("svg")[2];
+    svg.scrollIntoView({block: "center", behavior: "instant"});
+    const matrix = svg.getScreenCTM();
+    for (const path of svg.querySelectorAll("[data-points]")) {
+      const places = [...path.getAttribute("d").matchAll(/M([-\\d.]+) ([-\\d.]+)/g)];
+      const k = path.dataset.points.split(" ").findIndex((number) => links[number]);
+      if (k < 0) continue;
+      const point = new DOMPoint(Number(places[k][1]), Number(places[k][2]));
+      const { x, y } = point.matrixTransform(matrix);
+      return [Math.round(x), Math.round(y), links[path.dataset.points.split(" ")[k]]];
+    }"""
+    x, y, _ = page.execute_script(place)
+    actions = ActionChains(page)
+    pointer: Any = actions.w3c_actions.pointer_action
+    pointer.move_to_location(x, y)
+    actions.perform()
+    assert " px" in page.find_element("id", "tip").text
+    pointer.click()
+    actions.perform()
+    assert "#outline-" in page.current_url
 
 
 def test_tables_sort_by_numbers_and_back(page: Any) -> None:
@@ -162,7 +199,7 @@ def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path
     changed = replace(calibration, dataset=dataset, notes=(HOSTILE,))
     changed.__dict__["result"] = calibration.result
     browser.get(legcal.write_report(changed, tmp_path).as_uri())
-    _draw_all(browser)
+    assert _is_drawn(browser, "machine-scene")
     assert _errors(browser) == []
     assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
     assert HOSTILE in browser.find_element("css selector", "h1").text

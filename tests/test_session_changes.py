@@ -7,21 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changed_rays import turned, with_rays, zoomed
 from csv_rows import read_rows, write_rows
-from scipy.spatial.transform import Rotation
 from simulated import simulated
 
-from legcal import calibrate, load_dataset
+from legcal import calibrate, load_dataset, load_mechanism
+from legcal.calibration.closeness import commanded
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, session_tests
 from legcal.data.dataset import Dataset
 from legcal.data.image_order import image_sequences
+from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 
 CHANGED_AT = 7  # of the 12 images of the second view
-SLIP, LAG, GAIN, BACKLASH, DRIFT = 3e-4, 4e-3, 2e-3, 2e-4, 4e-4
+SLIP, LAG, GAIN, BACKLASH, DRIFT, SCATTER = 3e-4, 4e-3, 2e-3, 2e-4, 4e-4, 1e-4
 TURN, ZOOM = 4e-4, 1e-3
 
 
@@ -77,37 +79,20 @@ def _moves(q: Array) -> Array:
     return moves
 
 
+def _between_views(q: Array) -> Array:
+    return q + SLIP * np.outer(np.arange(len(q)) >= 12, np.arange(6) == 1)
+
+
+def _commanded(q: Array) -> Array:
+    return q + SCATTER * np.random.default_rng(1).normal(size=q.shape)
+
+
 def _drifting(q: Array) -> Array:
     return q + DRIFT * np.outer(np.tile(np.linspace(0.0, 1.0, 12), 2), np.arange(6) == 5)
 
 
-def _with_outlines(change: Callable[[Array], Array]) -> Callable[[Dataset], Dataset]:
-    """Change the rays through outlines of later images of the second view."""
-
-    def changed(dataset: Dataset) -> Dataset:
-        o, m = dataset.observations, dataset.measurements
-        assert o is not None
-        camera, later = m.views[1].camera, _later(m.n_rows)[o.row]
-        xy = camera.undistort(o.ends[later].reshape(-1, 2))
-        rays = change(np.column_stack([xy, np.ones(len(xy))]))
-        ends = o.ends.copy()
-        ends[later] = camera.project(rays).reshape(-1, 2, 2)
-        h = o.h.copy()
-        first, second = np.moveaxis(rays.reshape(-1, 2, 3), 1, 0)
-        normal = np.cross(first, second)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        h[later] = normal * np.sign(np.sum(normal * h[later], axis=1))[:, None]
-        return replace(dataset, observations=replace(o, h=h, ends=ends))
-
-    return changed
-
-
-def _turned(rays: Array) -> Array:
-    return np.asarray(Rotation.from_rotvec([0.0, TURN, 0.0]).apply(rays))
-
-
-def _zoomed(rays: Array) -> Array:
-    return np.asarray(rays * [1.0 + ZOOM, 1.0 + ZOOM, 1.0])
+def _with_later_rays(change: Callable[[Array], Array]) -> Callable[[Dataset], Dataset]:
+    return lambda dataset: with_rays(dataset, _later(dataset.measurements.n_rows), change)
 
 
 CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {
@@ -124,8 +109,9 @@ CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {
         BACKLASH,
     ),
     "drift": (_with_readings(_drifting), "leg6", DRIFT),
-    "camera": (_with_outlines(_turned), "c2", TURN),
-    "focal_length": (_with_outlines(_zoomed), "c2", ZOOM),
+    "reading_noise": (_with_readings(_commanded), "all motors", SCATTER),
+    "camera": (_with_later_rays(turned(TURN)), "c2", TURN),
+    "focal_length": (_with_later_rays(zoomed(ZOOM)), "c2", ZOOM),
 }
 
 
@@ -145,6 +131,22 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
         assert finding.between is not None
         labels = healthy.measurements.pose_labels
         assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
+
+
+def test_a_slip_between_two_views_is_not_a_drift(healthy: Dataset, start: Start) -> None:
+    finding = _findings(_with_readings(_between_views)(healthy), start)[0]
+    assert (finding.kind, finding.subject) == ("encoder", "leg2")
+    assert finding.between == ("view c1", "view c2")
+    assert abs(finding.amount - SLIP) < 4.0 * finding.sigma < 0.6 * SLIP
+
+
+@pytest.mark.parametrize("part", [0.0, 3e-3])
+def test_a_stated_length_tells_a_pitch_that_all_motors_share(healthy: Dataset, part: float) -> None:
+    truth = load_mechanism(next((healthy.folder / "truth/models").glob("*.yaml")))
+    length = 1e3 * float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))
+    stretched = _with_readings(lambda q: q * (1.0 + part))(healthy)
+    result = calibrate(stretched, priors=[f"leg1.base:leg3.base={length:.3f}±0.05mm"])
+    assert [doubt.code for doubt in result.doubts] == ["pitch"] * (part > 0.0)
 
 
 def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
@@ -182,3 +184,19 @@ def test_images_are_ordered_by_times_then_by_the_numbers_of_a_view(healthy: Data
     assert by_exif.tolist() == list(range(24))[::-1]
     unnamed = replace(m, image=tuple("a" * (row + 1) for row in range(24)))
     assert image_sequences(unnamed, {}) == ()
+
+
+def test_readings_that_are_the_commands_of_a_plan_are_noted(
+    healthy: Dataset, tmp_path: Path
+) -> None:
+    m = replace(healthy.measurements, image=tuple(f"{row}.jpg" for row in range(24)))
+    q = np.round(m.q, 7)  # [m]
+    motors = [f"{leg.prismatic} [mm]" for leg in healthy.machine.legs]
+    rows = [
+        [name, *(f"{1e3 * x:.4f}" for x in of_row)] for name, of_row in zip(m.image, q, strict=True)
+    ]
+    (tmp_path / "poses.csv").write_text(format_table(["image", *motors], rows))
+    planned = replace(healthy, folder=tmp_path, measurements=replace(m, q=q))
+    assert "encoders read" in commanded(planned)[0]
+    q = q + 1e-6 * (np.arange(24) == 5)[:, None]
+    assert commanded(replace(planned, measurements=replace(m, q=q))) == ()

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
+from legcal.machine.meshes import ray_caster
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.solids import (
@@ -153,3 +155,16 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
         local = plate.T_base_solid.inv().apply(np.concatenate([A, B, middles]))
         assert np.abs(local[:, 2]).min() > 0.5 * plate.solid.shape.length
         assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
+
+
+def test_meshes_hide_the_same_with_and_without_embree(monkeypatch: pytest.MonkeyPatch) -> None:
+    sphere = trimesh.creation.icosphere(2, 0.1)
+    rng = np.random.default_rng(3)
+    aims = np.column_stack([rng.uniform(-0.15, 0.15, (200, 2)), np.ones(200)])
+    start = np.tile([0.0, 0.0, -1.0], (200, 1))
+    triangles = []
+    for is_there in (True, False):
+        monkeypatch.setattr("trimesh.base.ray.has_embree", is_there)
+        triangles.append(ray_caster(sphere.vertices, sphere.faces).intersects_first(start, aims))
+    np.testing.assert_array_equal(*triangles)
+    assert 20 < np.count_nonzero(triangles[0] >= 0) < 180

@@ -1,4 +1,4 @@
-"""Comparison of a calibration with the error expected by the plan of its session."""
+"""Comparison of a session with its plan: the expected error, and the commands of its poses."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.joint_fit.platform import PlatformAccuracy
+from legcal.data.dataset import Dataset
+from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
+from legcal.files.quantity import SHOWN_IN
 from legcal.files.reading import read_json
+from legcal.files.table import Column, read_table
 
 PLAN_NAME = "plan.json"  # plan in the folder of a planned session
+POSES_NAME = "poses.csv"  # its poses
+_ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
 
@@ -52,3 +58,28 @@ def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) ->
             "make the difference: see legcal detect, and plan with --noise of this result."
         )
     return (sentence,)
+
+
+def commanded(dataset: Dataset) -> tuple[str, ...]:
+    """Return a sentence on readings that are all the commands of a plan; () without a plan."""
+    file, m, machine = dataset.folder / POSES_NAME, dataset.measurements, dataset.machine
+    shown = [SHOWN_IN[machine.legs[j].reading_unit] for j in machine.motors]
+    motors = zip(legs_with_readings(machine.legs), shown, strict=True)
+    names = [f"{leg.prismatic} [{unit}]" for leg, (_, unit) in motors]
+    columns = [Column("image", "text"), *(Column(name) for name in names)]
+    if not file.exists():
+        return ()
+    try:
+        table = read_table(file, "plan", "row", columns)
+        commands = dict(zip(table.text("image"), table.numbers(names), strict=True))
+    except (OSError, DatasetError):
+        return ()
+    rows = [row for row, image in enumerate(m.image) if image in commands]
+    scale = np.array([size for size, _ in shown])
+    apart = [scale * m.q[row, machine.motors] - commands[m.image[row]] for row in rows]
+    if not rows or not np.all(np.abs(apart) <= _ROUNDED):
+        return ()
+    return (
+        f"All readings equal the commands in {file}: write down what the encoders read at each "
+        "pose; without encoders, state how well the motors reach a command as encoder_sigma.",
+    )

@@ -7,10 +7,11 @@ true, where that can be computed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
@@ -18,6 +19,7 @@ from legcal.calibration.documents import DoubtBlock
 from legcal.calibration.joint_fit.cross_validation import cross_validate
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     PlatformError,
@@ -25,19 +27,27 @@ from legcal.calibration.joint_fit.platform import (
     platform_by_parameters,
     poses_at_readings,
 )
-from legcal.calibration.joint_fit.scale import scale_witnesses
+from legcal.calibration.joint_fit.scale import (
+    MODEL,
+    RADII,
+    NominalSize,
+    compare_scales,
+    scale_witnesses,
+)
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.session_changes import Finding, SessionTests
+from legcal.calibration.session_changes import OF_MOTORS, Finding, SessionTests
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import few, few_views
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.kinematics import pose_differences
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import geometries, vector_of
+from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
@@ -49,6 +59,8 @@ _SURE = 5.0  # standard deviations of these squares
 # Of what a change claims to predict better: claims are linear, and cameras absorb so much of a
 # change that a right one may gain a third of its claim only
 MIN_GAIN = 0.1
+_LAST_DIGIT = 0.5e-6  # [m] half of the last digit of printed lengths
+_STUDENT_AT = 3.5  # standard deviations at which Student's distribution is compared
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
 
 
@@ -118,28 +130,50 @@ def doubts_of(
 ) -> tuple[Doubt, ...]:
     """Return all that speaks against a result but for the size of its improvement.
 
-    A change in the course of the session scatters outlines and bends cameras: where one is named,
-    these are not accused as well.
+    Accusations are compared here, so that nothing right is accused of what something else did: a
+    mistake that explains the images explains whatever else they contradict. A change in the course
+    of the session, or two scales, make outlines scatter, bend cameras and move parameters; a motor
+    that is named explains the readings that disagree and the outlines of its own legs.
     """
-    changes = _changes(dataset, solution, platform, session)
+    if mistakes := _mistakes(diagnosis):
+        return tuple(mistakes)
+    changes = _Changes.of(dataset, solution)
+    course = _changes(dataset, solution, platform, session)
+    # A scale that all motors share is one witness of the scale against the others
+    is_of_scale = any(one.kind == "pitch" for one in session.findings)
+    scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
+    causes = scale or course
+    motors = {one.subject for one in session.findings} if course else set[str]()
+    is_of_motors = any(one.kind in OF_MOTORS for one in session.findings) and bool(course)
+    legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
     return (
-        *_mistakes(diagnosis),
-        *_readings(solution),
-        *_legs_left_out(solution),
+        *([] if is_of_motors else _readings(solution)),
+        *_legs_left_out(solution, legs),
         *_clicks(dataset, solution),
         *_strayed_cameras(dataset, solution),
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
-        *_moved_parameters(dataset, solution, platform),
-        *_scale(dataset, solution, platform),
-        *_held_out(held_out),
-        *(changes or _symptoms(solution, platform)),
+        *_nominal_lengths(dataset, solution, platform, changes),
+        *(causes or _symptoms(dataset, solution, platform, changes, held_out, session)),
     )
 
 
-def _symptoms(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
-    """Return the doubts that a change in the course of a session would cause as well."""
-    return [*_cameras(solution, platform), *_left_out(solution, platform), *_noise(solution)]
+def _symptoms(
+    dataset: Dataset,
+    solution: Solution,
+    platform: PlatformAccuracy | None,
+    changes: _Changes,
+    held_out: HeldOut | None,
+    session: SessionTests,
+) -> list[Doubt]:
+    """Return the doubts that a change in the course of a session, or two scales, cause as well."""
+    return [
+        *_moved_parameters(dataset, solution, platform, changes),
+        *_held_out(held_out),
+        *_cameras(solution, platform),
+        *_left_out(solution, platform),
+        *_noise(solution, session),
+    ]
 
 
 def no_improvement(remedy: str) -> Doubt:
@@ -162,13 +196,14 @@ def _readings(solution: Solution) -> list[Doubt]:
     ]
 
 
-def _legs_left_out(solution: Solution) -> list[Doubt]:
-    """Return legs in views most of whose outlines were rejected."""
-    if not solution.left_out:
+def _legs_left_out(solution: Solution, explained: Collection[str]) -> list[Doubt]:
+    """Return legs in views most of whose outlines were rejected, but for *explained* ones."""
+    left_out = [one for one in solution.left_out if not any(f" of {j} " in one for j in explained)]
+    if not left_out:
         return []
     what = (
         "most outlines of a leg that a view shows disagree with the fit "
-        f"({', '.join(solution.left_out)}), so that they are of something else or the fit is wrong"
+        f"({', '.join(left_out)}), so that they are of something else or the fit is wrong"
     )
     remedy = (
         "look at them in the table of observations, and correct them or leave the leg out of the "
@@ -366,8 +401,8 @@ def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[
     """
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     names = solution.posterior.problem.legs.parametrization.names
-    step_of = dict(zip(names, finding.steps.tolist(), strict=True))
-    steps = np.array([[step_of[name]] for name in parametrization.names])
+    step_of = dict(zip(names, finding.steps, strict=True))
+    steps = np.array([step_of[name] for name in parametrization.names])
     legs, poses = solution.legs, solution.T_Rb_Re
     error = _moved_platform(dataset, solution, steps)
     before = error.mean_displacement, error.mean_rotation
@@ -384,22 +419,73 @@ def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Changes:
+    """The kinematic parameters of a fit against those of the nominal model, (p,) each."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    nominal: Array
+    change: Array
+    covariance: Array  # (p, p)
+    tolerance: Array  # infinite without one
+    estimated: BoolArray
+
+    @classmethod
+    def of(cls, dataset: Dataset, solution: Solution) -> _Changes:
+        """Collect them."""
+        machine, kinematic = dataset.machine, solution.kinematic
+        parametrization, legs = kinematic.parametrization, geometries(machine)
+        names, nominal = parametrization.names, vector_of(parametrization, legs, legs)
+        by_name = dict(zip(machine.leg_names, legs, strict=True))
+        tolerances = machine.tolerance.of_parameters(names, by_name, machine.size)
+        return cls(
+            names,
+            parametrization.units,
+            nominal,
+            vector_of(parametrization, solution.legs, legs) - nominal,
+            kinematic.value_covariance,
+            np.array([tolerances.get(name, np.inf) for name in names]),
+            np.array([solution.estimates.status.get(name) == "estimated" for name in names]),
+        )
+
+    def nominal_size(self, problem_names: Sequence[str], *, stated: bool) -> NominalSize | None:
+        """Return what the model says of the size of the machine; None without free lengths.
+
+        The size is that of the nominal lengths by least squares, each with its tolerance. How much
+        the other changes vary says how far that counts, with Student's distribution: a machine
+        whose parts vary little is as large as its model, too. *Stated* tolerances are the least.
+        """
+        at = np.flatnonzero(self.estimated & np.equal(self.units, "m") & (self.tolerance < np.inf))
+        length, change, tolerance = self.nominal[at], self.change[at], self.tolerance[at]
+        information = float(np.sum((length / tolerance) ** 2))
+        if information <= 0.0 or len(at) < 2:
+            return None
+        by_change = length / tolerance**2 / information
+        excess, sigma = float(by_change @ change), 1.0 / np.sqrt(information)
+        fitted = np.sqrt(np.diagonal(self.covariance)[at])
+        beyond = (change - excess * length) / np.hypot(tolerance, fitted)
+        n = len(at) - 1
+        part = np.sqrt(np.sum(beyond**2) / n) * stdtrit(n, ndtr(_STUDENT_AT)) / _STUDENT_AT
+        sigma *= max(float(part), 1.0 if stated else 0.0)
+        places = [problem_names.index(self.names[i]) for i in at.tolist()]
+        by_parameter = np.zeros(len(problem_names))
+        by_parameter[places] = by_change
+        return NominalSize(by_parameter, excess, sigma)
+
+
 def _moved_parameters(
-    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None
+    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
 ) -> list[Doubt]:
     """Return parameters that moved far beyond the tolerance of the machine, as one doubt."""
-    machine, kinematic = dataset.machine, solution.kinematic
-    parametrization, nominal = kinematic.parametrization, geometries(machine)
-    names, priors = parametrization.names, solution.posterior.problem.choices.priors
-    before = vector_of(parametrization, nominal, nominal)
-    expected = [priors[n].mean if n in priors else x for n, x in zip(names, before, strict=True)]
-    change = vector_of(parametrization, solution.legs, nominal) - np.array(expected)
-    sigma = np.sqrt(np.diagonal(kinematic.value_covariance))
-    legs = dict(zip(machine.leg_names, nominal, strict=True))
-    tolerances = machine.tolerance.of_parameters(names, legs, machine.size)
-    tolerance = np.array([tolerances.get(name, np.inf) for name in names])
-    estimated = np.array([solution.estimates.status.get(n) == "estimated" for n in names])
-    times = np.where(estimated, np.abs(change) / np.hypot(sigma, tolerance), 0.0)
+    names, priors = changes.names, solution.posterior.problem.choices.priors
+    expected = [
+        priors[n].mean if n in priors else x
+        for n, x in zip(names, changes.nominal.tolist(), strict=True)
+    ]
+    change, tolerance = changes.change + changes.nominal - expected, changes.tolerance
+    spread = np.hypot(np.sqrt(np.diagonal(changes.covariance)), tolerance)
+    times = np.where(changes.estimated, np.abs(change) / spread, 0.0)
     far = np.flatnonzero(times > MOST_MOVED)
     if not len(far):
         return []
@@ -410,7 +496,7 @@ def _moved_parameters(
         error = _moved_platform(dataset, solution, steps)
     moved = []
     for i in far[np.argsort(-times[far], kind="stable")].tolist():
-        scale, unit = SHOWN_IN[parametrization.units[i]]
+        scale, unit = SHOWN_IN[changes.units[i]]
         moved.append(
             f"{names[i]} by {scale * change[i]:+.3g} {unit} (tolerance {scale * tolerance[i]:.2g})"
         )
@@ -422,14 +508,15 @@ def _moved_parameters(
     return [Doubt("tolerance", what, remedy, *_mean(error))]
 
 
-def _noise(solution: Solution) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or those of a view or a leg."""
+def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or of a view, leg or period."""
     problem = solution.posterior.problem
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
     if times["all views"] <= MOST_SCATTER:
         times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
         times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
+        times |= {name: scatter.ratio(of) for name, of in session.periods.items()}
     worst = max(times, key=times.__getitem__)
     if times[worst] <= MOST_SCATTER:
         return []
@@ -444,49 +531,100 @@ def _noise(solution: Solution) -> list[Doubt]:
     return [Doubt("noise", what, remedy)]
 
 
-def _scale(dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
-    """Return whether a scale with a single witness contradicts the model as a whole.
+def _scale(
+    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
+) -> list[Doubt]:
+    """Return whether witnesses of the scale contradict each other, or the only one the model.
 
-    The scale is that of the nominal lengths by least squares; each has its tolerance.
+    Where several agree, a model or radii of another size are theirs, and no doubt.
     """
-    witnesses = scale_witnesses(solution.posterior.problem)
-    if len(witnesses) != 1:
+    problem = solution.posterior.problem
+    names = problem.legs.parametrization.names
+    tolerance = dataset.machine.tolerance
+    nominal = changes.nominal_size(names, stated=tolerance != NOT_STATED)
+    found = None if nominal is None else compare_scales(solution.posterior, nominal)
+    if found is None:
         return []
-    machine, kinematic = dataset.machine, solution.kinematic
-    parametrization, nominal = kinematic.parametrization, geometries(machine)
-    names = parametrization.names
-    legs = dict(zip(machine.leg_names, nominal, strict=True))
-    tolerances = machine.tolerance.of_parameters(names, legs, machine.size)
-    is_length = [
-        unit == "m" and solution.estimates.status.get(name) == "estimated" and name in tolerances
-        for name, unit in zip(names, parametrization.units, strict=True)
+    alone, wrong = len(scale_witnesses(problem)) == 1, found.likelier_wrong()
+    explained = wrong is not None and found.witnesses[wrong] in (RADII, *([] if alone else [MODEL]))
+    pairs = [
+        pair
+        for pair in found.disagreements
+        if not (explained and wrong in (pair.larger, pair.smaller))
     ]
-    at = np.flatnonzero(is_length)
-    length = vector_of(parametrization, nominal, nominal)
-    change = vector_of(parametrization, solution.legs, nominal) - length
-    tolerance = np.array([tolerances[names[i]] for i in at])
-    weight = length[at] / tolerance**2
-    information = float(weight @ length[at])
-    if information <= 0.0:
+    if not pairs:
         return []
-    by_change = weight / information
-    scale = float(by_change @ change[at])
-    fitted = float(by_change @ kinematic.value_covariance[np.ix_(at, at)] @ by_change)
-    sigma = float(np.sqrt(1.0 / information + fitted))
-    if abs(scale) <= MOST_MOVED * sigma:
+    first = pairs[0]
+    clauses = [
+        f"{found.witnesses[pair.larger]} says that the machine is {100.0 * pair.ratio:.2g} % "
+        f"larger than {found.witnesses[pair.smaller]} does ({pair.sigmas:.0f} standard deviations)"
+        for pair in pairs
+    ]
+    likelier = (
+        "either may be wrong"
+        if wrong is None
+        else f"the likelier wrong is {found.witnesses[wrong]}, as the others agree without it"
+    )
+    rests = f"; the scale rests on {scale_witnesses(problem)[0]} alone" if alone else ""
+    what = f"{few(clauses)}: {likelier}{rests}"
+    remedy = (
+        "measure that again, or another length, and state it "
+        f"({dataset.machine.length_option}, --set)"
+    )
+    error = None
+    if platform is not None:
+        suspects = [first.larger, first.smaller] if wrong is None else [wrong]
+        step_of = [dict(zip(names, step, strict=True)) for step in found.steps.T.tolist()]
+        errors = [
+            _moved_platform(
+                dataset,
+                solution,
+                np.array([[first.ratio * step_of[i][name]] for name in changes.names]),
+            )
+            for i in suspects
+        ]
+        error = max(errors, key=lambda one: one.mean_displacement)
+    return [Doubt("scale", what, remedy, *_mean(error))]
+
+
+def _nominal_lengths(
+    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
+) -> list[Doubt]:
+    """Return whether the only witness of the scale is a stated length that is the model's.
+
+    A measured one differs, and nothing else would show that this one was not measured.
+    """
+    stated = nominal_lengths(dataset, solution)
+    nominal = changes.nominal_size(changes.names, stated=dataset.machine.tolerance != NOT_STATED)
+    if not stated or nominal is None or len(scale_witnesses(solution.posterior.problem)) != 1:
         return []
     error = None
     if platform is not None:
-        steps = np.zeros((len(names), 1))
-        steps[at, 0] = scale * length[at]
-        error = _moved_platform(dataset, solution, steps)
-    way = "larger" if scale > 0.0 else "smaller"
+        steps = nominal.sigma * np.where(np.equal(changes.units, "m"), changes.nominal, 0.0)
+        error = _moved_platform(dataset, solution, steps[:, None])
+        if error.mean_displacement <= platform.sigma.mean_displacement:
+            return []
     what = (
-        f"the machine comes out {100.0 * abs(scale):.1f} % {way} than its model, "
-        f"{abs(scale) / sigma:.0f} times the tolerance, and its scale rests on {witnesses[0]} alone"
+        f"the scale rests on {few(stated)} alone, which is the nominal length to all digits: was "
+        "it measured?"
     )
-    remedy = "measure that again, or another length, and state it (--length, --set)"
-    return [Doubt("scale", what, remedy, *_mean(error))]
+    remedy = (
+        "measure it and state that, or state a second length beside it "
+        f"({dataset.machine.length_option})"
+    )
+    return [Doubt("nominal_length", what, remedy, *_mean(error))]
+
+
+def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return stated lengths that are the nominal ones to all digits, as nobody measures them."""
+    known = known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
+    priors = solution.posterior.problem.choices.priors
+    return [
+        name
+        for name in sorted(priors)
+        if (":" in name or ParameterId.parse(name).kind == "length")
+        and abs(priors[name].mean - known.parameter(name).nominal) < _LAST_DIGIT
+    ]
 
 
 def _held_out(held_out: HeldOut | None) -> list[Doubt]:

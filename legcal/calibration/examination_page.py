@@ -17,12 +17,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import Detection, unique_names
 from legcal.calibration.examination import Examination, ViewCondition
-from legcal.calibration.summary import UNITS
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
 from legcal.data.measurements import row_names
 from legcal.data.outlines import format_observations
 from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
+from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.picture import draw_machine, joint_letter
@@ -99,10 +99,10 @@ def tables_of(examination: Examination) -> list[Table]:
             [_outline_cells(view) for view in examination.views if view.outlines is not None],
         ),
     ]  # fmt: skip
-    units = dict.fromkeys(UNITS[check.unit][1] for check in examination.encoders)
+    units = dict.fromkeys(SHOWN_IN[check.unit][1] for check in examination.encoders)
     rows = list[list[Cell]]()
     for encoder in examination.encoders:
-        scale = UNITS[encoder.unit][0]
+        scale = SHOWN_IN[encoder.unit][0]
         low_high = None if encoder.travel is None else [scale * end for end in encoder.travel]
         rows.append(
             [

@@ -28,6 +28,7 @@ from legcal.calibration.documents import (
     ParameterRow,
     WeakInLinks,
 )
+from legcal.calibration.quantities import FRAMES
 from legcal.files.motions import Pose
 from legcal.geometry.axes import turned_axis
 from legcal.geometry.lines import normal_basis
@@ -39,7 +40,6 @@ from legcal.machine.parameters import free_coordinates, geometries, parametrizat
 from legcal.machine.rods import AT_ZERO
 from legcal.vision.board import LINKS, Link
 
-FRAMES: dict[Link, str] = {"base": "R_b", "platform": "R_e"}
 _MARKS: tuple[FrameMark, ...] = ("origin", "x axis", "xy plane")
 _STATUSES: tuple[CoordinateStatus, ...] = ("weak", "estimated", "fixed", "frame")
 _ROUNDING = 1e-9  # rounding of the components of unit vectors
@@ -291,7 +291,7 @@ def compared_joints(machine: Machine, reference: Machine) -> dict[Link, Compared
     return links
 
 
-def mark_in_words(side: Link, status: CoordinateStatus, defines: FrameMark | None) -> str:
+def mark_in_words(side: str, status: str, defines: FrameMark | None) -> str:
     """Return the remark on a coordinate that is not simply estimated: ``defines R_b``."""
     if status == "frame":
         return f"defines {FRAMES[side]}"

@@ -47,6 +47,7 @@ from legcal.workers import Run
 
 # largest leg residual that errors of a nominal model explain, relative to the mean leg length
 MAX_NOMINAL_RESIDUAL = 0.03
+_STARTS = 12  # poses of other images near which the pose of accused readings is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +243,7 @@ def nominal_poses(
         for k, pose in zip(unreached, nearest, strict=True):
             T[k] = pose
     limit, first = _largest_residual(machine), measurements.first_rows.tolist()
-    contradicting = _contradictions(machine, measurements, T)
+    T, contradicting = _contradictions(machine, measurements, T)
     refused = {
         first[k]: Cause(
             "found {}; check this reading, its encoder and the offset of the leg, or take",
@@ -289,17 +290,31 @@ def contradicting_readings(machine: Machine, measurements: Measurements) -> dict
     first = measurements.first_rows.tolist()
     return {
         first[k]: contradiction.cause(machine)
-        for k, contradiction in _contradictions(machine, measurements, T).items()
+        for k, contradiction in _contradictions(machine, measurements, T)[1].items()
         if not _is_refused(contradiction, machine)
     }
 
 
 def _contradictions(
     machine: Machine, measurements: Measurements, T_Rb_Re: Sequence[RigidTransform]
-) -> dict[int, Contradiction]:
-    """Return the poses at which readings of redundant motors contradict each other."""
+) -> tuple[list[RigidTransform], dict[int, Contradiction]]:
+    """Return the poses at which readings of redundant motors contradict each other, and all poses.
+
+    Readings have several poses, and the one that is followed from home may be the wrong one: before
+    readings are accused, poses near those of the other images are tried.
+    """
+    T, q = list(T_Rb_Re), measurements.q_of_poses
     motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
-    return contradictions(machine, T_Rb_Re, measurements.q_of_poses[:, motors], sigma[motors])
+    accused = contradictions(machine, T, q[:, motors], sigma[motors])
+    others = [pose for k, pose in enumerate(T) if k not in accused]
+    starts = [platform_in_base(machine, machine.home), *others[:: 1 + len(others) // _STARTS]]
+    for k in accused:
+        near = [T[k], *starts]
+        poses, missed = _least_squares(machine, np.repeat(q[[k]], len(near), axis=0), near)
+        T[k] = poses[int(np.argmin(missed))]
+    if accused:
+        accused = contradictions(machine, T, q[:, motors], sigma[motors])
+    return T, accused
 
 
 def _is_refused(contradiction: Contradiction, machine: Machine) -> bool:

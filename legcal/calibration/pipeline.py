@@ -47,9 +47,10 @@ from legcal.data.cache import fingerprint, plan_dataset, store_outlines
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at, split_images
 from legcal.data.image_causes import image_notes
+from legcal.data.image_choice import chosen_images, own_zero
 from legcal.data.measurements import few_views
 from legcal.data.outlines import reject_unused_legs
-from legcal.data.overrides import Override, overrides_of_call
+from legcal.data.overrides import Override, listed, overrides_of_call
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -59,7 +60,8 @@ from legcal.errors import (
     UsageError,
 )
 from legcal.files.folder import check_destination, output_path
-from legcal.geometry.types import IntArray
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.parameter_id import ParameterId
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes
@@ -87,6 +89,8 @@ def calibrate(
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
     holdout: float | None = None,
+    leave_out: str = "",
+    split: Sequence[str] = (),
     overlays: bool = False,
     beside: Beside | None = None,
 ) -> Calibration:
@@ -121,6 +125,12 @@ def calibrate(
     holdout : float, optional
         Hold out this fraction of the images, and compare them with the prediction of the fit to the
         others.
+    leave_out : str
+        Leave these images out of the fit: ``p22``, ``p22..p45`` in the order in which they were
+        taken, ``c2`` for a view, ``c2:p22`` where several views have that name; by commas.
+    split : sequence of str
+        ``MOTOR@IMAGES``: the encoder of that motor had another zero in these images than in the
+        others, whose zero the model has.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
     beside : callable, optional
@@ -154,7 +164,11 @@ def calibrate(
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
-    fitted, held_out = _split(dataset, holdout)
+    zeros = tuple(own_zero(dataset, text) for text in listed(split))
+    if zeros:
+        dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
+    left_out = chosen_images(dataset, leave_out) if leave_out else None
+    fitted, held_out = _fitted_and_held_out(dataset, left_out, holdout)
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
@@ -177,6 +191,8 @@ def calibrate(
         *Note.about(Topic.MODEL, (*choices.notes, *identify_notes)),
         *Note.about(Topic.DATASET, cache_notes),
         *Note.about(Topic.READINGS, found.fitted.unreached_notes()),
+        *Note.about(Topic.READINGS, _own_zero_notes(dataset, found.solution)),
+        *Note.about(Topic.IMAGES, [f"Left out, as asked: {leave_out}."] if leave_out else ()),
         *Note.about(Topic.BOARDS, board_notes(dataset, found.solution, found.corners)),
         *found.solution.notes,
         *Note.about(Topic.CAMERAS, _camera_notes(dataset, found.solution)),
@@ -347,7 +363,9 @@ def outline_key(dataset: Dataset, choices: Choices) -> str:
 
     Images that disagree are searched again near the fit, which depends on the choices.
     """
-    return fingerprint(dataset, detection_settings() | choices.document())
+    zeros = [[one.motor, one.images] for one in dataset.measurements.own_zeros]
+    split = {"own_zeros": zeros} if zeros else {}
+    return fingerprint(dataset, detection_settings() | choices.document() | split)
 
 
 def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[str]:
@@ -383,10 +401,16 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     return replace(choices, priors={**twists, **choices.priors})
 
 
-def _split(dataset: Dataset, holdout: float | None) -> tuple[IntArray, IntArray]:
+def _fitted_and_held_out(
+    dataset: Dataset, left_out: BoolArray | None, holdout: float | None
+) -> tuple[IntArray, IntArray]:
     """Return the rows of fitted and of held-out images."""
+    rows = np.arange(dataset.measurements.n_rows)
+    if left_out is not None:
+        rows = rows[~left_out]
+        fitted, held_out = _fitted_and_held_out(dataset_at(dataset, rows), None, holdout)
+        return rows[fitted], rows[held_out]
     if holdout is None:
-        rows = np.arange(dataset.measurements.n_rows)
         return rows, rows[:0]
     if dataset.axes is not None:
         raise UsageError(
@@ -408,6 +432,21 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
     poses = held_out.poses_by(solution.legs)
     return compare_held_out(solution.posterior, held_out.measurements, outlines, poses)
+
+
+def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on each zero that an encoder had in some images."""
+    posterior, notes = solution.posterior, list[str]()
+    sigma = np.sqrt(np.diagonal(posterior.covariance)[posterior.problem.where("own_zeros")])
+    zeros = dataset.measurements.own_zeros, posterior.state.own_zeros.tolist(), sigma.tolist()
+    unit_of = {leg.motor_label: leg.reading_unit for leg in dataset.machine.legs}
+    for of, value, error in zip(*zeros, strict=True):
+        scale, unit = SHOWN_IN[unit_of[of.motor]]
+        notes.append(
+            f"In {of.images} the zero of the encoder of {of.motor} is {scale * value:+.4f} ± "
+            f"{scale * error:.4f} {unit} from that of the other images, which the model has."
+        )
+    return notes
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from legcal.calibration.documents import ParameterRow, Result
+from legcal.calibration.documents import Result
+from legcal.calibration.quantities import Quantity, parameters_of
 from legcal.errors import UsageError
 from legcal.figures import new_figure, plain
 from legcal.geometry.types import Array
@@ -89,17 +90,18 @@ def _directions(posterior: Posterior) -> Array:
 
 def plot_uncertainty(result: Result) -> Figure:
     """Plot the standard deviations of all parameters, and of the platform at poses."""
+    quantities = parameters_of(result)
     groups = [
-        (rows, scale, unit)
-        for unit_of_rows, scale, unit in (("m", 1e3, "mm"), ("rad", float(np.degrees(1.0)), "deg"))
-        if (rows := [row for row in result.parameters if row.unit == unit_of_rows and row.sigma])
+        (unit, shown)
+        for unit in ("mm", "deg")
+        if (shown := [q for q in quantities if q.unit == unit and q.sigma])
     ]
     platform = result.platform
     n = len(groups) + (platform is not None)
-    longest = max((len(rows) for rows, _, _ in groups), default=0)
+    longest = max((len(shown) for _, shown in groups), default=0)
     with new_figure(n, n, (_WIDTH, max(_HEIGHT, _LINE * longest))) as (figure, panels):
-        for panel, (rows, scale, unit) in zip(panels, groups, strict=False):
-            _bars(panel, rows, scale)
+        for panel, (unit, shown) in zip(panels, groups, strict=False):
+            _bars(panel, shown)
             panel.set_xlabel(f"1 sigma [{unit}]")
         if platform is not None:
             panel = panels[n - 1]
@@ -115,10 +117,11 @@ def plot_uncertainty(result: Result) -> Figure:
     return figure
 
 
-def _bars(panel: Axes, rows: list[ParameterRow], scale: float) -> None:
+def _bars(panel: Axes, quantities: list[Quantity]) -> None:
     """Draw a bar for each parameter, the first at the top."""
-    sigma = [scale * (row.sigma or 0.0) for row in rows]
-    panel.barh(range(len(rows)), sigma)
-    panel.set_yticks(range(len(rows)), [plain(row.name) for row in rows], fontsize="x-small")
+    panel.barh(range(len(quantities)), [q.sigma or 0.0 for q in quantities])
+    panel.set_yticks(
+        range(len(quantities)), [plain(q.name) for q in quantities], fontsize="x-small"
+    )
     panel.invert_yaxis()
     panel.margins(y=0.01)

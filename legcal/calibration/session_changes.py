@@ -8,7 +8,8 @@ view have an order, over both sides for each other view. The most certain findin
 others are tested given those before, so that one cause is named once.
 
 Errors that images share make scores scatter more than the covariances of outlines say; a score
-counts in units of its scatter from image to image.
+counts in units of its scatter from image to image. The squares of the scores of single readings
+say how much readings scatter: a variance component by motor, tested after all other numbers.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import chain, combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.sensitivity import kinematic_steps
+from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
-from legcal.data.measurements import Measurements, row_names
+from legcal.data.image_choice import images_in_words
+from legcal.data.measurements import Measurements, few_views, row_names
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test
@@ -39,9 +42,27 @@ MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked
 MIN_IMAGES = 3  # on each side of a change
 _MAX_OTHER_VIEWS = 5  # views whose side of a change is tried
 _HUBER = 3.0  # standard deviations from which on outlines count less
-_UNSEEN = 1e-6  # part of the square of a column below which the fit absorbs it
+_UNSEEN = 1e-7  # part of the square of a column below which the fit absorbs it
+ALL_MOTORS = "all motors"
 
-Kind = Literal["encoder", "drift", "camera", "focal_length", "lag", "backlash", "gain"]
+_GOOD_PART = 0.2  # of a turn, beyond which errors once a turn are looked for
+MOST_SCATTER = 2.0  # times the stated standard deviation of readings
+
+Kind = Literal[
+    "encoder",
+    "drift",
+    "camera",
+    "focal_length",
+    "lag",
+    "backlash",
+    "gain",
+    "pitch",
+    "eccentricity",
+    "reading_noise",
+]
+OF_MOTORS: frozenset[Kind] = frozenset(
+    ("encoder", "drift", "lag", "backlash", "gain", "pitch", "eccentricity", "reading_noise")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +78,20 @@ class Finding:
     unit : str
         ``m``, ``rad`` or ``1``.
     amount, sigma : float
-        The number; of a camera the angle or the distance, whichever is surer.
+        The number; of a camera the angle or the distance, whichever is surer, of noise the
+        standard deviation of readings.
     between : (str, str) or None
-        The images before and after a change; None where it is of all images.
+        The images, or the views, before and after a change; None where it is of all images.
     p_value : float
         Probability of such a score by chance, times the number of tests.
-    steps : (p,) array
+    steps : (p, c) array
         The error of the kinematic parameters of the fit without the number, as in the
-        parametrization of its problem.
+        parametrization of its problem; of noise, c independent errors.
+    images : str
+        The images on one side of a change, as options name them: before that of an encoder, the
+        fewer ones beside that of a camera.
+    stated : float
+        The standard deviation of readings that is stated, of noise alone.
     """
 
     kind: Kind
@@ -75,6 +102,8 @@ class Finding:
     between: tuple[str, str] | None
     p_value: float
     steps: Array
+    images: str = ""
+    stated: float = 0.0
 
     @property
     def size(self) -> str:
@@ -82,7 +111,10 @@ class Finding:
         scale, unit = (100.0, "%") if self.unit == "1" else SHOWN_IN[self.unit]
         sigma = scale * self.sigma
         digits = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0.0 else 3
-        sign = "" if self.kind in ("camera", "backlash") else "+"
+        if self.kind == "reading_noise":
+            stated = f"{scale * self.stated:.2g} {unit}"
+            return f"{scale * self.amount:.{digits}f} {unit} where {stated} are stated"
+        sign = "" if self.kind in _WITHOUT_SIGN else "+"
         return f"{scale * self.amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
 
     @property
@@ -94,14 +126,16 @@ class Finding:
     @property
     def remedy(self) -> str:
         """What to do, as a clause."""
-        return _WORDS[self.kind][1].format(subject=self.subject)
+        return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
+_WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
+_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity")
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
-        "look for a slipped coupling or a lost home there, and leave the images before it, or "
-        "those after it, out of measurements.csv",
+        "look for a slipped coupling or a lost home there, and calibrate with a zero of its own "
+        "before that (--split {subject}@{images})",
     ),
     "drift": (
         "the zero of the encoder of {subject} drifts by {size} from the first image to the last",
@@ -109,12 +143,14 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
     ),
     "camera": (
         "the camera of {subject} moved by {size}",
-        "make the images after it a view of their own in dataset.yaml and measurements.csv",
+        "make the images after it a view of their own in dataset.yaml and measurements.csv, or "
+        "calibrate without those on one side of it (--leave-out {images})",
     ),
     "focal_length": (
         "the focal length of {subject} changed by {size}",
         "switch off autofocus and zoom; make the images after it a view of their own, with a "
-        "camera file of their own",
+        "camera file of their own, or calibrate without those on one side of it "
+        "(--leave-out {images})",
     ),
     "lag": (
         "readings are ahead of the platform by {size} of the last move",
@@ -128,6 +164,20 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "readings of {subject} are {size} too large",
         "check the pitch or gear ratio of that motor, and its counts per turn",
     ),
+    "pitch": (
+        "readings of {subject} are {size} larger than all other measurements say together",
+        "measure stated lengths and boards again, and check pitch or gear ratio and counts per "
+        "turn",
+    ),
+    "eccentricity": (
+        "readings of {subject} are wrong by up to {size} once a turn",
+        "look for an eccentric or tilted disc of that encoder",
+    ),
+    "reading_noise": (
+        "readings of {subject} scatter by {size}, as commands in place of readings would",
+        "write down what encoders read when the platform stands still; if that was done, look for "
+        "play and for a camera that vibrates, or state their scatter as encoder_sigma",
+    ),
 }
 
 
@@ -139,7 +189,7 @@ class _Hypothesis:
     subject: str
     unit: str
     columns: Mapping[str, Array]  # (n, q, d) of factors by name
-    block: Mapping[str, IntArray]  # (n,) block of images of each residual; -1: none
+    share: Mapping[str, Array]  # (n, n_blocks) of blocks of images in each residual
     changes: bool  # from some image on; else in all images
 
 
@@ -148,7 +198,8 @@ class _Test(NamedTuple):
 
     hypothesis: int
     holds: BoolArray  # (n_blocks,)
-    at: tuple[int, int] | None  # the blocks before and after a change
+    between: tuple[str, str] | None  # the images, or views, before and after a change
+    has_levels: bool  # all numbers but the first are levels that may be anything
 
 
 @dataclass(frozen=True)
@@ -161,10 +212,13 @@ class SessionTests:
         The numbers that the fit lacks, the most certain first.
     least_slips : dict
         The least changes of encoders that would show half of the time, by motor [m or rad].
+    periods : dict
+        The outlines of the fit (n,) in each quarter of the images in order, by its images.
     """
 
     findings: tuple[Finding, ...] = ()
     least_slips: Mapping[str, float] = field(default_factory=dict)
+    periods: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
 def session_tests(
@@ -182,60 +236,126 @@ def session_tests(
         Rows in the order of their images, as of
         :func:`legcal.data.image_order.image_sequences`.
     """
-    if not len(posterior.problem.outlines) or not len(sequences):
+    if not len(posterior.problem.outlines):
         return SessionTests()
     posterior = replace(posterior, problem=_with_rejected(posterior))
     problem, state = posterior.problem, posterior.state
-    course = _Course.of(posterior, measurements, sequences)
+    has_order = len(sequences) > 0
+    course = _Course.of(
+        posterior, measurements, sequences if has_order else [np.arange(measurements.n_rows)]
+    )
     linear = linearize(problem, state)
     normal = normal_equations(problem, state, linear)
     hypotheses = [*_of_motors(problem, course), *_of_views(problem, state, linear, course)]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
     tests = [
-        _Test(i, holds, at)
+        _Test(i, holds, between, hypothesis.kind == "drift")
         for i, hypothesis in enumerate(hypotheses)
-        for holds, at in (
-            course.changes(_blocks_of(hypothesis, course.n_blocks))
-            if hypothesis.changes
-            else course.always
+        if has_order or hypothesis.kind in _WITHOUT_ORDER
+        for holds, between in (
+            course.changes(_blocks_of(hypothesis)) if hypothesis.changes else course.always
         )
     ]
-    if not tests:
+    if not hypotheses:
         return SessionTests()
-    scores = _Scores.of(problem, linear, normal, hypotheses, course.n_blocks)
-    least = math.sqrt(chdtri(1.0, SIGNIFICANCE / len(tests)))
-    slips = dict[str, list[float]]()
-    for test in tests:
-        if hypotheses[test.hypothesis].kind == "encoder":
-            sigma = math.sqrt(scores.estimate(test)[1][0, 0])
-            slips.setdefault(hypotheses[test.hypothesis].subject, []).append(least * sigma)
-    findings = list[Finding]()
-    while len(findings) < MAX_FINDINGS:
-        values = [scores.value(test) for test in tests]
-        best = min(range(len(tests)), key=lambda i: (values[i][0], -values[i][1]))
-        p_value = values[best][0] * len(tests)
-        if p_value > SIGNIFICANCE:
-            break
-        test = tests[best]
+    scores = _Scores.of(problem, linear, normal, hypotheses)
+    least = math.sqrt(chdtri(1.0, SIGNIFICANCE / max(len(tests), 1)))
+    slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
+    for test, number in zip(tests, solved, strict=True):
         hypothesis = hypotheses[test.hypothesis]
-        amount, covariance = scores.estimate(test)
-        steps = _effect(problem, linear, normal, hypothesis, test.holds, amount)
+        if hypothesis.kind == "encoder":
+            sigma = math.sqrt(number.covariance[0, 0])
+            slips.setdefault(hypothesis.subject, []).append(least * sigma)
+    lacking, left = _forward_selection(scores, tests, solved, len(tests))
+    noise = _reading_noise(hypotheses, left)
+    if noise is not None:
+        scores, tests_left = scores.with_noise(noise), [test for test, _ in lacking]
+        lacking, _ = _forward_selection(
+            scores, tests_left, [scores.solved(test) for test in tests_left], len(tests)
+        )
+    findings = [
+        Finding(
+            hypotheses[test.hypothesis].kind,
+            hypotheses[test.hypothesis].subject,
+            *_size(hypotheses[test.hypothesis], number),
+            test.between,
+            number.p_value * len(tests),
+            _effect(
+                problem,
+                linear,
+                normal,
+                hypotheses[test.hypothesis],
+                test.holds.astype(np.float64)[:, None],
+                number.amount[:, None],
+            ),
+            _side(measurements, course, hypotheses[test.hypothesis], test),
+        )
+        for test, number in lacking
+    ]
+    if noise is not None:
+        steps = [
+            _effect(
+                problem,
+                linear,
+                normal,
+                hypotheses[i],
+                np.diag(noise.further * sigma),
+                np.ones((1, len(sigma))),
+            )
+            for i, sigma in zip(noise.group, noise.sigma, strict=True)
+        ]
         findings.append(
             Finding(
-                hypothesis.kind,
-                hypothesis.subject,
-                *_size(hypothesis, amount, covariance),
-                None if test.at is None else course.images(*test.at),
-                p_value,
-                steps,
+                "reading_noise",
+                noise.subject,
+                hypotheses[noise.group[0]].unit,
+                noise.ratio * noise.stated,
+                noise.sigma_of_ratio * noise.stated,
+                None,
+                noise.p_value,
+                np.hstack(steps),
+                stated=noise.stated,
             )
         )
-        scores = scores.given(test)
-        tests = [t for t in tests if t.hypothesis != test.hypothesis]
-        if not tests:
-            break
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
-    return SessionTests(tuple(findings), least_slips)
+    periods = course.periods(problem.outlines) if has_order else {}
+    return SessionTests(tuple(findings), least_slips, periods)
+
+
+def _forward_selection(
+    scores: _Scores, tests: Sequence[_Test], solved: Sequence[_Solved], n_tests: int
+) -> tuple[list[tuple[_Test, _Solved]], _Scores]:
+    """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
+    lacking = list[tuple[_Test, _Solved]]()
+    while tests and len(lacking) < MAX_FINDINGS:
+        best = min(range(len(tests)), key=lambda i: (solved[i].p_value, -solved[i].square))
+        if solved[best].p_value * n_tests > SIGNIFICANCE:
+            break
+        lacking.append((tests[best], solved[best]))
+        scores = scores.given(solved[best])
+        tests = [test for test in tests if test.hypothesis != tests[best].hypothesis]
+        solved = [scores.solved(test) for test in tests]
+    return lacking, scores
+
+
+def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
+    """Return the images before a change of an encoder; beside that of a camera, the fewer ones."""
+    if test.between is None:
+        return ""
+    names = [view.name for view in measurements.views]
+    is_of_camera = hypothesis.kind != "encoder"
+    sides = []
+    for is_after in (False, True):
+        parts = []
+        for rows in course.rows_in_order:
+            on_side = test.holds[course.block[rows]] == is_after
+            if is_of_camera:
+                on_side &= measurements.view[rows] == names.index(hypothesis.subject)
+            parts.append(rows[on_side])
+        sides.append([rows for rows in parts if len(rows)])
+    if is_of_camera:
+        sides.sort(key=lambda side: sum(map(len, side)))
+    return images_in_words(measurements, sides[0])
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:
@@ -249,15 +369,19 @@ def _with_rejected(posterior: Posterior) -> FitProblem:
     return problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
 
 
-def _size(hypothesis: _Hypothesis, amount: Array, covariance: Array) -> tuple[str, float, float]:
+def _size(hypothesis: _Hypothesis, number: _Solved) -> tuple[str, float, float]:
     """Return the unit, the amount and its standard deviation.
 
     Of a camera, which moves by a rotation vector and a displacement: those of the surer one.
     """
+    amount, covariance = number.amount, number.covariance
+    parts = {"rad": slice(0, 3), "m": slice(3, 6)}
     if hypothesis.kind != "camera":
-        return hypothesis.unit, float(amount[0]), float(np.sqrt(covariance[0, 0]))
+        if len(amount) == 1 or hypothesis.kind == "drift":
+            return hypothesis.unit, float(amount[0]), float(np.sqrt(covariance[0, 0]))
+        parts = {hypothesis.unit: slice(None)}
     sizes = []
-    for unit, part in (("rad", slice(0, 3)), ("m", slice(3, 6))):
+    for unit, part in parts.items():
         size = float(np.linalg.norm(amount[part]))
         along = amount[part] / max(size, 1e-300)
         sizes.append((unit, size, float(np.sqrt(along @ covariance[part, part] @ along))))
@@ -271,6 +395,7 @@ class _Course:
     block: IntArray  # (n_rows,) block of each row; -1: not in any order
     first: tuple[str, ...]  # first image of each block
     last: tuple[str, ...]
+    names: tuple[str, ...]  # the view of each sequence, where it is of one
     sequences: tuple[IntArray, ...]  # blocks in order
     rows_in_order: tuple[IntArray, ...]  # the same by rows
     size: IntArray  # (n_blocks,) images
@@ -317,6 +442,7 @@ class _Course:
             block,
             tuple(first),
             tuple(last),
+            tuple(views[measurements.view[rows[0]]] for rows in sequences),
             tuple(ordered),
             tuple(sequences),
             np.array(size, dtype=np.intp),
@@ -335,29 +461,43 @@ class _Course:
         """The blocks of something that holds in all images."""
         return [(np.ones(self.n_blocks, dtype=np.bool_), None)]
 
-    def images(self, before: int, after: int) -> tuple[str, str]:
-        """Return the last image of one block and the first one of another."""
-        return self.last[before], self.first[after]
+    def changes(self, among: BoolArray) -> Iterator[tuple[BoolArray, tuple[str, str]]]:
+        """Yield the blocks after each possible change, among some blocks, and what is beside it.
 
-    def changes(self, among: BoolArray) -> Iterator[tuple[BoolArray, tuple[int, int]]]:
-        """Yield the blocks after each possible change, among some blocks, and both beside it."""
+        Where only the images of each view have an order, it may be between views.
+        """
         inside = [blocks[among[blocks]] for blocks in self.sequences]
-        for i, blocks in enumerate(inside):
-            others = [other for j, other in enumerate(inside) if j != i and len(other)]
-            are_many = len(others) > _MAX_OTHER_VIEWS
-            sides: list[tuple[bool, ...]] = [(False,) if are_many else (False, True)] * len(others)
+        whole = [i for i, blocks in enumerate(inside) if len(blocks)]
+        for i in whole:
+            blocks, others = inside[i], [j for j in whole if j != i]
             for cut in range(1, len(blocks)):
-                n_before, n_after = (
-                    int(self.size[part].sum()) for part in (blocks[:cut], blocks[cut:])
-                )
-                if min(n_before, n_after) < MIN_IMAGES:
+                sides = blocks[:cut], blocks[cut:]
+                if min(int(self.size[side].sum()) for side in sides) < MIN_IMAGES:
                     continue
-                for are_after in product(*sides):
-                    holds = np.zeros(self.n_blocks, dtype=np.bool_)
-                    holds[blocks[cut:]] = True
-                    for other, is_after in zip(others, are_after, strict=True):
-                        holds[other] = is_after
-                    yield holds, (int(blocks[cut - 1]), int(blocks[cut]))
+                for after in _subsets(others, [()]):
+                    holds = self._blocks([sides[1], *(inside[j] for j in after)])
+                    yield holds, (self.last[blocks[cut - 1]], self.first[blocks[cut]])
+        for after in _subsets(whole[1:], [(j,) for j in whole[1:]]):
+            if after:
+                views = [[self.names[j] for j in whole if j not in after]]
+                views.append([self.names[j] for j in after])
+                names = [few_views(part) for part in views]
+                yield self._blocks([inside[j] for j in after]), (names[0], names[1])
+
+    def _blocks(self, parts: Sequence[IntArray]) -> BoolArray:
+        holds = np.zeros(self.n_blocks, dtype=np.bool_)
+        holds[np.concatenate(parts)] = True
+        return holds
+
+    def periods(self, outlines: ObservedOutlines) -> dict[str, BoolArray]:
+        """Return masks of the outlines in the quarters of each sequence, by their images."""
+        share, quarters = self.of_images(outlines.view, outlines.pose), dict[str, BoolArray]()
+        for sequence in self.sequences:
+            for blocks in np.array_split(sequence, 4):
+                if len(blocks):
+                    name = f"images {self.first[blocks[0]]} to {self.last[blocks[-1]]}"
+                    quarters[name] = np.asarray(share[:, blocks].any(axis=1))
+        return quarters
 
     def drift(self, row: IntArray) -> Array:
         """Return the time of rows from 0 to 1 over their sequence, and levels of other sequences.
@@ -374,27 +514,42 @@ class _Course:
                 columns[at >= 0.0, i] = 1.0
         return columns
 
-    def of_poses(self, pose: IntArray) -> IntArray:
-        """Return the blocks of poses of the fit."""
-        row = self.row_of_pose[pose]
-        return np.where(row >= 0, self.block[row], -1)
+    def of_poses(self, pose: IntArray) -> Array:
+        """Return the share of each block in poses of the fit, (n, n_blocks): one or none."""
+        return self._of_rows(self.row_of_pose[pose])
 
-    def of_images(self, view: IntArray, pose: IntArray) -> IntArray:
-        """Return the blocks of images of the fit."""
-        rows = [
-            self.rows.get(image, -1) for image in zip(view.tolist(), pose.tolist(), strict=True)
-        ]
-        row = np.array(rows, dtype=np.intp)
-        return np.where(row >= 0, self.block[row], -1)
+    def of_images(self, view: IntArray, pose: IntArray) -> Array:
+        """Return the share of each block in images of the fit, (n, n_blocks).
+
+        Pose -1 stands for all images of the view, in equal parts.
+        """
+        images = zip(view.tolist(), pose.tolist(), strict=True)
+        share = self._of_rows(np.array([self.rows.get(i, -1) for i in images], dtype=np.intp))
+        for v in np.unique(view[pose < 0]).tolist():
+            rows = np.array([row for (of, _), row in self.rows.items() if of == v], dtype=np.intp)
+            share[(view == v) & (pose < 0)] = self._of_rows(rows).mean(axis=0)
+        return share
+
+    def _of_rows(self, row: IntArray) -> Array:
+        block = np.where(row >= 0, self.block[row], -1)
+        return np.equal(block[:, None], np.arange(self.n_blocks)).astype(np.float64)
 
 
-def _blocks_of(hypothesis: _Hypothesis, n_blocks: int) -> BoolArray:
+def _blocks_of(hypothesis: _Hypothesis) -> BoolArray:
     """Return the blocks in which a hypothesis can be told from others, (n_blocks,)."""
-    seen = np.zeros(n_blocks, dtype=np.bool_)
-    for name, block in hypothesis.block.items():
-        has_effect = np.any(hypothesis.columns[name] != 0.0, axis=(1, 2)) & (block >= 0)
-        seen[block[has_effect]] = True
-    return seen
+    seen = [
+        np.any(share[np.any(hypothesis.columns[name] != 0.0, axis=(1, 2))] > 0.0, axis=0)
+        for name, share in hypothesis.share.items()
+    ]
+    return np.asarray(np.any(seen, axis=0))
+
+
+def _subsets(sequences: Sequence[int], few: Sequence[tuple[int, ...]]) -> Sequence[tuple[int, ...]]:
+    """Return all subsets of other sequences, or *few* where there are many sequences."""
+    if len(sequences) > _MAX_OTHER_VIEWS:
+        return few
+    sizes = range(len(sequences) + 1)
+    return list(chain.from_iterable(combinations(sequences, n) for n in sizes))
 
 
 class _Encoders(NamedTuple):
@@ -404,7 +559,7 @@ class _Encoders(NamedTuple):
     leg: IntArray  # (n,) index of the leg
     reading: Array  # (n,) [m or rad]
     by_reading: Array  # (n,) derivative of the whitened residual
-    block: IntArray  # (n,)
+    share: Array  # (n, n_blocks)
     row: IntArray  # (n,) first row of the pose, -1 without any
 
 
@@ -444,16 +599,26 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
                 ("gain", "1", e.reading[:, None]),
                 ("backlash", unit, 0.5 * np.sign(last_move)[:, None]),
             ]
+            turned = math.tau if leg.reads_angle else math.inf
+            if np.ptp(e.reading[e.leg == j]) > _GOOD_PART * turned:
+                once_a_turn = np.column_stack([np.cos(e.reading), np.sin(e.reading)])
+                numbers.append(("eccentricity", unit, once_a_turn))
             for kind, of_unit, by in numbers:
                 wrong = (e.by_reading * (e.leg == j))[:, None, None] * by[:, None]
-                of_factor, block = {e.factor: wrong}, {e.factor: e.block}
+                of_factor, share = {e.factor: wrong}, {e.factor: e.share}
                 label, changes = leg.motor_label, kind == "encoder"
-                yield _Hypothesis(kind, label, of_unit, of_factor, block, changes)
-    columns = {
-        e.factor: (e.by_reading * last_move)[:, None, None]
-        for e, last_move in zip(encoders, moves, strict=True)
-    }
-    yield _Hypothesis("lag", "", "1", columns, {e.factor: e.block for e in encoders}, False)
+                yield _Hypothesis(kind, label, of_unit, of_factor, share, changes)
+    shares = {e.factor: e.share for e in encoders}
+    of_all: list[tuple[Kind, str, list[Array]]] = [
+        ("lag", "", moves),
+        ("pitch", ALL_MOTORS, [e.reading for e in encoders]),
+    ]
+    for kind, label, wrong_by in of_all:
+        columns = {
+            e.factor: (e.by_reading * by)[:, None, None]
+            for e, by in zip(encoders, wrong_by, strict=True)
+        }
+        yield _Hypothesis(kind, label, "1", columns, shares, False)
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
@@ -472,28 +637,30 @@ def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Arr
 def _of_views(
     problem: FitProblem, state: State, linear: Linearization, course: _Course
 ) -> Iterator[_Hypothesis]:
-    """Yield what may have changed about the camera of each view; boards would say more."""
-    if any(map(len, problem.boards)):
-        return
-    o = problem.outlines
-    block = course.of_images(o.view, o.pose)
-    by_focal = np.sum(
-        o.by_intrinsics(("fx", "fy"), problem.keys, state)
-        * np.array([[c.K[0, 0], c.K[1, 1]] for c in state.cameras])[o.view][:, None],
-        axis=2,
-    )
-    by_focal = np.einsum("nij,nj->ni", np.asarray(problem.factor("outlines").whitening), by_focal)
-    for v, name in enumerate(o.views):
-        own = (o.view == v)[:, None]
+    """Yield what may have changed about the camera of each view.
+
+    Corners of a board on the base are means over the images of a view, changed by the share of
+    those after a change.
+    """
+    boards = {corners.name: corners for corners in problem.boards if len(corners)}
+    shares = {
+        name: course.of_images(table.view, table.pose)
+        for name, table in ({"outlines": problem.outlines} | boards).items()
+    }
+    residuals = CameraResiduals(problem, state, linear)
+    for v, view in enumerate(problem.outlines.views):
+        if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
+            continue
         moved = []
         for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
-            error = np.zeros((len(o.views), 6))
+            error = np.zeros((len(problem.outlines.views), 6))
             error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
-            moved.append(residual_changes(problem, linear, "camera_pose", error)["outlines"])
-        blocks = {"outlines": block}
-        yield _Hypothesis("camera", name, "", {"outlines": np.stack(moved, axis=-1)}, blocks, True)
-        focal = np.where(own, -by_focal, 0.0)[..., None]
-        yield _Hypothesis("focal_length", name, "1", {"outlines": focal}, blocks, True)
+            moved.append(residual_changes(problem, linear, "camera_pose", error))
+        camera = {name: np.stack([change[name] for change in moved], axis=-1) for name in shares}
+        yield _Hypothesis("camera", view, "", camera, shares, True)
+        zoom = residuals.zoomed(v)
+        focal = {name: -zoom[name][..., None] for name in shares}
+        yield _Hypothesis("focal_length", view, "1", focal, shares, True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -512,14 +679,13 @@ class _Scores:
         linear: Linearization,
         normal: NormalEquations,
         hypotheses: Sequence[_Hypothesis],
-        n_blocks: int,
     ) -> _Scores:
         """Compute the scores."""
         columns, c = list[IntArray](), 0
         for hypothesis in hypotheses:
             d = next(iter(hypothesis.columns.values())).shape[-1]
-            seen = _blocks_of(hypothesis, n_blocks)
-            column = np.full((d, n_blocks), -1, dtype=np.intp)
+            seen = _blocks_of(hypothesis)
+            column = np.full((d, len(seen)), -1, dtype=np.intp)
             column[:, seen] = c + np.arange(d * int(seen.sum())).reshape(d, -1)
             c += d * int(seen.sum())
             columns.append(column)
@@ -528,38 +694,42 @@ class _Scores:
             for name, values in hypothesis.columns.items():
                 n, q, d = values.shape
                 of_factor = stacked.setdefault(name, np.zeros((n, q, c)))
-                block = hypothesis.block[name]
                 for k in range(d):
-                    rows = np.flatnonzero((block >= 0) & (column[k][block] >= 0))
-                    of_factor[rows, :, column[k][block[rows]]] = values[rows, :, k]
+                    blocks = np.flatnonzero(column[k] >= 0)
+                    of_factor[:, :, column[k][blocks]] = (
+                        values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
+                    )
         score, information = score_test(problem, linear, normal, stacked)
         size = sum(np.einsum("nqc,nqc->c", v, v) for v in stacked.values())
         return cls(score, information, np.asarray(size), columns)
 
-    def value(self, test: _Test) -> tuple[float, float]:
-        """Return the probability of a score by chance, and its square in units of its scatter."""
-        solved = self._solved(test)
-        if not solved.rank:
-            return 1.0, 0.0
-        square = solved.square / solved.scatter
-        return float(chdtrc(float(solved.rank), square)), square
-
-    def estimate(self, test: _Test) -> tuple[Array, Array]:
-        """Return the number and its covariance."""
-        solved = self._solved(test)
-        return solved.amount, solved.inverse * solved.scatter
-
-    def given(self, test: _Test) -> _Scores:
-        """Return the scores given that a test is true."""
-        solved = self._solved(test)
-        toward = self.information[:, solved.columns] @ solved.chosen
+    def given(self, number: _Solved) -> _Scores:
+        """Return the scores given a number that the fit lacks."""
+        toward = self.information[:, number.columns] @ number.chosen
         return replace(
             self,
-            score=self.score - toward @ solved.amount,
-            information=self.information - toward @ solved.inverse @ toward.T,
+            score=self.score - toward @ number.amount,
+            information=self.information - toward @ number.inverse @ toward.T,
         )
 
-    def _solved(self, test: _Test) -> _Solved:
+    def of_readings(self, group: Sequence[int], sigma: Sequence[Array]) -> tuple[IntArray, Array]:
+        """Return the columns (c,) of the readings of some motors, and what is given of each."""
+        columns = np.concatenate([self.column[i][0] for i in group])
+        return columns[columns >= 0], np.concatenate(sigma)[columns >= 0]
+
+    def with_noise(self, noise: _Scatter) -> _Scores:
+        """Return the scores where readings scatter as much as they were found to."""
+        columns, sigma = self.of_readings(noise.group, noise.sigma)
+        toward = self.information[:, columns]
+        precision = np.diag((noise.further * sigma) ** -2.0) + toward[columns]
+        by_noise = np.linalg.solve(precision, toward.T)
+        return replace(
+            self,
+            score=self.score - self.score[columns] @ by_noise,
+            information=self.information - toward @ by_noise,
+        )
+
+    def solved(self, test: _Test) -> _Solved:
         """Estimate the number of a test."""
         column = self.column[test.hypothesis]
         used = column >= 0
@@ -581,7 +751,10 @@ class _Scores:
         tested = variance > _UNSEEN * self.size[columns]
         ratio = left[tested] ** 2 / variance[tested]
         scatter = max(float(ratio.mean()), 1.0) if len(ratio) else 1.0
-        rank, square = int(seen.sum()), float(score @ amount)
+        rank, square = int(seen.sum()), float(score @ amount) / scatter
+        if test.has_levels:
+            variance = max(float(inverse[0, 0]) * scatter, np.finfo(np.float64).tiny)
+            rank, square = min(rank, 1), float(amount[0]) ** 2 / variance
         return _Solved(columns, chosen, amount, inverse, rank, square, scatter)
 
 
@@ -593,8 +766,95 @@ class _Solved(NamedTuple):
     amount: Array  # (d,)
     inverse: Array  # (d, d) covariance of the number, by the covariances of outlines
     rank: int  # directions of the number that the fit does not absorb
-    square: float  # of the score, in standard deviations
+    square: float  # of the score, in units of its scatter
     scatter: float  # mean square of the scores of single blocks over their variance, at least 1
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a score by chance."""
+        return float(chdtrc(float(self.rank), self.square)) if self.rank else 1.0
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the number."""
+        return self.inverse * self.scatter
+
+
+def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
+    """Return the scatter of readings beyond that stated: of a motor, or of all in a unit."""
+    encoders = [i for i, h in enumerate(hypotheses) if h.kind == "encoder"]
+    groups = {hypotheses[i].subject: [i] for i in encoders}
+    for unit in ("m", "rad"):
+        alike = [i for i in encoders if hypotheses[i].unit == unit]
+        if len(alike) > 1:
+            groups[ALL_MOTORS if len(alike) == len(encoders) else f"all motors [{unit}]"] = alike
+    tests = [
+        _Scatter.of(subject, group, hypotheses, scores, len(groups))
+        for subject, group in groups.items()
+    ]
+    best = min(tests, key=lambda test: test.p_value, default=None)
+    if best is None or best.p_value > SIGNIFICANCE or best.ratio < MOST_SCATTER:
+        return None
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class _Scatter:
+    """How much the readings of some motors scatter, by the squares of their scores.
+
+    With scores z of the errors of single readings and their covariance K under the stated scatter,
+    a further variance adds its multiple of K^2 to that of z. Blocks have the mean of their images.
+    """
+
+    subject: str
+    group: Sequence[int]  # hypotheses of the zeros of encoders
+    p_value: float  # times the number of tests
+    further: float  # standard deviation beside the stated one, over that
+    sigma_of_square: float  # of the square of that
+    sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block, by motor [m or rad]
+    stated: float  # of a reading, in the median of motors
+
+    @property
+    def ratio(self) -> float:
+        """Standard deviation of readings over the stated one."""
+        return math.hypot(1.0, self.further)
+
+    @property
+    def sigma_of_ratio(self) -> float:
+        """Standard deviation of the ratio."""
+        return 0.5 * self.sigma_of_square / self.ratio
+
+    @classmethod
+    def of(
+        cls,
+        subject: str,
+        group: Sequence[int],
+        hypotheses: Sequence[_Hypothesis],
+        scores: _Scores,
+        n_tests: int,
+    ) -> _Scatter:
+        """Test the readings of some motors."""
+        sigmas, stated = list[Array](), list[float]()
+        for i in group:
+            ((name, wrong),) = hypotheses[i].columns.items()
+            read = wrong[:, 0, 0] != 0.0
+            stated.append(1.0 / float(np.abs(wrong[read, 0, 0]).max()))
+            n = hypotheses[i].share[name][read].sum(axis=0)
+            sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
+        columns, sigma = scores.of_readings(group, sigmas)
+        z = sigma * scores.score[columns]
+        K = sigma[:, None] * scores.information[np.ix_(columns, columns)] * sigma
+        trace, of_square, squares = float(np.trace(K)), float(np.sum(K * K)), float(z @ z)
+        p_value, further, spread = 1.0, 0.0, 0.0
+        if trace > 0.0:
+            # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
+            dof = trace**2 / of_square
+            p_value = min(n_tests * float(chdtrc(dof, squares * dof / trace)), 1.0)
+            further = max(squares - trace, 0.0) / of_square
+            covariance = K + further * (K @ K)
+            spread = math.sqrt(2.0 * float(np.sum(covariance * covariance))) / of_square
+        typical = float(np.median(stated))
+        return cls(subject, group, p_value, math.sqrt(further), spread, sigmas, typical)
 
 
 def _effect(
@@ -602,13 +862,15 @@ def _effect(
     linear: Linearization,
     normal: NormalEquations,
     hypothesis: _Hypothesis,
-    holds: BoolArray,
+    holds: Array,
     amount: Array,
 ) -> Array:
-    """Return the error of the kinematic parameters (p,) by a number that the fit lacks."""
-    changes = {}
-    for name, values in hypothesis.columns.items():
-        block = hypothesis.block[name]
-        in_blocks = (block >= 0) & holds[block]
-        changes[name] = np.where(in_blocks[:, None, None], values @ amount[:, None], 0.0)
-    return kinematic_steps(problem, response(problem, linear, normal, changes))[:, 0]
+    """Return errors of the kinematic parameters (p, c) by numbers (d, c) that the fit lacks.
+
+    *holds* (n_blocks, c) has the part of each number in the blocks of images.
+    """
+    changes = {
+        name: (values @ amount) * (hypothesis.share[name] @ holds)[:, None]
+        for name, values in hypothesis.columns.items()
+    }
+    return kinematic_steps(problem, response(problem, linear, normal, changes))

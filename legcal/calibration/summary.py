@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -20,24 +20,23 @@ from legcal.calibration.documents import (
     Result,
     WorkspaceAccuracy,
 )
-from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
+from legcal.calibration.link_joints import joints_title, mark_in_words
 from legcal.calibration.plots import plot_uncertainty
+from legcal.calibration.quantities import (
+    FRAMES,
+    Quantity,
+    joints_of,
+    parameters_of,
+    turns_of,
+)
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
-from legcal.machine.parameter_id import ParameterId
-from legcal.vision.board import LINKS, Link
+from legcal.vision.board import Link
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-
-UNITS = {  # what people read a unit in: how many there are in it, its name, and digits
-    "m": (1e3, "mm", 4),
-    "rad": (float(np.degrees(1.0)), "deg", 4),
-    "px": (1.0, "px", 3),
-    "": (1.0, "", 6),
-}
 
 
 @dataclass(frozen=True)
@@ -54,66 +53,43 @@ class ParameterTable:
     @classmethod
     def of(cls, result: Result, *, joints: bool = True) -> ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
-        rows, digits = [], []
-        for row in result.parameters:
-            if not row.is_shown or (not joints and ParameterId.parse(row.name).is_joint_coordinate):
-                continue
-            scale, unit, n = UNITS[row.unit]
-            value, nominal = scale * row.value, scale * row.nominal
-            sigma = None if row.sigma is None else scale * row.sigma
-            rows.append((row.name, nominal, value, value - nominal, sigma, unit, row.status))
-            digits.append(n)
-        columns = ("parameter", "nominal", "calibrated", "change", "sigma", "unit", "status")
-        return cls(columns, tuple(rows), tuple(digits))
+        quantities = [
+            q for q in parameters_of(result) if joints or not q.parameter.is_joint_coordinate
+        ]
+        rows = ((q.name, *_numbers(q), q.unit, q.status) for q in quantities)
+        columns = ("parameter", *_CALIBRATED, "unit", "status")
+        return cls(columns, tuple(rows), tuple(q.digits for q in quantities))
 
     @classmethod
-    def of_joints(cls, result: Result, *links: Link) -> ParameterTable:
+    def of_joints(cls, result: Result, *sides: Link) -> ParameterTable:
         """Return the joint centres in the links of the model, beside R_b and R_e."""
-        rows = []
-        for side in links or LINKS:
-            block = (result.links or {}).get(side)
-            in_frame = result.base_joints if side == "base" else result.platform_joints
-            for joint, own in zip([] if block is None else block.joints, in_frame, strict=False):
-                for k, axis in enumerate("xyz"):
-                    value, nominal, sigma = joint.xyz[k], joint.nominal[k], joint.sigma[k]
-                    rows.append(
-                        (
-                            joint.leg,
-                            side,
-                            axis,
-                            "" if block is None else block.link,
-                            *(1e3 * x for x in (nominal, value, value - nominal)),
-                            None if sigma is None else 1e3 * sigma,
-                            "mm",
-                            1e3 * own[k],
-                            mark_in_words(side, joint.status[k], joint.defines),
-                        )
-                    )
+        in_frame = {
+            f"{leg}.{side}.{axis}": 1e3 * x
+            for side, joints in (("base", result.base_joints), ("platform", result.platform_joints))
+            for leg, xyz in zip(result.legs, joints, strict=True)
+            for axis, x in zip("xyz", xyz, strict=True)
+        }
+        quantities = list(joints_of(result, *sides))
+        rows = tuple(
+            (
+                *_place(q),
+                *_numbers(q),
+                q.unit,
+                in_frame[q.name],
+                mark_in_words(q.parameter.kind, q.status, q.defines),
+            )
+            for q in quantities
+        )
         columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "in_frame", "status")
-        return cls(columns, tuple(rows), (UNITS["m"][2],) * len(rows))
+        return cls(columns, rows, tuple(q.digits for q in quantities))
 
     @classmethod
     def of_axes(cls, result: Result) -> ParameterTable:
         """Return the turns of the axes of joints from the nominal ones, about x, y, z of links."""
-        _, unit, digits = UNITS["rad"]
-        rows = [
-            (
-                one.leg,
-                f"{side} axis",
-                axis,
-                block.link,
-                0.0,
-                *(np.degrees([one.turn[k], one.turn[k]]).tolist()),
-                None if one.sigma is None else float(np.degrees(one.sigma[k])),
-                unit,
-                "fixed" if one.sigma is None else "estimated",
-            )
-            for side, block in (result.links or {}).items()
-            for one in block.axes
-            for k, axis in enumerate("xyz")
-        ]
+        quantities = list(turns_of(result))
+        rows = tuple((*_place(q), *_numbers(q), q.unit, q.status) for q in quantities)
         columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "status")
-        return cls(columns, tuple(rows), (digits,) * len(rows))
+        return cls(columns, rows, tuple(q.digits for q in quantities))
 
     def without(self, *columns: str) -> ParameterTable:
         """Return the table without some columns."""
@@ -130,7 +106,15 @@ class ParameterTable:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return (self[k] for k in range(len(self)))
 
-    def __getitem__(self, row: int) -> dict[str, Any]:
+    @overload
+    def __getitem__(self, row: int) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> ParameterTable: ...
+
+    def __getitem__(self, row: int | slice) -> dict[str, Any] | ParameterTable:
+        if isinstance(row, slice):
+            return replace(self, rows=self.rows[row], digits=self.digits[row])
         return dict(zip(self.columns, self.rows[row], strict=True))
 
     def cells(self) -> list[tuple[str, ...]]:
@@ -181,6 +165,16 @@ class ParameterTable:
             for row in self.cells()
         )
         return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _numbers(q: Quantity) -> tuple[Any, ...]:
+    """Return the numbers of the columns of a quantity."""
+    return q.nominal, q.value, q.change, q.sigma
+
+
+def _place(q: Quantity) -> tuple[str, ...]:
+    """Return leg, joint or axis, coordinate and link."""
+    return q.parameter.owner, q.parameter.kind.replace("_", " "), q.parameter.component, q.frame
 
 
 _CALIBRATED = ("nominal", "calibrated", "change", "sigma")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from legcal.calibration.clicks import click_notes
-from legcal.calibration.closeness import closeness
+from legcal.calibration.closeness import closeness, commanded
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.doubts import (
     CAMERA,
@@ -15,6 +15,7 @@ from legcal.calibration.doubts import (
     doubts_of,
     model_error,
     no_improvement,
+    nominal_lengths,
     worst_first,
 )
 from legcal.calibration.four_steps import Steps
@@ -28,7 +29,9 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
-from legcal.data.image_order import image_sequences
+from legcal.data.image_choice import sequences_of
+from legcal.data.measurements import few
+from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
@@ -58,6 +61,11 @@ def judge(
     readings = solution.quality.redundant_readings
     for wrong in () if readings is None else readings.wrong:
         q[wrong.pose, np.equal(machine.reads, machine.reads[wrong.leg])] = np.nan
+    motors = np.array([leg.motor_label for leg in machine.legs], dtype=object)
+    for of, zero in zip(
+        measurements.own_zeros, solution.posterior.state.own_zeros.tolist(), strict=True
+    ):
+        q[np.ix_(of.rows[measurements.first_rows], motors == of.motor)] -= zero
     platform = platform_accuracy(
         machine,
         solution.legs,
@@ -75,8 +83,7 @@ def judge(
         if by_scale := _share_of_scale(platform):
             found += f"; {by_scale}"
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
-    taken_at = {image: facts.taken_at for image, facts in dataset.facts.items()}
-    sequences = image_sequences(measurements, taken_at)
+    sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
     doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
     displacement, rotation = model_error(doubts)
@@ -95,6 +102,8 @@ def judge(
         (
             *notes,
             *Note.about(Topic.IMAGES, click_notes(dataset, solution)),
+            *Note.about(Topic.READINGS, commanded(dataset)),
+            *Note.about(Topic.MODEL, _asked_lengths(dataset, solution, doubts)),
             *Note.about(Topic.READINGS, _untested(dataset, sequences, session, platform)),
             *closeness(dataset.folder, measurements.n_rows, platform),
         ),
@@ -102,6 +111,17 @@ def judge(
         corners,
         tuple(diagnosis),
     )
+
+
+def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]) -> list[str]:
+    """Return a note on stated lengths that are the nominal ones, where no doubt asks for them."""
+    stated = nominal_lengths(dataset, solution)
+    if not stated or any(doubt.code == "nominal_length" for doubt in doubts):
+        return []
+    return [
+        f"The stated {few(stated)} is the nominal length to all digits: measure it and state that, "
+        "or leave it out."
+    ]
 
 
 def _untested(
@@ -119,19 +139,19 @@ def _untested(
             "Changes in the course of the session could not be tested: images have neither times "
             "nor numbers in their names; add a column time to measurements.csv."
         ]
-    hidden = {
-        motor: size
-        for motor, size in session.least_slips.items()
-        if platform is not None and size > MOST_HIDDEN * platform.sigma.mean_displacement
+    leg_of = {leg.motor_label: leg for leg in dataset.machine.legs}
+    at_joint = {  # [m]
+        motor: size / leg_of[motor].reading_of(1.0) for motor, size in session.least_slips.items()
     }
-    turning = {leg.motor_label for leg in dataset.machine.legs if leg.reads_angle}
-    hidden = {motor: size for motor, size in hidden.items() if motor not in turning}
-    if not hidden:
+    motor = max(at_joint, key=at_joint.__getitem__, default="")
+    if platform is None or not motor:
         return []
-    motor = max(hidden, key=lambda name: hidden[name])
+    if at_joint[motor] <= MOST_HIDDEN * platform.sigma.mean_displacement:
+        return []
+    scale, unit = SHOWN_IN[leg_of[motor].reading_unit]
     return [
-        f"A slip of an encoder below {1e3 * hidden[motor]:.2g} mm ({motor}) would not show in "
-        "these images."
+        f"A slip of an encoder below {scale * session.least_slips[motor]:.2g} {unit} ({motor}) "
+        "would not show in these images."
     ]
 
 

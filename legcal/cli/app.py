@@ -9,7 +9,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Annotated
 
@@ -70,27 +70,18 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (
-    inspect,
-    camera,
-    identify,
-    doctor,
-    detect,
-    calibrate,
-    evaluate,
-    locate,
-    view,
-    export,
-    new,
-    init,
-    plan,
-    simulate,
-    example,
-    schema,
-):
-    app.command()(command)
-app.command("import")(import_)
-app.add_typer(study, name="study")
+PANELS: dict[str, Sequence[Callable[..., None]]] = {
+    "Your machine": (new, inspect, identify),
+    "Photographs": (camera, plan, init, import_, doctor, detect),
+    "Calibrate": (calibrate,),
+    "Results": (evaluate, locate, export, view),
+    "No machine yet": (example, simulate),
+    "For programs": (schema,),
+}
+for panel, commands in PANELS.items():
+    for command in commands:
+        app.command(command.__name__.rstrip("_"), rich_help_panel=panel)(command)
+app.add_typer(study, name="study", rich_help_panel="For programs")
 
 
 def _refuse_empty(words: Sequence[str]) -> None:

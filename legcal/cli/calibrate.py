@@ -70,8 +70,8 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="JOINT:JOINT=VALUE+-SIGMA",
-            help="A measured distance of two joints: leg1.base:leg3.base=400+-0.05mm, or of both "
-            "ends of a rod. Rotary motors do not determine the scale; one distance does.",
+            help="A measured distance of two joints: leg1.base:leg3.base=MEASURED+-0.05mm, or of "
+            "both ends of a rod. Rotary motors do not determine the scale; one distance does.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -81,6 +81,25 @@ def calibrate(
             metavar="FRACTION",
             help="Hold out this fraction of the images (0.2: a fifth), and compare them with the "
             "prediction of the fit to the others.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = None,
+    leave_out: Annotated[
+        str,
+        typer.Option(
+            "--leave-out",
+            metavar="IMAGES",
+            help="Leave images out of the fit: p22, p22..p45 in the order in which they were "
+            "taken, c2 for a view, c2:p22 for one of its images; separated by commas.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = "",
+    split: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="MOTOR@IMAGES",
+            help="The encoder of MOTOR had another zero in these images (leg4@p01..p21), as before "
+            "a slip; the model has that of the others. May be repeated.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -127,6 +146,8 @@ def calibrate(
             "--set": settings or None,
             "--length": length,
             "--holdout": holdout,
+            "--leave-out": leave_out or None,
+            "--split": split,
             "--fresh": fresh or None,
             "--criteria": None if criteria == "default" else criteria,
             "--overlays": overlays or None,
@@ -163,6 +184,8 @@ def calibrate(
         "criteria": criteria,
         "use_cache": not fresh,
         "holdout": holdout,
+        "leave_out": leave_out,
+        "split": split or (),
         "overlays": overlays,
     }
     arguments |= overrides_of_settings(settings or ())
@@ -241,8 +264,8 @@ def _lengths(stated: Sequence[str]) -> list[str]:
         if ":" not in text.partition("=")[0]:
             raise UsageError(
                 f"The length {describe(text)} could not be used: found no two joints, needed two "
-                "with a colon between them; write leg1.base:leg3.base=400+-0.05mm, or both ends "
-                "of a rod, leg1.base:leg1.platform."
+                "with a colon between them; write leg1.base:leg3.base=MEASURED+-0.05mm, or both "
+                "ends of a rod, leg1.base:leg1.platform."
             )
     return list(stated)
 

@@ -264,6 +264,20 @@ def inspect(
             metavar="FILE.svg", help="Draw the machine at home, its joints numbered, as SVG."
         ),
     ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="The base of a URDF or MJCF file that leaves it open."),
+    ] = None,
+    platform: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="Its platform; one of several mechanisms."),
+    ] = None,
+    leg_radius: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM", min=1e-3, help="Radius of the legs that it draws without a cylinder [mm]."
+        ),
+    ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
     from legcal.machine.inspection import machine_document
@@ -279,7 +293,8 @@ def inspect(
                 "give the name of an SVG file."
             )
         MACHINE_PICTURE.check_place(picture)
-    machine = load_mechanism(model)
+    radius = None if leg_radius is None else 1e-3 * leg_radius
+    machine = load_mechanism(model, base=base, platform=platform, leg_radius=radius)
     description = machine_document(machine)
     if picture is not None:
         MACHINE_PICTURE.write(picture, draw_machine(machine))

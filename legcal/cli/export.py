@@ -23,7 +23,8 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="table, csv, json, urdf, mjcf, linuxcnc, python, c, matlab, ros or correction.",
+            help="table, csv, json, urdf, mjcf, linuxcnc, klipper, reprapfirmware, marlin, flypt, "
+            "python, c, matlab, ros or correction.",
         ),
     ],
     output: Annotated[

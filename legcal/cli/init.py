@@ -59,6 +59,9 @@ def init(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Do not show which reading each image gets.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
@@ -69,7 +72,7 @@ def init(
         cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
     )
     dataset = plan_new_dataset(folder, readings, model, output, options)
-    if not as_json:
+    if not as_json and not quiet:
         print_table(matching_table(dataset))
     written = write_new_dataset(dataset, force=force)
     if as_json:

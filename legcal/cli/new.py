@@ -17,7 +17,9 @@ def new(
     table: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[TABLE]", help="A YAML or CSV table of the legs.", show_default=False
+            metavar="[FILE]",
+            help="A YAML or CSV table of the legs, or the configuration of a firmware.",
+            show_default=False,
         ),
     ] = None,
     output: Annotated[
@@ -34,7 +36,7 @@ def new(
     as_json: JsonOption = False,
     **options: Any,
 ) -> None:
-    """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
+    """Write a model, YAML and URDF, from a table of joints, a firmware or a few dimensions."""
     from rich.text import Text
 
     from legcal.machine.family import description_of

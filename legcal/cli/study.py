@@ -58,7 +58,7 @@ def paper(
     from legcal.simulation.study import StudyResult, run_study
 
     def make_page(study_result: StudyResult, folder: Path) -> None:
-        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.html enlarges it."
+        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.svg enlarges it."
         title, figures = "The paper's simulation", {caption: folder / "fig4.png"}
         write_page(folder / REPORT, title, study_table(study_result.document()), figures=figures)
 

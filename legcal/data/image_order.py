@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from datetime import datetime
+from datetime import date, datetime, time
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -13,7 +13,7 @@ from legcal.data.measurements import Measurements, row_names
 from legcal.geometry.types import Array, IntArray
 
 _NUMBER = re.compile(r"\d+")
-_EXIF_TIME = "%Y:%m:%d %H:%M:%S"
+_EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
 
 
 def image_sequences(
@@ -44,13 +44,25 @@ def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | N
         return measurements.time
     times = np.full(measurements.n_rows, np.nan)
     for row, image in enumerate(measurements.image):
-        try:
-            moment = datetime.strptime(taken_at.get(image, ""), _EXIF_TIME)
-        except ValueError:
+        moment = moment_of(taken_at.get(image, ""))
+        if moment is None:
             return None
         times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
     n_moments = len(np.unique(times))
     return times if 2 * n_moments > measurements.n_poses else None
+
+
+def moment_of(text: str, day: date | None = None) -> datetime | None:
+    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
+    text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=None)
+    except ValueError:
+        pass
+    try:
+        return None if day is None else datetime.combine(day, time.fromisoformat(text))
+    except ValueError:
+        return None
 
 
 def _numbers(names: Sequence[str]) -> IntArray | None:

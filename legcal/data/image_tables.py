@@ -165,6 +165,7 @@ def measurements_at(measurements: Measurements, rows: IntArray) -> Measurements:
         q=measurements.q[rows],
         time=None if measurements.time is None else measurements.time[rows],
         pose_labels=tuple(labels[p] for p in poses[appearance].tolist()) if labels else (),
+        own_zeros=tuple(replace(one, rows=one.rows[rows]) for one in measurements.own_zeros),
     )
 
 

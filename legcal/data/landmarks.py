@@ -168,7 +168,10 @@ def place_by_landmarks(
         notes += clicked_camera.notes
         if clicked_camera.T_base_camera is not None and not clicked_camera.problems:
             views[v] = replace(
-                views[v], T_base_camera=clicked_camera.T_base_camera, by_landmarks=True
+                views[v],
+                T_base_camera=clicked_camera.T_base_camera,
+                by_landmarks=True,
+                is_placed=clicked_camera.is_sure,
             )
     if problems and not may_be_wrong:
         raise DatasetError(problems)
@@ -183,6 +186,12 @@ class ClickedCamera:
     T_base_camera: RigidTransform | None
     problems: list[str]  # wrong or missing clicks
     notes: list[str]  # ambiguity or uncertainty of the pose
+    n_agreeing: int  # clicks that agree with the pose
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether so many clicks agree on one camera that images need not find it again."""
+        return not (self.problems or self.notes) and self.n_agreeing >= GOOD_NUMBER
 
 
 def cameras_by_landmarks(
@@ -196,7 +205,8 @@ def cameras_by_landmarks(
         clicks = _Clicks(path, machine, measurements, v, view_clicks, joints, has_place)
         pose, problems, notes = clicks.camera()
         T = None if pose is None else pose.T_camera_base.inv()
-        cameras[v] = ClickedCamera(T, problems, notes)
+        n_agreeing = 0 if pose is None else len(pose.off_px) - len(problems)
+        cameras[v] = ClickedCamera(T, problems, notes, n_agreeing)
     return cameras
 
 

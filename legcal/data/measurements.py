@@ -62,10 +62,20 @@ class View:
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
     hand_held: bool = False  # one image of a hand-held camera, which only the board can place
     by_landmarks: bool = False  # whether the rough pose comes from clicks on joints
+    is_placed: bool = False  # whether enough clicks agree that it is the camera, and not a start
 
     def uses(self, leg: str) -> bool:
         """Return whether a leg, by its name, is used in this view."""
         return self.legs is None or leg in self.legs
+
+
+@dataclass(frozen=True, eq=False)
+class OwnZero:
+    """Images in which the encoder of a motor has a zero of its own."""
+
+    motor: str  # its label
+    rows: BoolArray  # (n_rows,)
+    images: str  # as they were named
 
 
 @brief
@@ -87,6 +97,7 @@ class Measurements:
     pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     time: Array | None = None  # (n_rows,) when images were taken [s], NaN where unknown
+    own_zeros: tuple[OwnZero, ...] = ()
 
     @property
     def n_rows(self) -> int:

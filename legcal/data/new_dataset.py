@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import ENCODER_SIGMAS
 from legcal.data.measurements import few, few_views, reading_columns
 from legcal.data.photograph_matching import (
@@ -205,6 +206,24 @@ class SheetOptions:
     unit: str | None = None
     lengths: bool = False
     encoder_sigma: float | str | Mapping[str, float] | None = None
+
+
+def init(
+    folder: str | Path,
+    readings: str | Path,
+    model: str | Path,
+    output: str | Path,
+    *,
+    options: SheetOptions = SheetOptions(),
+    force: bool = False,
+) -> Dataset:
+    """Make a dataset from a folder of photographs and a table of readings, and load it.
+
+    Arguments and exceptions as in :func:`plan_new_dataset` and :func:`write_new_dataset`; *output*
+    is the folder of the dataset.
+    """
+    write_new_dataset(plan_new_dataset(folder, readings, model, output, options), force=force)
+    return load_dataset(output)
 
 
 def plan_new_dataset(

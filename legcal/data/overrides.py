@@ -39,9 +39,9 @@ def overrides_of_call(
     if isinstance(priors, Mapping):
         entries += [("prior", str(name), value) for name, value in priors.items()]
     else:
-        entries += [("prior", text, None) for text in _listed(priors)]
-    entries += [("fixed", text, None) for text in _listed(fixed)]
-    entries += [("free", text, None) for text in _listed(free)]
+        entries += [("prior", text, None) for text in listed(priors)]
+    entries += [("fixed", text, None) for text in listed(fixed)]
+    entries += [("free", text, None) for text in listed(free)]
     overrides: list[Override] = []
     problems: list[str] = []
     for action, text, value in entries:
@@ -91,6 +91,6 @@ def read_override(
     return Override(name, action, where, stated, in_file)
 
 
-def _listed(texts: Iterable[str]) -> list[str]:
+def listed(texts: Iterable[str]) -> list[str]:
     """Return texts as a list; a single text counts as one element."""
     return [texts] if isinstance(texts, str) else [str(text) for text in texts]

@@ -12,10 +12,11 @@ import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from datetime import date, datetime, time, timedelta
+from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
+from legcal.data.image_order import moment_of
 from legcal.data.measurements import few
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
@@ -28,7 +29,6 @@ MAX_PHOTOGRAPHS = 50_000
 MAX_VIEWS = 12  # maximum number of views guessed from names of photographs
 _SEPARATORS = " _-."
 _NUMBERS = re.compile(r"(\d+)", re.ASCII)
-_EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
 
 
 @dataclass(frozen=True)
@@ -439,21 +439,8 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
 def photograph_time(photograph: Photograph) -> datetime | None:
     """Return the time of a photograph in its metadata, None if there is none."""
     try:
-        return _moment(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
+        return moment_of(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
     except OSError:
-        return None
-
-
-def _moment(text: str, day: date | None = None) -> datetime | None:
-    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
-    text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
-    try:
-        return datetime.fromisoformat(text).replace(tzinfo=None)
-    except ValueError:
-        pass
-    try:
-        return None if day is None else datetime.combine(day, time.fromisoformat(text))
-    except ValueError:
         return None
 
 
@@ -472,7 +459,7 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             "column time to match rows and photographs in order."
         )
     day = taken[dated[0].name].date()
-    times = [_moment(row.time, day) for row in rows]
+    times = [moment_of(row.time, day) for row in rows]
     bad = [
         f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
         "one such as 2026-11-23 10:15:00; correct the cell."

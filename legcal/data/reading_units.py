@@ -11,13 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import GetJsonSchemaHandler, model_validator
+from pydantic import GetJsonSchemaHandler, StringConstraints, TypeAdapter, model_validator
 
 from legcal.errors import DatasetError, UsageError
-from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN, split_quantity
+from legcal.files.quantity import ANGLE, COUNTS, LENGTH, SHOWN_IN, split_quantity, unit_size
 from legcal.files.schema import FileSchema, Number, closest, describe
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Pulses
@@ -27,7 +27,10 @@ PULSES = "us"
 SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
-ReadingUnitName = Literal["m", "cm", "mm", "um", "rad", "mrad", "deg", "us"]
+ReadingUnitName = (
+    Literal["m", "cm", "mm", "um", "in", "ft", "rad", "mrad", "deg", "rev", "us"]
+    | Annotated[str, StringConstraints(pattern=f"^{COUNTS}$")]
+)
 _WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
 
 
@@ -62,6 +65,11 @@ def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
     return list(first_legs.values())
 
 
+def is_length(name: str) -> bool:
+    """Return whether a unit is one of length."""
+    return unit_size(name, LENGTH) is not None
+
+
 def default_unit(leg: Leg) -> ReadingUnit:
     """Return the unit of readings of a leg where none is stated."""
     return ReadingUnit(leg.reading_unit)
@@ -83,8 +91,8 @@ def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit
     """
     motor = leg.prismatic
     of_kind = ANGLE if leg.reads_angle else LENGTH
-    if name in of_kind:
-        return ReadingUnit(name, of_kind[name])
+    if size := unit_size(name, of_kind):
+        return ReadingUnit(name, size)
     if name != PULSES or not leg.reads_angle:
         does = "turns" if leg.reads_angle else "slides"
         unit_names = [*of_kind, PULSES] if leg.reads_angle else [*of_kind]
@@ -114,7 +122,8 @@ class ReadingsEntry(FileSchema):
         cls, core_schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Return the schema of an entry, or of a unit alone."""
-        return {"anyOf": [handler(core_schema), {"enum": [*get_args(ReadingUnitName)]}]}
+        unit = TypeAdapter(ReadingUnitName).json_schema()
+        return {"anyOf": [handler(core_schema), *unit["anyOf"]]}
 
     @model_validator(mode="before")
     @classmethod
@@ -140,10 +149,11 @@ def reading_units(
         return units
     problems = []
     if isinstance(stated, str):
-        alike = [name for name, leg in motors.items() if leg.reads_angle is (stated not in LENGTH)]
-        entries = {name: ReadingsEntry(unit=stated) for name in alike}  # type: ignore[arg-type]
+        slides = is_length(stated)
+        alike = [name for name, leg in motors.items() if leg.reads_angle is not slides]
+        entries = {name: ReadingsEntry(unit=stated) for name in alike}
         if not alike:
-            does = "slides" if stated in LENGTH else "turns"
+            does = "slides" if slides else "turns"
             problems.append(
                 f"{path}: readings could not be used: found {stated} and no motor that {does}, "
                 f"needed {'an angle or us' if does == 'slides' else 'a length'}; correct it."

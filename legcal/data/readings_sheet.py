@@ -25,9 +25,9 @@ from legcal.data.measurements import (
     reading_columns,
     readings_of_lengths,
 )
-from legcal.data.reading_units import PULSES, ReadingUnit, unit_named
+from legcal.data.reading_units import PULSES, ReadingUnit, is_length, unit_named
 from legcal.errors import DatasetError, Place, UsageError
-from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN
+from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN, unit_size
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, is_number, read_table, split_heading
 from legcal.geometry.types import Array
@@ -49,6 +49,11 @@ _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs":
 _TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
 ByContent = Mapping[str, Callable[[Sequence[str]], bool]]
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
+# Units at the end of a heading without brackets that would else be part of a name
+_FOREIGN = {
+    *("inch", "inches", "zoll", "feet", "foot", "dm", "mil", "mils", "yd"),
+    *("counts", "steps", "ticks", "turns", "grad", "gon", "arcmin", "arcsec"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +201,7 @@ class ReadingsSheet:
                 lengths,
             )
             option_of_kind = (
-                option if option is not None and (option in LENGTH) is not turning else None
+                option if option is not None and is_length(option) is not turning else None
             )
             unit, origin = of_kind.unit(option_of_kind)
             unit_of_motor |= dict(zip(some, of_kind.units(unit), strict=True))
@@ -207,18 +212,18 @@ class ReadingsSheet:
     def _refuse_options(self, option: str | None, lengths: bool) -> None:
         """Refuse a unit that no motor has, and lengths of legs that have none."""
         unit_names = [*LENGTH, *READING_ANGLES]
-        if option is not None and option not in unit_names:
+        if option is not None and not _is_known(option):
             raise UsageError(
                 f"The unit could not be used: found '{option}', needed one of "
                 f"{', '.join(unit_names)}; correct --unit."
             )
         if option is not None and not any(
-            leg.reads_angle is (option not in LENGTH) for leg in self.motors
+            leg.reads_angle is not is_length(option) for leg in self.motors
         ):
-            does = "slides" if option in LENGTH else "turns"
+            does = "slides" if is_length(option) else "turns"
             raise UsageError(
                 f"The unit could not be used: found '{option}' and no motor that {does}, needed "
-                f"one of {', '.join(READING_ANGLES if option in LENGTH else LENGTH)}; correct "
+                f"one of {', '.join(READING_ANGLES if is_length(option) else LENGTH)}; correct "
                 "--unit."
             )
         if lengths and any(leg.actuator is not None for leg in self.motors):
@@ -255,7 +260,8 @@ class _Headings:
                 "q1, 1); add a first line of headings."
             )
         split = [split_heading(text) for text in header]
-        readings = [split_heading(text, (*LENGTH, *READING_ANGLES)) for text in header]
+        known = (*LENGTH, *READING_ANGLES)
+        readings = [split_heading(text, known, others=True) for text in header]
         meaning: dict[int, str] = {}
         clock: dict[int, float] = {}  # seconds in a unit of a column of times
         for i, (key, _) in enumerate(split):
@@ -275,7 +281,14 @@ class _Headings:
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self.joints:
-                self.units[name] = readings[i][1]
+                self.units[name] = unit = readings[i][1] or _foreign(readings[i][0])
+                if unit and not _is_known(unit):
+                    raise DatasetError(
+                        f"{self.path}, header: the unit of {describe(header[i])} could not be "
+                        f"used: found '{unit}', needed one of {', '.join(known)}, or counts with "
+                        "their scale (80 counts/mm); convert the readings, or leave the unit out "
+                        "of the heading if it is none."
+                    )
         unused = [text for i, text in enumerate(header) if i not in meaning and text]
         if unused:
             is_single = len(unused) == 1
@@ -331,6 +344,17 @@ class _Headings:
             f"the leg ({self.motors[0].name}), its joint ({self.joints[0]}) or its number "
             "(L1, q1, 1); rename the columns."
         )
+
+
+def _is_known(unit: str) -> bool:
+    """Return whether readings may have a unit."""
+    return unit == PULSES or is_length(unit) or unit_size(unit, ANGLE) is not None
+
+
+def _foreign(key: str) -> str:
+    """Return the unit at the end of a heading that readings cannot have, "" if none is there."""
+    end = _NUMBERED.fullmatch(key)
+    return end[3] if end is not None and end[3] in _FOREIGN else ""
 
 
 def _dated(cell: str, size: float | None) -> str:
@@ -416,7 +440,7 @@ class _MotorsOfKind:
                 "needed the same for all readings; correct the headings."
             )
         unit = self.stated[0] if self.stated else option
-        if unit is not None and unit not in self.possible and unit != PULSES:
+        if unit is not None and is_length(unit) is self.turning and unit != PULSES:
             does = "turns" if self.turning else "slides"
             raise DatasetError(
                 f"{self.path}: the unit could not be used: found {unit} of '{self.joints[0]}', "
@@ -486,5 +510,5 @@ def _exactly(texts: Sequence[str], unit: ReadingUnit) -> list[float]:
 def _scaled(number: Decimal, unit: ReadingUnit) -> float:
     """Return a difference of readings [m or rad], positive or not."""
     if unit.name in LENGTH:
-        return float(number.scaleb(round(math.log10(unit.size))))
+        return float(number * Decimal(repr(unit.size)))
     return float(number) * abs(unit.size)

@@ -85,17 +85,21 @@ class _Model:
         return np.asarray(inside[:, motors].all(axis=1))
 
     def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
-        """Return the poses (k, 3, 4) at readings, near others, and which were reached."""
-        machine, scale = self.machine, self.machine.size
-        motors = list(machine.motors)
-        solution = solve(
-            equations_of_readings(machine, q[:, motors]),
-            poses_after,
-            near,
-            tolerance=1e-14 * scale,
-            unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
-        )
-        return solution.points, solution.worst <= REACHED * scale
+        """Return :func:`poses_at_readings`."""
+        return poses_at_readings(self.machine, q, near)
+
+
+def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, BoolArray]:
+    """Return the poses (k, 3, 4) at readings (k, n_legs), near others, and which were reached."""
+    scale = machine.size
+    solution = solve(
+        equations_of_readings(machine, q[:, list(machine.motors)]),
+        poses_after,
+        near,
+        tolerance=1e-14 * scale,
+        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
+    )
+    return solution.points, solution.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
@@ -154,7 +158,7 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
     calibrated, _ = models
     machine, columns = calibrated.machine, calibrated.columns
     centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, columns]
-    there = coordinates_of(_stacked(workspace(machine)[1]))[0][:, columns]
+    there = coordinates_of(stacked(workspace(machine)[1]))[0][:, columns]
     there = centre + turned_back(there - centre, columns)
     middle, reach = there.mean(axis=0), np.abs(there - there.mean(axis=0)).max(axis=0)
     for part in SHRINKING ** np.arange(ATTEMPTS):
@@ -259,6 +263,6 @@ def _no_grid(machine: Machine) -> str:
     )
 
 
-def _stacked(poses: list[RigidTransform]) -> Array:
+def stacked(poses: list[RigidTransform]) -> Array:
     """Return poses as matrices (k, 3, 4)."""
     return np.array([T.as_matrix()[:3] for T in poses])

@@ -6,10 +6,12 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.correction import correction_files, correction_refusal
+from legcal.exports.firmware import firmware_files, firmware_refusal
+from legcal.exports.flypt import flypt_files, flypt_refusal
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
 from legcal.exports.mjcf import mjcf_files, mjcf_refusal
@@ -18,6 +20,10 @@ from legcal.exports.robot_files import ros_files, urdf_files
 from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
 from legcal.files.folder import OutputFile, OutputKind, result_folder
 from legcal.files.schema import Document, Number, SparseDocument
+from legcal.machine.model import Machine
+
+if TYPE_CHECKING:
+    from legcal.calibration.result_folder import EarlierResult
 
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
@@ -44,6 +50,11 @@ FORMATS: dict[str, Format] = {
     "urdf": Format(urdf_files, options=("inertia",)),
     "mjcf": Format(mjcf_files, mjcf_refusal),
     "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
+    **{
+        name: Format(firmware_files(name), firmware_refusal(name))
+        for name in ("klipper", "reprapfirmware", "marlin")
+    },
+    "flypt": Format(flypt_files, flypt_refusal),
     "python": Format(python_files, kinematics_refusal),
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
@@ -80,8 +91,15 @@ class Residual(Document):
     max_dE_rad: Number
 
 
+class Remaining(Document):
+    """Errors of a firmware over the workspace [mm]."""
+
+    rms: Number
+    max: Number
+
+
 class ExportDocument(SparseDocument):
-    """The document of ``legcal export --json``: files, and figures of a correction table."""
+    """The document of ``legcal export --json``: files, and figures of a correction or firmware."""
 
     format: str
     written: list[str]
@@ -90,11 +108,13 @@ class ExportDocument(SparseDocument):
     residual: Residual | None = None  # with the corrected commands
     uncorrected: Residual | None = None
     tested: int | None = None  # number of tested middles of cells
+    remaining_mm: Remaining | None = None  # with the written numbers of a firmware
+    nominal_mm: Remaining | None = None  # with those of the nominal model
     notes: list[str]
 
 
 def export(
-    source: str | Path | Subject,
+    source: str | Path | Machine | EarlierResult | Subject,
     to: str,
     path: str | Path,
     *,
@@ -105,8 +125,9 @@ def export(
 
     Parameters
     ----------
-    source : path, name or Subject
-        A result folder, its ``result.json``, or a mechanism.
+    source : path, name, Machine or EarlierResult
+        A result folder, its ``result.json``, what :func:`legcal.load_result` returned, or a
+        mechanism.
     to : str
         One of ``FORMATS``.
     path : path
@@ -141,13 +162,24 @@ def export(
             f"{', '.join(formats_of(subject))}."
         )
     rendered = format.render(subject, given, destination)
-    _keep_sources(subject, [destination / file.name for file in rendered.files])
+    places = [_beside(destination, file.name) for file in rendered.files]
+    if format.is_folder:
+        places = [destination / file.name for file in rendered.files]
+    _keep_sources(subject, places)
     if format.is_folder:
         paths = _write_folder(destination, rendered, force=force)
     else:
-        _FILE.write(destination, rendered.files[0].content, force=force)
-        paths = (destination,)
+        paths = tuple(places)
+        for place in paths:
+            _FILE.check_place(place, force=force)
+        for place, file in zip(paths, rendered.files, strict=True):
+            _FILE.write(place, file.content, force=force)
     return Exported(to, paths, rendered.notes, dict(rendered.figures))
+
+
+def _beside(destination: Path, ending: str) -> Path:
+    """Return the place of a file of an export: a picture stands beside, under its name."""
+    return destination.with_name(destination.name + ending) if ending else destination
 
 
 def formats_of(subject: Subject) -> tuple[str, ...]:

@@ -53,6 +53,7 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
     home = readings_at(machine, machine.home)
+    pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
     lines = [
         f"# genhexkins of {comment(subject.name)}, written by legcal {__version__}.",
         "# Machine units are mm and degrees ([TRAJ] LINEAR_UNITS = mm, ANGULAR_UNITS = degree).",
@@ -74,6 +75,9 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
         "",
         "# For the INI file. HOME_OFFSET is the length where the encoder reads zero, HOME that at",
         "# the home pose of the model. Readings of the sign -1 shrink as the leg grows.",
+        "# [TRAJ]",
+        "# LINEAR_UNITS = mm",
+        f"# HOME = {' '.join(repr(float(x)) for x in pose)}",
     ]
     for j, leg in enumerate(machine.legs):
         lines += [

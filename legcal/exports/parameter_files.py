@@ -9,14 +9,15 @@ from __future__ import annotations
 import csv
 import io
 import json
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from legcal.calibration.quantities import FRAMES, Quantity, parameters_of
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
+from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
@@ -27,31 +28,8 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from legcal.calibration.documents import JointInLink
 
-UNITS = {
-    "m": (1e3, "mm"),
-    "rad": (float(np.degrees(1.0)), "deg"),
-}  # units in files; others are unchanged
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
 _DIGITS = 6  # decimals in the table
-_OF_FRAME = re.compile(r"\.(base|platform)(\.[xyz]|_axis\.[12])$")
-_MODEL = "model"  # status of numbers without a result
-
-
-class Row(NamedTuple):
-    """A number of a machine, in a unit of the files."""
-
-    name: str
-    frame: str  # a link, R_b or R_e; "" if independent of a frame
-    unit: str
-    value: float
-    nominal: float | None  # None without a result
-    sigma: float | None  # None if not estimated
-    status: str  # estimated, fixed, weak, frame (defines R_b or R_e), derived (axes) or model
-
-    @property
-    def change(self) -> float | None:
-        """Value minus nominal."""
-        return None if self.nominal is None else self.value - self.nominal
 
 
 def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
@@ -109,7 +87,7 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
         result = subject.result.document
         unit = {row.name: row.unit for row in result.parameters}
         names = result.kinematic.names
-        units = [UNITS.get(unit.get(name, "m"), (1.0, "")) for name in names]
+        units = [SHOWN_IN[unit.get(name, "m")] for name in names]
         scale = np.array([factor for factor, _ in units])
         covariance = np.array(result.kinematic.covariance) * np.outer(scale, scale)
         document["covariance"] = {
@@ -120,13 +98,18 @@ def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered
     return one_file(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def rows_of(subject: Subject) -> list[Row]:
-    """Return the rows of a subject."""
-    return [*_joint_rows(subject), *_parameter_rows(subject)]
+def rows_of(subject: Subject) -> list[Quantity]:
+    """Return the rows of a subject: joints and axes in their links, then all parameters."""
+    parameters = (
+        _parameters_of_model(subject.machine)
+        if subject.result is None
+        else parameters_of(subject.result.document)
+    )
+    return [*_joint_rows(subject), *_actuator_rows(subject), *parameters]
 
 
-def _joint_rows(subject: Subject) -> Iterator[Row]:
-    """Yield the rows of joint centres and axes in their links."""
+def _joint_rows(subject: Subject) -> Iterator[Quantity]:
+    """Yield joint centres and axes in their links."""
     machine, nominal = subject.machine, subject.nominal
     joints = _joints(subject)
     for side, link in (("base", machine.base), ("platform", machine.platform)):
@@ -136,48 +119,46 @@ def _joint_rows(subject: Subject) -> Iterator[Row]:
             before, turned = None, None
             if nominal is not None:
                 before, turned = _end(nominal.legs_of_frames[j], side)
-            if axis is not None and turned is not None and axis @ turned < 0.0:
-                turned = -turned  # axes are lines
-            for k, letter in enumerate("xyz"):
-                sigma = None if joint is None else joint.sigma[k]
-                yield Row(
-                    f"{leg.name}.{side}.{letter}",
-                    link,
-                    "mm",
-                    1e3 * float(point[k]),
-                    None if before is None else 1e3 * float(before[k]),
-                    None if sigma is None else 1e3 * sigma,
-                    _MODEL if joint is None else joint.status[k],
-                )
-            if axis is None:
-                continue
-            for k, letter in enumerate("xyz"):
-                before_k = None if turned is None else float(turned[k])
-                status = _MODEL if joint is None else "derived"
-                name = f"{leg.name}.{side}_axis.{letter}"
-                yield Row(name, link, "", float(axis[k]), before_k, None, status)
-    yield from _actuator_rows(machine, nominal)
+            status = ["model"] * 3 if joint is None else joint.status
+            sigma = [None] * 3 if joint is None else joint.sigma
+            yield from _vector(f"{leg.name}.{side}", link, "m", point, before, status, sigma)
+            if axis is not None:
+                if turned is not None and axis @ turned < 0.0:
+                    turned = -turned  # axes are lines
+                status = ["model" if joint is None else "derived"] * 3
+                yield from _vector(f"{leg.name}.{side}_axis", link, "", axis, turned, status)
 
 
-def _actuator_rows(machine: Machine, nominal: Machine | None) -> Iterator[Row]:
-    """Yield the rows of directions and axes of actuators, in the base link."""
-    before = (
-        {}
-        if nominal is None
-        else {nominal_actuator.joint: nominal_actuator for nominal_actuator in nominal.actuators}
-    )
-    status = _MODEL if nominal is None else "derived"
+def _actuator_rows(subject: Subject) -> Iterator[Quantity]:
+    """Yield directions and axes of actuators, in the base link."""
+    machine, nominal = subject.machine, subject.nominal
+    before = {} if nominal is None else {other.joint: other for other in nominal.actuators}
+    status = ["model" if nominal is None else "derived"] * 3
     for actuator in machine.actuators:
-        other = before.get(actuator.joint)
-        vector = "axis" if actuator.turns else "direction"
-        for k, letter in enumerate("xyz"):
-            was = None if other is None else float(other.axis[k])
-            name = f"{actuator.joint}.{vector}.{letter}"
-            yield Row(name, machine.base, "", float(actuator.axis[k]), was, None, status)
-        for k, letter in enumerate("xyz" * actuator.turns):
-            was = None if other is None else 1e3 * float(other.point[k])
-            name, value = f"{actuator.joint}.axis_point.{letter}", 1e3 * float(actuator.point[k])
-            yield Row(name, machine.base, "mm", value, was, None, status)
+        other, joint = before.get(actuator.joint), actuator.joint
+        kind = "axis" if actuator.turns else "direction"
+        was = None if other is None else other.axis
+        yield from _vector(f"{joint}.{kind}", machine.base, "", actuator.axis, was, status)
+        if actuator.turns:
+            was = None if other is None else other.point
+            name = f"{joint}.axis_point"
+            yield from _vector(name, machine.base, "m", actuator.point, was, status)
+
+
+def _vector(
+    name: str,
+    frame: str,
+    unit: str,
+    vector: Array,
+    nominal: Array | None,
+    status: Sequence[str],
+    sigma: Sequence[float | None] = (None, None, None),
+) -> Iterator[Quantity]:
+    """Yield the components of a vector."""
+    for k, axis in enumerate("xyz"):
+        before = None if nominal is None else float(nominal[k])
+        numbers = float(vector[k]), before, sigma[k]
+        yield Quantity.of(f"{name}.{axis}", frame, unit, numbers, status[k])
 
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
@@ -193,34 +174,16 @@ def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
     return (leg.A, leg.base_axis) if side == "base" else (leg.B, leg.platform_axis)
 
 
-def _parameter_rows(subject: Subject) -> Iterator[Row]:
-    """Yield the rows of the parameters in R_b and R_e, from the result or the model."""
-    if subject.result is not None:
-        for row in subject.result.document.parameters:
-            if not row.is_shown:
-                continue
-            scale, unit = UNITS.get(row.unit, (1.0, row.unit))
-            sigma = None if row.sigma is None else scale * row.sigma
-            numbers = scale * row.value, scale * row.nominal, sigma
-            yield Row(row.name, _frame_of(row.name), unit, *numbers, row.status)
-        return
-    for name, leg in zip(subject.machine.leg_names, geometries(subject.machine), strict=True):
+def _parameters_of_model(machine: Machine) -> Iterator[Quantity]:
+    """Yield the parameters of a model, joints in R_b and R_e."""
+    for name, leg in zip(machine.leg_names, geometries(machine), strict=True):
         for side, point in (("base", leg.A), ("platform", leg.B)):
-            for axis, x in zip("xyz", point, strict=True):
-                of = f"{name}.{side}.{axis}"
-                yield Row(of, _frame_of(of), "mm", 1e3 * float(x), None, None, _MODEL)
+            yield from _vector(f"{name}.{side}", FRAMES[side], "m", point, None, ["model"] * 3)
         if leg.kind is not LegKind.PASSIVE:
-            quantity = "length" if leg.kind is LegKind.CONSTANT else "offset"
-            yield Row(f"{name}.{quantity}", "", "mm", 1e3 * leg.q0, None, None, _MODEL)
+            kind = "length" if leg.kind is LegKind.CONSTANT else "offset"
+            yield Quantity.of(f"{name}.{kind}", "", "m", (leg.q0, None, None))
         if leg.twist is not None:
-            degrees = float(np.degrees(leg.twist))
-            yield Row(f"{name}.twist", "", "deg", degrees, None, None, _MODEL)
-
-
-def _frame_of(name: str) -> str:
-    """Return the frame of a parameter."""
-    side = _OF_FRAME.search(name)
-    return "" if side is None else {"base": "R_b", "platform": "R_e"}[side[1]]
+            yield Quantity.of(f"{name}.twist", "", "rad", (leg.twist, None, None))
 
 
 def _leg(
@@ -229,7 +192,7 @@ def _leg(
     """Return the entry of a leg in the document."""
     actuator = in_links.actuator
     has_travel = in_links.has_value and bool(np.isfinite(in_links.travel).all())
-    scale = UNITS["m" if actuator is None else actuator.unit][0]
+    scale = SHOWN_IN["m" if actuator is None else actuator.unit][0]
     return {
         "name": name,
         "type": in_links.type,

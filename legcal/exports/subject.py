@@ -72,8 +72,8 @@ def other_gains(machine: Machine) -> str:
     return ", ".join(f"'{a.joint}' {a.gain:.9g}" for a in machine.actuators if a.gain != 1.0)
 
 
-def load_subject(given: str | Path) -> Subject:
-    """Return the subject of an export: the result in a folder or ``result.json``, else a mechanism.
+def load_subject(given: str | Path | Machine | EarlierResult) -> Subject:
+    """Return the subject of an export: a result, its folder or ``result.json``, or a mechanism.
 
     Raises
     ------
@@ -82,6 +82,10 @@ def load_subject(given: str | Path) -> Subject:
     ModelError
         If there is no such mechanism.
     """
+    if isinstance(given, Machine):
+        return Subject(given, str(given.yaml_path))
+    if not isinstance(given, (str, os.PathLike)):
+        return Subject(given.machine, str(given.folder), _nominal(given), given)
     path = Path(given)
     if os.path.isfile(path / RESULT_NAME) or path.name == RESULT_NAME:
         from legcal.calibration.result_folder import load_result

@@ -11,15 +11,39 @@ from numbers import Real
 from legcal.errors import UsageError
 from legcal.files.schema import describe
 
-LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0}
-ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
+LENGTH: Mapping[str, float] = {
+    "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048
+}  # fmt: skip
+ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0, "rev": math.tau}
 PIXELS: Mapping[str, float] = {"px": 1.0}
-# Units shown in place of metres and radians, and their factors
-SHOWN_IN: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg")}
+# Units shown in place of those of files, and their factors
+SHOWN_IN: Mapping[str, tuple[float, str]] = {
+    "m": (1e3, "mm"),
+    "rad": (math.degrees(1.0), "deg"),
+    "px": (1.0, "px"),
+    "": (1.0, ""),
+}
 
 _NUMBER = r"\s*([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
 _VALUE = re.compile(_NUMBER, re.ASCII)
+_PLACEHOLDERS = {
+    "MEASURED": "the measured value",
+    "SIGMA": "the standard deviation of the measurement",
+    "VALUE": "a value",
+}
+_PLACEHOLDER = re.compile("|".join(_PLACEHOLDERS))
 _PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
+
+COUNTS = r"\s*(\d+(?:\.\d*)?)\s*(?:counts?|steps?|ticks?)\s*/\s*([a-z]+)\s*"  # 80 counts/mm
+
+
+def unit_size(name: str, units: Mapping[str, float]) -> float | None:
+    """Return the size of a unit, also of counts with a stated scale; None if it is not known."""
+    counts = re.fullmatch(COUNTS, name)
+    if counts is None:
+        return units.get(name)
+    size = units.get(counts[2])
+    return None if size is None or float(counts[1]) == 0.0 else size / float(counts[1])
 
 
 def split_quantity(text: str) -> tuple[float, str]:
@@ -98,6 +122,7 @@ def read_prior(value: object) -> Quantity:
 
 def _read_prior_text(text: str) -> Quantity:
     """Return the prior that a text states; a unit at its end counts for both numbers."""
+    _refuse_placeholders(text)
     match = _PRIOR.fullmatch(text)
     if match is None:
         raise ValueError(
@@ -121,6 +146,7 @@ def _read_prior_text(text: str) -> Quantity:
 
 def read_value(text: str) -> Quantity:
     """Parse a number with an optional unit."""
+    _refuse_placeholders(text)
     match = _VALUE.fullmatch(text)
     if match is None or not math.isfinite(float(match[1])):
         raise ValueError(
@@ -134,6 +160,15 @@ def read_value(text: str) -> Quantity:
             "for SI units and pixels."
         )
     return Quantity(_in_si(float(match[1]), unit), None, _DIMENSION.get(unit, ""))
+
+
+def _refuse_placeholders(text: str) -> None:
+    """Refuse text with a placeholder of a printed command in it."""
+    if placeholder := _PLACEHOLDER.search(text):
+        raise ValueError(
+            f"found the placeholder {placeholder[0]}, needed a number; replace {placeholder[0]} by "
+            f"{_PLACEHOLDERS[placeholder[0]]}."
+        )
 
 
 def _in_si(number: float, unit: str) -> float:

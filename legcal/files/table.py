@@ -358,6 +358,9 @@ def _number_in(text: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
+_IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]+)[\])]")
+
+
 @cache
 def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
     """Return the pattern of headings that end with one of some units."""
@@ -365,13 +368,18 @@ def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
     return re.compile(rf"(.*?)(?:\s*[\[(]\s*({unit_pattern})\s*[\])]|[\s_/]({unit_pattern}))?")
 
 
-def split_heading(text: str, units: Iterable[str] = LENGTH) -> tuple[str, str]:
+def split_heading(
+    text: str, units: Iterable[str] = LENGTH, *, others: bool = False
+) -> tuple[str, str]:
     """Return a heading in small letters and digits alone, and its unit (of length) or "".
 
-    ``Leg 1 [mm]``, ``leg1_mm`` and ``LEG-1 (mm)`` are all ``leg1`` in ``mm``.
+    ``Leg 1 [mm]``, ``leg1_mm`` and ``LEG-1 (mm)`` are all ``leg1`` in ``mm``. With *others* any
+    text in brackets is a unit, whether it is known or not.
     """
     match = _heading_with(tuple(units)).fullmatch(text.strip())
     name, unit = (match[1], match[2] or match[3] or "") if match else (text, "")
+    if others and not unit and (stated := _IN_BRACKETS.fullmatch(text.strip())):
+        name, unit = stated[1], stated[2].strip()
     letters = "".join(letter for letter in name.casefold() if letter.isalnum())
     return letters, "um" if unit in ("µm", "μm") else unit
 

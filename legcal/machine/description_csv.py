@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import DatasetError
+from legcal.files.quantity import LENGTH
 from legcal.files.schema import describe
 from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
 
 FILE_KIND = "table"
 MAX_NUMBER = 1e9  # largest number, in any unit
-UNITS = {"m": 0, "mm": -3}  # units of length, as powers of ten
 SIDES = {
     "base": ("base", "bottom", "fixed", "ground", "lower", "a"),
     "platform": ("platform", "plat", "top", "moving", "mobile", "upper", "effector", "p", "t"),
@@ -40,6 +40,7 @@ _OTHER = {
     "tube": ("tube", "tuberadius"),
     "rod": ("rod", "rodradius"),
 }
+_NOT_LENGTHS = ("deg", "us", "-")  # units of other columns
 _POINT = ("point", "joint", "name", "id", "label")
 _WORDS = "|".join(sorted([*SIDES["base"], *SIDES["platform"], "b"], key=len, reverse=True))
 _COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
@@ -221,8 +222,8 @@ def _unit(table: Table, given: str | None) -> str:
     stated = _shared(table, "unit") or given
     if stated is None:
         raise DatasetError(
-            f"{table.path}: the lengths could not be read: found no unit, needed m or mm; "
-            "add a column 'unit', or give --unit mm."
+            f"{table.path}: the lengths could not be read: found no unit, needed one of "
+            f"{', '.join(LENGTH)}; add a column 'unit', or give --unit mm."
         )
     return stated
 
@@ -235,13 +236,14 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
     """
     lines = _with_headings(lines, path)
     number, header = lines[0]
-    split = [split_heading(text) for text in header]
+    split = [split_heading(text, others=True) for text in header]
     keys = [key for key, _ in split]
-    units = sorted({unit for _, unit in split if unit})
-    if len(units) > 1 or (units and units[0] not in UNITS):
+    stated = {unit for (_, unit), text in zip(split, header, strict=True) if text not in names}
+    units = sorted(stated - {"", *_NOT_LENGTHS})
+    if len(units) > 1 or (units and units[0] not in LENGTH):
         raise DatasetError(
-            f"{path}, header: the unit could not be decided: found {' and '.join(units)}, needed m "
-            "or mm for all lengths; correct the headings."
+            f"{path}, header: the unit could not be decided: found {' and '.join(units)}, needed "
+            f"one of {', '.join(LENGTH)} for all lengths; correct the headings."
         )
     if {"x", "y"} <= set(keys) and len(lines) > 1:
         lines = _from_points(lines, keys, path)

@@ -6,7 +6,9 @@ validated as a :class:`TableFile`, whose entries are checked against each other 
 for all legs, or a list with one (or null) for each leg.
 """
 
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,12 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from legcal.errors import BadValue, DatasetError, ModelError
 from legcal.files.motions import Quaternion, Vector
+from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
     FileSchema,
     Number,
     PlainName,
     Version,
     closest,
+    content_of,
     describe,
     is_plain_name,
     read_yaml,
@@ -42,7 +46,8 @@ from legcal.machine.description import (
     legs_in_words,
     look_like_base,
 )
-from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, UNITS, read_columns
+from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, read_columns
+from legcal.machine.firmware_files import firmware_table
 from legcal.machine.leg import MAX_LEGS, LegKind
 
 
@@ -291,7 +296,7 @@ class TableFile(FileSchema):
 
     legcal_table: Version
     name: PlainName
-    unit: Literal["m", "mm"]
+    unit: Literal["m", "mm", "cm", "um", "nm", "in", "ft"]
     type: Annotated[str | None, BeforeValidator(_type)] = None
     types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
     legs: list[PlainName] | None = None
@@ -346,15 +351,35 @@ def read_description(
     unit: str | None = None,
     name: str | None = None,
     given: Mapping[str, Any] | None = None,
+    effector: float | None = None,
 ) -> Description:
-    """Return the machine described by a table.
+    """Return the machine described by a table, or by the configuration of a firmware.
 
     ``given`` holds entries from the command line, in the unit of the table, which must not have
-    them.
+    them; ``effector`` is the radius of the joints on the effector of a printer, in that unit.
     """
     given = {} if given is None else given
     try:
-        if path.suffix.lower() == ".csv":
+        content = content_of(path, FILE_KIND).decode(errors="replace")
+    except DatasetError as error:
+        raise ModelError(error.facts) from error
+    if (of_firmware := firmware_table(path, content, unit, given, effector)) is not None:
+        table, notes = of_firmware
+        stated = {"name": name} if name is not None else {}
+        described = described_machine({**table, **stated, **given}, path)
+        return replace(described, notes=(*described.notes, *notes))
+    if content.lstrip().startswith("<"):
+        raise ModelError(
+            f"{path}: the table could not be read: found XML, needed a table of joints or the "
+            f"configuration of a firmware; give a URDF or MJCF to legcal inspect {path} --write ."
+        )
+    if effector is not None:
+        raise ModelError(
+            f"{path}: --platform-radius could not be used: found a table of joints, needed the "
+            "configuration of a printer, or --family; write the joints in the table."
+        )
+    try:
+        if _is_csv(path, content):
             table = read_columns(path, unit)
             table["name"] = name or table["name"]
             if not is_plain_name(table["name"]) and name is None:
@@ -385,6 +410,15 @@ def read_description(
             f"{describe(table['unit'])} in the table, needed one of them; leave out --unit."
         )
     return described_machine({**table, **given}, path)
+
+
+def _is_csv(path: Path, content: str) -> bool:
+    """Return whether a table is CSV, from its first line of content; a name decides where none."""
+    lines = (line.strip() for line in content.splitlines())
+    first = next((line for line in lines if line and not line.startswith("#")), "")
+    if re.match(r"""(---|\{|['"]?[\w-]+['"]?\s*:(\s|$))""", first):
+        return False
+    return path.suffix.lower() == ".csv" or any(mark in first for mark in ",;\t")
 
 
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
@@ -433,7 +467,7 @@ def _is_given(value: Any) -> bool:
 
 def in_metres(value: float, unit: str) -> float:
     """Return a length in metres: the float nearest to its decimal digits in any unit."""
-    return float(Decimal(repr(float(value))).scaleb(UNITS[unit]))
+    return float(Decimal(repr(float(value))) * Decimal(repr(LENGTH[unit])))
 
 
 def _types(file: TableFile, n: int) -> list[LegType]:

@@ -1,15 +1,21 @@
 """Notes on a loaded machine, one sentence each."""
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.types import Array
 from legcal.machine.home import home_reading_in_words, legs_outside
-from legcal.machine.mobility import singularity
+from legcal.machine.mobility import dimensionless, singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
+from legcal.machine.solved_poses import project_pose
 from legcal.machine.ties import ties_in_words
 
 _AT_MIDDLE = 1e-6  # largest distance from mid-travel, relative to the travel
 _MIN_SINGULARITY = 1e-4  # singularity measure below which it is the rounding of a file
+_GOOD_SINGULARITY = 0.05  # of a home that can be proposed
+_ALONG = np.radians(np.arange(2.0, 62.0, 2.0))  # of a free motion [rad, leg lengths]
+_PURE = 0.02  # part of a free motion that is not mentioned
 
 
 def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
@@ -65,12 +71,62 @@ def singularity_note(machine: Machine) -> str | None:
     measure = singularity(machine, machine.home)
     if measure > _MIN_SINGULARITY:
         return None
+    motion = _free_motion(machine)
+    free = _in_words(motion, machine.size)
     return (
-        "the mechanism is singular at home: the platform can move there with all motors locked "
-        f"(singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
-        f"{machine.urdf.wording.correct_home}, or the joints if they make similar figures on base "
-        "and platform."
+        f"the mechanism is singular at home: the platform can {free} there with all "
+        f"motors locked (singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
+        f"{machine.urdf.wording.correct_home}{_good_home(machine, motion)}, or the joints if they "
+        "make similar figures on base and platform."
     )
+
+
+def _free_motion(machine: Machine) -> Array:
+    """Return the motion (6,) that motors hold least at home, in the base link.
+
+    A rotation about the mean of the platform joints [rad] and a displacement [m] of it; the larger
+    one, in leg lengths, is one.
+    """
+    jacobian = dimensionless(machine, machine.home.as_matrix()[None])[0]
+    motion = np.linalg.svd(jacobian)[2][-1]
+    motion /= max(np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]))
+    return np.concatenate([motion[:3], machine.size * motion[3:]])
+
+
+def _in_words(motion: Array, size: float) -> str:
+    """Return a free motion in words."""
+
+    def direction(vector: Array) -> str:
+        unit = vector / np.linalg.norm(vector)
+        unit *= np.sign(unit[np.argmax(np.abs(unit))])
+        return f"({', '.join(f'{x:.2g}' for x in np.where(np.abs(unit) < 5e-3, 0.0, unit))})"
+
+    turn, shift = motion[:3], motion[3:]
+    words = []
+    if np.linalg.norm(turn) > _PURE:
+        words.append(f"turn about {direction(turn)}")
+    if np.linalg.norm(shift) > _PURE * size:
+        words.append(f"move along {direction(shift)}")
+    return f"{' and '.join(words)} of the base"
+
+
+def _good_home(machine: Machine, motion: Array) -> str:
+    """Return the nearest pose along a motion at which motors hold the platform, as an entry."""
+    centre = machine.B_platform.mean(axis=0)
+    for part in _ALONG:
+        for sign in (1.0, -1.0):
+            rotation = Rotation.from_rotvec(sign * part * motion[:3]) * machine.home.rotation
+            middle = machine.home.apply(centre) + sign * part * motion[3:]
+            moved = RigidTransform.from_components(middle - rotation.apply(centre), rotation)
+            pose, problem = project_pose(machine, moved)
+            if problem is None and singularity(machine, pose) > _GOOD_SINGULARITY:
+                quaternion = pose.rotation.as_quat(canonical=True)
+                xyz, quat = (
+                    ", ".join(f"{x:.6g}" for x in np.round(values, 6) + 0.0)
+                    for values in (pose.translation, quaternion)
+                )
+                return f" (the nearest good one is xyz [{xyz}], quat_xyzw [{quat}])"
+    return ""
 
 
 def _unseen_notes(machine: Machine) -> list[str]:
@@ -83,7 +139,10 @@ def _unseen_notes(machine: Machine) -> list[str]:
     else:
         who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
         add = "add one to each"
-    return [f"{who} cannot be seen in images; {add} with its radius."]
+    return [
+        f"{who} cannot be seen in images; {add} with its radius, or write a model that has them "
+        "with: legcal inspect FILE --leg-radius MM --write DIR."
+    ]
 
 
 def _motor_notes(machine: Machine) -> list[str]:

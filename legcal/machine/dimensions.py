@@ -24,7 +24,7 @@ class Dimensions:
     family: str | None = field(
         default=None, metadata=option("In place of a table: hexapod or delta.")
     )
-    unit: str | None = field(default=None, metadata=option("Unit of all lengths: mm or m."))
+    unit: str | None = field(default=None, metadata=option("Unit of all lengths: mm, m, in."))
     name: str | None = field(default=None, metadata=option("Name of the model and its files."))
     type: str | None = field(
         default=None, metadata=option("Type of the legs, where the table has none: UPS.")

@@ -5,19 +5,21 @@ that sink with the reading, and two parallel rods on each. For further numbers, 
 ``legcal new --template`` writes.
 """
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from legcal.errors import UsageError
+from legcal.files.quantity import LENGTH
 from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
-from legcal.machine.description_csv import UNITS
 from legcal.machine.description_table import described_machine, read_description
 from legcal.machine.dimensions import Dimensions
+from legcal.machine.model_builder import Created, create_model
 from legcal.option_fields import flag
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
@@ -26,7 +28,7 @@ TUBE, ROD = 0.03, 0.02  # radii, relative to the length at home
 RADIUS_OF_ROD = 0.0125  # radius of rods of a Delta, relative to their length
 SPACING = 1.2  # distance of the two rods of an arm, in platform radii
 TRAVEL = (-30.0, 70.0)  # travel of arms [deg]
-_DIGITS = {"mm": 9, "m": 12}  # decimals of a length
+DIGITS = 12  # decimals of a length in metres
 _BESIDE = {  # options that may be given beside a table, and their entries in it
     "type": "type",
     "min_length": "min_length",
@@ -34,6 +36,50 @@ _BESIDE = {  # options that may be given beside a table, and their entries in it
     "leg_radius": "radius",
     "height": "home",
 }
+
+
+def new(
+    table: str | Path | None = None,
+    output: str | Path = ".",
+    *,
+    force: bool = False,
+    **dimensions: str | float,
+) -> Created:
+    """Write a model, YAML and URDF, from a table of joints or a few dimensions.
+
+    Parameters
+    ----------
+    table : path, optional
+        A table of legs, as for ``legcal new``; None with a family.
+    output : path
+        The folder of ``models/`` and ``urdf/``.
+    force : bool
+        Replace existing files.
+    **dimensions
+        The options of ``legcal new``: ``family``, ``unit``, ``name``, ``type``, ``height``, ...
+        Lengths are in ``unit``, "mm" or "m".
+
+    Returns
+    -------
+    Created
+        The machine as loaded again, the paths, and notes on what was assumed.
+
+    Raises
+    ------
+    UsageError, ModelError
+        With one sentence for each problem of the table or the dimensions.
+    OutOfResources
+        If the folder cannot be written.
+    """
+    known = [field.name for field in fields(Dimensions)]
+    if unknown := [name for name in dimensions if name not in known]:
+        raise UsageError(
+            f"The model could not be written: found the dimension '{unknown[0]}', needed some of "
+            f"{', '.join(known)}; correct its name."
+        )
+    given = Dimensions(**dimensions)  # type: ignore[arg-type]
+    path = None if table is None else Path(table)
+    return create_model(description_of(path, given), Path(output), force=force)
 
 
 def description_of(table: Path | None, given: Dimensions) -> Description:
@@ -54,18 +100,20 @@ def description_of(table: Path | None, given: Dimensions) -> Description:
         for key, value in stated.items()
         if key in _BESIDE
     }
-    if of_family := [flag(key) for key in stated if key not in (*_BESIDE, "unit", "name")]:
+    beside = (*_BESIDE, "unit", "name", "platform_radius")
+    if of_family := [flag(key) for key in stated if key not in beside]:
         raise UsageError(
             f"The model could not be written: found {', '.join(of_family)} beside a table, needed "
             "them with --family only; write them in the table."
         )
-    return read_description(table, given.unit, given.name, entries)
+    return read_description(table, given.unit, given.name, entries, given.platform_radius)
 
 
 def _check_unit(given: Dimensions) -> None:
-    if given.unit not in (None, *UNITS):
+    if given.unit not in (None, *LENGTH):
         raise UsageError(
-            f"The unit could not be used: found '{given.unit}', needed mm or m; correct --unit."
+            f"The unit could not be used: found '{given.unit}', needed one of "
+            f"{', '.join(LENGTH)}; correct --unit."
         )
 
 
@@ -93,8 +141,8 @@ def family_table(given: Dimensions) -> dict[str, Any]:
     ]
     if lengths and given.unit is None:
         problems.append(
-            f"{where}: found {flag(next(iter(lengths)))} and no unit of lengths, needed mm or m; "
-            "give --unit mm."
+            f"{where}: found {flag(next(iter(lengths)))} and no unit of lengths, needed one "
+            f"of {', '.join(LENGTH)}; give --unit mm."
         )
     for key, value in lengths.items():
         below = name == "delta" and key == "height"
@@ -111,7 +159,7 @@ def family_table(given: Dimensions) -> dict[str, Any]:
         )
     if problems:
         raise UsageError(problems)
-    size = {key: value * (1e-3 if unit == "m" else 1.0) for key, value in family.dimensions.items()}
+    size = {key: value * 1e-3 / LENGTH[unit] for key, value in family.dimensions.items()}
     try:
         table = family.make(size | lengths, unit)
     except ValueError as error:
@@ -135,15 +183,20 @@ def _no_family(family: str) -> str:
     )
 
 
+def _decimals(unit: str) -> int:
+    """Return the decimals of lengths in a unit."""
+    return DIGITS + round(math.log10(LENGTH[unit]))
+
+
 def _hexapod(size: Mapping[str, float], unit: str) -> dict[str, Any]:
     """Return the table of a hexapod, with platform pairs between base pairs."""
-    digits, half = _DIGITS[unit], SPREAD * np.tile([0.5, -0.5], 3)
+    digits, half = _decimals(unit), SPREAD * np.tile([0.5, -0.5], 3)
     A = size["base_radius"] * _ring(np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + half)
     B = size["platform_radius"] * _ring(np.repeat([60.0, 180.0, 300.0], 2) - half)
     at_home = float(np.linalg.norm(B[0] + np.array([0.0, 0.0, size["height"]]) - A[0]))
 
     def part(of_length: float) -> float:
-        return round(of_length * at_home, digits - 8)
+        return round(of_length * at_home, max(digits - 8, 1))
 
     radius = size.get("leg_radius")
     return {
@@ -162,7 +215,7 @@ def _delta(size: Mapping[str, float], unit: str) -> dict[str, Any]:
     R, r, arm, rod = (
         size[key] for key in ("base_radius", "platform_radius", "arm_length", "rod_length")
     )
-    digits, spacing = _DIGITS[unit], SPACING * r
+    digits, spacing = _decimals(unit), SPACING * r
     radius = size.get("leg_radius", RADIUS_OF_ROD * rod)
     if not 2.0 * radius < spacing:
         raise ValueError(

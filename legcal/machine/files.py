@@ -122,6 +122,11 @@ def read_file(path: Path, kind: str) -> bytes:
         raise ModelError(error.facts) from error
 
 
+def is_xml(path: Path) -> bool:
+    """Return whether a file of a mechanism is XML, by its content."""
+    return read_file(path, "mechanism file").lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
 def yaml_of_urdf(path: Path) -> Path | None:
     """Return the mechanism YAML near a URDF, or None."""
     near = [path.with_suffix(".yaml"), _sibling(path, "models").with_suffix(".yaml")]

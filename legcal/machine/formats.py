@@ -8,6 +8,7 @@ coincident frames. Without a block ``legcal`` the tree is closed near its drawn 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -17,14 +18,15 @@ from lxml import etree
 from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass, Problem
+from legcal.errors import ModelError, OutOfClass, Problem, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
-from legcal.machine.bodies import rigid_bodies
+from legcal.machine.bodies import frame_link, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
+from legcal.machine.files import find_model, find_urdf, is_xml, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
-from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
+from legcal.machine.open_joints import with_held_joints
+from legcal.machine.schema import MAX_LOOPS, LegcalBlock, MechanismFile, read_mechanism_file
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
     Loop,
@@ -34,12 +36,13 @@ from legcal.machine.spanning_tree import (
     assumed_travel,
     check_one_mechanism,
     close_loop,
+    moving_groups,
     reference_poses,
     set_travel,
     sliders_without_travel,
     travel_note,
 )
-from legcal.machine.topology import find_chains, level_rotation, propose_block
+from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
     LOOP_TAGS,
     Problems,
@@ -53,12 +56,13 @@ from legcal.machine.urdf import (
 )
 from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
-XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
+_CLOSING = re.compile(r"closing_(.+)_([12])")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 TRIALS = 24
 STEPS = 200
 CLOSED = 1e-10  # largest residual of a closed loop [m, rad]
+_DRAWN_CLOSED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
 _OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
 _RIGID = 1e-3  # tolerance of determinants of rotations
 _SPREAD = 0.1  # start offset of a trial per trial number [rad], and relative to the machine
@@ -72,18 +76,140 @@ KINDS: dict[str, LoopKind] = {
 }
 
 
-def read_source(model: str | Path) -> Source:
-    """Return the tree and the closures of a mechanism; each file is checked in itself."""
+def read_source(model: str | Path, base: str | None = None, platform: str | None = None) -> Source:
+    """Return the tree and the closures of a mechanism; each file is checked in itself.
+
+    The links *base* and *platform* are stated for a file without a block ``legcal``.
+    """
     path = find_model(model)
-    is_xml = path.suffix.lower() in XML_SUFFIXES
-    source = _read_xml(path) if is_xml else read_yaml_source(path)
-    if source.file.legcal is not None:
-        return source
+    source = _read_xml(path) if is_xml(path) else read_yaml_source(path)
+    _check_stated(source, base, platform)
     names = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in names for pair in source.file.closed_loop for name in pair):
+    pairs = source.file.closed_loop
+    if not all(a in names and b in names and a != b for a, b in pairs):
         return source  # refused later, with the location of the name
+    source = with_held_joints(source)
+    if source.file.legcal is not None:
+        is_drawn_closed = source.file.legcal.home is None and _is_drawn_closed(source)
+        return completed(source) if is_drawn_closed else source
+    source = replace(source, base=base, platform=platform)
+    if base is not None or platform is not None:
+        source = with_held_joints(_of_stated(source))
     check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
+        source = _with_arms_as_motors(source)
     return completed(source)
+
+
+def _check_stated(source: Source, base: str | None, platform: str | None) -> None:
+    """Check the links that are stated for a file.
+
+    Raises
+    ------
+    UsageError
+        If the file names others itself, or has no such link.
+    """
+    for option, link in (("--base", base), ("--platform", platform)):
+        if link is None:
+            continue
+        if source.file.legcal is not None:
+            raise UsageError(
+                Problem(
+                    f"{option} could not be used",
+                    "a file with a block legcal, which names base and platform",
+                    "a file without it",
+                    f"write '{link}' in legcal.{option.removeprefix('--')}",
+                    str(source.path),
+                )
+            )
+        if link not in source.urdf.links:
+            raise UsageError(
+                Problem(
+                    f"{option} could not be used",
+                    f"the link '{link}', which is not in the file",
+                    "",
+                    closest(link, source.urdf.links),
+                    str(source.path),
+                )
+            )
+
+
+def _of_stated(source: Source) -> Source:
+    """Return a file with the loops of that mechanism alone whose platform or base is stated."""
+    loops = source.file.closed_loop
+    stated = {source.base, source.platform}
+    mine = {
+        link
+        for links, _ in moving_groups(source.urdf, loops)
+        if stated & {*links}
+        for link in links
+    }
+    kept = [
+        i
+        for i, pair in enumerate(loops)
+        if any(frame_link(source.urdf, frame) in mine for frame in pair)
+    ]
+    if not kept:
+        return source
+    update = {"closed_loop": [loops[i] for i in kept], "type": [source.file.type[i] for i in kept]}
+    file = source.file.model_copy(update=update)
+    return replace(source, file=file)
+
+
+def _is_drawn_closed(source: Source) -> bool:
+    """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
+    chain = _closed_chain(source)
+    poses = reference_poses(source.urdf).values()
+    size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
+    return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
+
+
+def _closed_chain(source: Source) -> ClosedChain:
+    """Return the tree of a mechanism with its closures."""
+    try:
+        return ClosedChain(source.urdf.text, _closures(source))
+    except ModelError as error:
+        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
+
+
+def _with_arms_as_motors(source: Source) -> Source:
+    """Return a mechanism without motors with those joints on its base as motors that move rods."""
+    urdf, closures = source.urdf, _closures(source)
+    with suppress(OutOfClass):
+        proposed_block(source, [])
+        return source  # moved by hand
+    with suppress(OutOfClass):
+        block = proposed_block(source, None)
+        bodies = rigid_bodies(urdf, closures, block.platform_joint)
+        turning = motors_on(bodies, urdf, bodies.body_of[block.base])
+        chains = find_chains(bodies, urdf, block.base, block.platform, turning)
+        moving = {chain.motor for chain in chains}
+        motors = [name for name in turning if name in moving]
+        note = (
+            f"The file names no motors: the {len(motors)} joints on the base that move rods "
+            f"({', '.join(motors)}) were taken as motors; name the motors in <transmission> "
+            "elements if some are not."
+        )
+        return replace(
+            source,
+            file=source.file.model_copy(update={"name_mot": motors}),
+            notes=(*source.notes, note),
+        )
+    return source
+
+
+def proposed_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
+    """Return the block ``legcal`` that is proposed for a file, as :func:`propose_block`."""
+    ends = source.base, source.platform
+    return propose_block(source.urdf, _closures(source), motors, source.path, ends)
+
+
+def _closures(source: Source) -> list[Closure]:
+    """Return the closures of a mechanism in the order of its file."""
+    return [
+        Closure("3d" if kind == "3d" else "6d", first, second)
+        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+    ]
 
 
 def _read_xml(path: Path) -> Source:
@@ -95,6 +221,16 @@ def _read_xml(path: Path) -> Source:
     root = parse_xml(path, content, "mechanism file")
     if root.tag == "mujoco":
         return read_mjcf_source(path, content)
+    if root.tag == "sdf":
+        raise ModelError(
+            Problem(
+                "the mechanism could not be read",
+                "an SDF file of Gazebo",
+                "a URDF or MJCF file",
+                "export the model as URDF or MJCF",
+                str(path),
+            )
+        )
     if root.tag != "robot":
         raise ModelError(
             Problem(
@@ -105,8 +241,9 @@ def _read_xml(path: Path) -> Source:
                 line=cast("int", root.sourceline),
             )
         )
-    if any(element.tag in LOOP_TAGS for element in root):
+    if any(element.tag in LOOP_TAGS for element in root) or closing_frames(root, path):
         return read_loop_source(path, content)
+    parse_urdf(path, content, travel_needed=False)  # a link with two parents closes a loop as well
     raise OutOfClass(
         Problem(
             "this is not a parallel mechanism",
@@ -258,8 +395,38 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
     return replaced
 
 
+def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
+    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot.
+
+    Raises
+    ------
+    ModelError
+        If one of a pair is missing.
+    """
+    ends: dict[str, dict[str, str]] = {}
+    for element in robot.findall("link"):
+        match = _CLOSING.fullmatch(element.get("name", ""))
+        if match:
+            ends.setdefault(match[1], {})[match[2]] = match[0]
+    for name, numbers in ends.items():
+        if len(numbers) == 1:
+            (number, link) = next(iter(numbers.items()))
+            other = f"closing_{name}_{3 - int(number)}"
+            raise ModelError(
+                Problem(
+                    "the loops could not be closed",
+                    f"the frame '{link}' and no '{other}'",
+                    "both ends of each loop",
+                    f"export the model again with both parts of the mate closing_{name}, or "
+                    f"remove '{link}'",
+                    str(path),
+                )
+            )
+    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+
+
 def read_loop_source(path: Path, content: bytes) -> Source:
-    """Return the mechanism of a URDF with loops.
+    """Return the mechanism of a URDF with loops: elements of its own, or pairs of closing frames.
 
     Motors are the prismatic joints named in ``<transmission>`` or ``<ros2_control>``, or all
     prismatic joints if none is named.
@@ -290,10 +457,16 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         if line:
             robot.append(etree.fromstring(line))
             robot[-1].tail = "\n"
+    named = closing_frames(robot, path)
+    if named:
+        notes.append(
+            f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
+            "joints."
+        )
     written = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
     file = MechanismFile(
-        closed_loop=[frames for frames, _ in pairs],
-        type=[kind for _, kind in pairs],
+        closed_loop=[*(frames for frames, _ in pairs), *named],
+        type=[*(kind for _, kind in pairs), *["3d"] * len(named)],
         name_mot=motors,
     )
     urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
@@ -436,14 +609,7 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
 
 def completed(source: Source) -> Source:
     """Return a mechanism without a block, completed with the closed poses and all travels."""
-    closures = [
-        Closure("3d" if kind == "3d" else "6d", first, second)
-        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
-    ]
-    try:
-        chain = ClosedChain(source.urdf.text, closures)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
+    closures, chain = _closures(source), _closed_chain(source)
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
@@ -487,7 +653,7 @@ def _levelled(
     """
     urdf = source.urdf
     try:
-        block = propose_block(urdf, closures, source.file.name_mot, source.path)
+        block = proposed_block(source, source.file.name_mot)
     except OutOfClass:
         return configuration  # refused later
     bodies = rigid_bodies(urdf, closures, block.platform_joint)

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
@@ -38,6 +39,7 @@ from legcal.machine.model import (
     readings_at_poses,
     slider_columns,
 )
+from legcal.machine.pose_input import Pose, pose_of
 from legcal.machine.redundancy import contradictions
 from legcal.machine.solved_poses import ROUNDING, TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
@@ -48,13 +50,15 @@ MIN_STEP = 1.0 / 4096.0  # least step, relative to the path between readings
 LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
 RANDOM_ANGLES = 6  # random starts for the angles of all legs
 FEW_RESTARTS = 2  # restarts of single legs that do not close
+MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
+MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 SAME_START = 2.5e-9  # tolerance of a start at the last pose [mean leg lengths, rotation matrix]
 FEW_STEPS = 12  # largest number of Newton steps
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
 
 def forward_kinematics(
-    mechanism: Machine, q: Array, start: RigidTransform | None = None
+    mechanism: Machine, q: ArrayLike, start: Pose | None = None
 ) -> RigidTransform:
     """Return the platform pose at motor readings.
 
@@ -62,10 +66,10 @@ def forward_kinematics(
     ----------
     mechanism : Machine
         The machine.
-    q : (n_legs,) array
-        Readings [m, rad]; legs without a motor are ignored and may be NaN. Of rods on one actuator
-        the first counts.
-    start : RigidTransform, optional
+    q : (n_legs,) or (n_motors,) array
+        Readings [m, rad] of legs or of motors. Those of legs without a motor are ignored and may
+        be NaN; of rods on one actuator the first counts.
+    start : RigidTransform, SE3 or (4, 4) array, optional
         T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``. The
         pose returned by the last call for this machine is fastest.
 
@@ -83,8 +87,9 @@ def forward_kinematics(
         If no closed pose is reached from ``start`` without crossing a singularity, or readings of
         redundant motors contradict each other by more than the errors of a nominal model.
     UsageError
-        If the readings are too few or not finite.
+        If the readings are too few, not finite, or so large that their unit must be wrong.
     """
+    start = None if start is None else pose_of(start)
     # Continue from the last configuration if this call starts at the last pose.
     T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
     away = np.zeros((4, 4)) if start is None or T_last is None else start.as_matrix() - T_last
@@ -110,7 +115,7 @@ class Follower:
     ----------
     mechanism : Machine
         The machine.
-    start : RigidTransform, optional
+    start : RigidTransform, SE3 or (4, 4) array, optional
         T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``.
 
     Attributes
@@ -128,7 +133,7 @@ class Follower:
         If the legs do not reach the start.
     """
 
-    def __init__(self, mechanism: Machine, start: RigidTransform | None = None) -> None:
+    def __init__(self, mechanism: Machine, start: Pose | None = None) -> None:
         _check_determined(mechanism)
         self._machine = mechanism
         self.configuration = mechanism.home_configuration
@@ -140,7 +145,7 @@ class Follower:
         """T_base_platform at the last readings."""
         return platform_pose(self._machine, self.configuration)
 
-    def place(self, T_base_platform: RigidTransform) -> RigidTransform:
+    def place(self, T_base_platform: Pose) -> RigidTransform:
         """Move the platform of the closed chain to a pose, with its legs, and return it.
 
         Raises
@@ -150,7 +155,7 @@ class Follower:
         DidNotConverge
             If the legs do not reach it; the configuration is then unchanged.
         """
-        projected, problem = project_pose(self._machine, T_base_platform)
+        projected, problem = project_pose(self._machine, pose_of(T_base_platform))
         if problem is not None:
             raise UsageError(
                 f"The pose could not be followed from its start: found {problem} there, needed "
@@ -159,13 +164,13 @@ class Follower:
         self.configuration = close_at(self._machine, projected, self.configuration, exact=False)
         return self.pose
 
-    def move_to(self, q: Array) -> RigidTransform:
+    def move_to(self, q: ArrayLike) -> RigidTransform:
         """Return the platform pose at readings, followed from the last ones.
 
         Parameters
         ----------
-        q : (n_legs,) array
-            Readings [m]; legs without a motor are ignored and may be NaN.
+        q : (n_legs,) or (n_motors,) array
+            Readings [m, rad], as for :func:`forward_kinematics`.
 
         Raises
         ------
@@ -173,7 +178,7 @@ class Follower:
             If no closed pose is reached without crossing a singularity, or readings contradict each
             other; the configuration is then unchanged.
         UsageError
-            If the readings are too few or not finite.
+            If the readings are too few, not finite, or of a wrong unit.
         """
         readings = _readings(self._machine, np.asarray(q, dtype=np.float64)[None])[0]
         reached = follow(self._machine, self.configuration, readings)
@@ -252,7 +257,7 @@ def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
         yield reached[-1]
 
 
-def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> Array:
+def inverse_kinematics(mechanism: Machine, T_base_platform: Pose) -> Array:
     """Return the joint value of every leg at a pose, ``q = sign (|AB| - q0)``.
 
     For a rod on an actuator it is the reading of the actuator, with ``|A(q) - B| = l``.
@@ -264,13 +269,14 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
     ----------
     mechanism : Machine
         The machine.
-    T_base_platform : RigidTransform
-        Pose of the platform link in the base link.
+    T_base_platform : RigidTransform, SE3 or (4, 4) array
+        Pose of the platform link in the base link [m].
 
     Returns
     -------
     (n_legs,) array
-        Joint values [m, rad]; zero for a leg of constant length on no actuator.
+        Joint values [m, rad]; zero for a leg of constant length on no actuator. Those of motors are
+        ``q[list(mechanism.motors)]``, in the order of ``mechanism.motor_names``.
 
     Raises
     ------
@@ -278,6 +284,13 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: RigidTransform) -> A
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
+    T_base_platform = pose_of(T_base_platform)
+    away = float(np.linalg.norm(T_base_platform.translation - mechanism.home.translation))
+    if away > MAX_AWAY * mechanism.size:
+        raise UsageError(
+            f"The readings could not be computed: found a pose {away:g} m from home, and legs of "
+            f"{mechanism.size:.3g} m; give translations in metres."
+        )
     problem = violated_constraint(mechanism, T_base_platform)
     if problem is not None:
         raise UsageError(
@@ -311,13 +324,27 @@ def _disagreement(
 
 def _readings(machine: Machine, q: Array) -> Array:
     """Return the readings of the motors, (n_rows, n_motors), checked."""
-    if q.ndim != 2 or q.shape[1] != machine.n_legs:
+    motors = list(machine.motors)
+    if q.ndim != 2 or q.shape[1] not in {machine.n_legs, len(motors)}:
+        of_motors = f", or ({len(motors)},), one for each motor" * (len(motors) < machine.n_legs)
         raise UsageError(
             f"The pose could not be computed: found readings of shape {q.shape[1:]}, needed "
-            f"({machine.n_legs},), one for each leg; pass them in the order of the legs."
+            f"({machine.n_legs},), one for each leg{of_motors}; pass them in this order."
         )
     _check_determined(machine)
-    readings = q[:, list(machine.motors)]
+    readings = q[:, motors] if q.shape[1] == machine.n_legs else q
+    legs = [machine.legs[j] for j in motors]
+    home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+    most = [MAX_TURN if leg.reads_angle else MAX_AWAY * machine.size for leg in legs]
+    far = np.argwhere(np.abs(readings - home) > most)
+    if len(far):
+        row, column = far[0]
+        unit, other = ("rad", "degrees") if legs[column].reads_angle else ("m", "mm")
+        raise UsageError(
+            f"The pose of row {row + 1} could not be computed: found the reading "
+            f"{readings[row, column]:g} {unit} of leg '{machine.leg_names[motors[column]]}', which "
+            f"reads {home[column]:.3g} {unit} at home, probably in {other}; convert the readings."
+        )
     lengths = machine.lengths_at(readings, machine.motors)
     wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths) & np.isfinite(readings)))
     if len(wrong):

@@ -26,6 +26,7 @@ from legcal.machine.classification import (
     actuator_of,
     joint_tolerance,
     leg_of,
+    parallel,
 )
 from legcal.machine.cylinders import (
     at_visible_heights,
@@ -39,7 +40,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
-from legcal.machine.formats import read_source
+from legcal.machine.formats import proposed_block, read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -51,6 +52,7 @@ from legcal.machine.leg import (
     JointType,
     LegChain,
 )
+from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
@@ -64,10 +66,11 @@ from legcal.machine.parameters import geometries, n_frame_legs, parametrization_
 from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
-from legcal.machine.spanning_tree import Source
+from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
+    VIRTUAL,
     Normals,
     any_joint,
     check_bodies,
@@ -78,7 +81,6 @@ from legcal.machine.topology import (
     normals_in_links,
     normals_of_closures,
     plane_of_motion,
-    propose_block,
     propose_frame,
 )
 from legcal.machine.urdf import Urdf, UrdfJoint
@@ -94,7 +96,14 @@ _DEVIATION = {  # messages, with an angle [deg]
 }
 
 
-def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machine:
+def load_mechanism(
+    model: str | Path,
+    *,
+    without: Collection[str] = (),
+    base: str | None = None,
+    platform: str | None = None,
+    leg_radius: float | None = None,
+) -> Machine:
     """Return the mechanism of a file, with its legs classified from geometry.
 
     Parameters
@@ -104,6 +113,10 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
         ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
     without : collection of str
         Sliders of legs that are treated as passive although ``name_mot`` lists them.
+    base, platform : str, optional
+        Links of a file without a block ``legcal`` in which several could be meant.
+    leg_radius : float, optional
+        Radius [m] of the legs that the file draws without a cylinder.
 
     Raises
     ------
@@ -112,11 +125,11 @@ def load_mechanism(model: str | Path, *, without: Collection[str] = ()) -> Machi
     OutOfClass
         If the method does not support the mechanism.
     """
-    source = read_source(model)
+    source = read_source(model, base, platform)
     if without:
         left = [name for name in source.file.name_mot if name not in without]
         source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
-    return _load(source)
+    return _load(replace(source, leg_radius=leg_radius))
 
 
 def _load(source: Source) -> Machine:
@@ -129,12 +142,22 @@ def _load(source: Source) -> Machine:
         Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
     ]
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
-    block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
+    if file.name_mot:
+        _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
+    try:
+        block = file.legcal or proposed_block(source, file.name_mot)
+    except OutOfClass:
+        _check_plane_of_arms(urdf, source.path)
+        raise
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
     machine = _assemble(source, block, closures)
+    drawn, round_parts = with_mesh_cylinders(machine, source.leg_radius)
+    if round_parts or drawn is not source.urdf:
+        source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
+        machine = _assemble(source, block, closures)
     urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
     if urdf is not source.urdf:
         machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
@@ -618,15 +641,35 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             )
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
-        raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                "a planar machine whose joints at A move on carriages or arms",
-                "a machine in space, or sliders along the legs",
-                "this machine cannot be calibrated with legcal",
-                str(path),
-            )
-        )
+        raise OutOfClass(_plane_of_arms("whose joints at A move on carriages or arms", path))
+
+
+def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
+    """Check that a machine without sliders moves in space.
+
+    Raises
+    ------
+    OutOfClass
+        If all axes are parallel: a planar machine of arms, such as a five-bar or a 3-RRR.
+    """
+    moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
+    poses = reference_poses(urdf)
+    axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
+    if len(axes) < 2 or any(joint.type == "prismatic" for joint in moving):
+        return
+    if all(parallel(axes[0], axis) for axis in axes):
+        raise OutOfClass(_plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path))
+
+
+def _plane_of_arms(kind: str, path: Path) -> Problem:
+    """Return the problem of a planar machine that has no sliders along its legs."""
+    return Problem(
+        "this mechanism is not supported",
+        f"a planar machine {kind}",
+        "a machine in space, or sliders along the legs",
+        "this machine cannot be calibrated with legcal",
+        str(path),
+    )
 
 
 def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,20 @@ from legcal.machine.urdf import number_list
 def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
     """Return the corners (n, 3) in the link [m] and the triangles (m, 3) of a mesh file.
 
-    They come from the scene of yourdfpy. Raises ValueError if the file holds no mesh.
+    Raises ValueError if the file holds no mesh.
     """
+    return _loaded(urdf_path, _alone(visual))
+
+
+@lru_cache(maxsize=512)  # a CAD export has hundreds, which are read for each part of a model
+def _loaded(urdf_path: Path, alone: bytes) -> tuple[Array, IntArray]:
+    """Return corners and triangles from the scene of yourdfpy of a URDF with one visual."""
     from yourdfpy import URDF  # half a second: imported only for meshes
 
-    name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+    name = etree.fromstring(alone).find("link/visual/geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
         scene: Any = URDF.load(
-            io.BytesIO(_alone(visual)),
+            io.BytesIO(alone),
             filename_handler=lambda fname: str(mesh_file(urdf_path, fname)),
         ).scene
         mesh = scene.to_geometry()
@@ -38,6 +45,7 @@ def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]
         raise ValueError(
             f"found no triangles in the mesh file '{name}', needed some; export it again"
         )
+    vertices.flags.writeable = False
     return vertices, faces.astype(np.intp)
 
 
@@ -68,3 +76,10 @@ def mesh_file(urdf_path: Path, name: str) -> Path | None:
             if (folder / tail).is_file():
                 return folder / tail
     return None
+
+
+def ray_caster(vertices: Array, triangles: IntArray | None) -> Any:
+    """Return the ray caster of trimesh for triangles: Embree, or a far slower one without it."""
+    import trimesh  # 30 MB and half a second: imported only for meshes
+
+    return trimesh.Trimesh(vertices, triangles, process=False).ray

@@ -2,8 +2,8 @@
 
 ``<connect>`` gives a ``3d`` closure and ``<weld>`` a ``6d`` one; motors are the joints of actuators
 and the slides of ``<jointpos>`` sensors. Elements for simulation only are ignored: cameras, lights,
-inertias, plugins, adhesion, and geoms other than cylinders and capsules. An unknown element of a
-body, constraint or geom type is refused, since it may be misspelt.
+inertias, plugins, adhesion, and geoms other than cylinders, capsules and meshes. An unknown element
+of a body, constraint or geom type is refused, since it may be misspelt.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from legcal.machine.spanning_tree import (
     Loop,
     LoopKind,
     Source,
-    TextCylinder,
     UrdfBuilder,
     close_loop,
+    mesh_xml,
     moving_groups,
+    origin_xml,
+    visual_xml,
 )
 from legcal.machine.urdf import Problems, Urdf, number_list, parse_urdf, parse_xml
 from legcal.machine.wording import MJCF
@@ -45,6 +47,7 @@ _LEFT_ALONE = ("inertial", "camera", "light", "plugin", "site")
 _GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 _NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
 _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
+_SHOWN_GROUPS = 2  # the last group of geoms that MuJoCo shows by default; others are collisions
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 Attributes = Mapping[str, str]
@@ -133,6 +136,11 @@ class MjcfReader:
         for top in root.iterfind("default"):
             self._read_defaults(top, "main", {})
         self._degrees, self._eulerseq, self._autolimits = True, "xyz", True
+        self._mesh_folder = ""
+        self._meshes = {
+            element.get("name") or Path(element.get("file", "")).stem: element
+            for element in root.iterfind("asset/mesh")
+        }
         for compiler in root.iterfind("compiler"):
             self._read_compiler(compiler)
 
@@ -147,22 +155,20 @@ class MjcfReader:
         for element in self.root.iterfind("worldbody//*[@name]"):
             if element.tag in ("body", "joint", "freejoint"):
                 self._names.add(str(element.get("name")))
-        visuals: list[TextCylinder] = []
+        visuals = ""
         pending: list[BodyElement] = []
         for world in self.root.findall("worldbody"):
             part = BodyElement(world, WORLD, EYE, world.get("childclass", "main"))
-            _, bodies, cylinders = self._contents(part)
-            visuals += cylinders
+            _, bodies, shown = self._contents(part)
+            visuals += shown
             pending += bodies
-        self.tree.link(WORLD, tuple(visuals))
+        self.tree.link(WORLD, visuals)
         while pending:
             pending = self._body(pending.pop(0)) + pending
 
-    def _contents(
-        self, body: BodyElement
-    ) -> tuple[list[BodyElement], list[BodyElement], list[TextCylinder]]:
-        """Return joints, bodies and cylinders of a body and its frames; register its sites."""
-        joints, bodies, cylinders = list[BodyElement](), list[BodyElement](), list[TextCylinder]()
+    def _contents(self, body: BodyElement) -> tuple[list[BodyElement], list[BodyElement], str]:
+        """Return joints, bodies and visuals of a body and its frames; register its sites."""
+        joints, bodies, visuals = list[BodyElement](), list[BodyElement](), ""
         pending = [body._replace(element=part) for part in body.element]
         while pending:
             part = pending.pop(0)
@@ -176,13 +182,12 @@ class MjcfReader:
             elif tag in ("joint", "freejoint"):
                 joints.append(part)
             elif tag == "geom":
-                cylinder = self._cylinder(part)
-                cylinders += [] if cylinder is None else [cylinder]
+                visuals += self._visual(part)
             elif tag == "site" and element.get("name"):
                 self._site(part)
             elif isinstance(tag, str) and tag not in (*_LEFT_ALONE, *_NOT_READ):
                 self.problems.add(element, "is no element of a body", "correct or remove it")
-        return joints, bodies, cylinders
+        return joints, bodies, visuals
 
     def _body(self, part: BodyElement) -> list[BodyElement]:
         """Write a body with its joints, and return its child bodies."""
@@ -197,7 +202,7 @@ class MjcfReader:
         T_parent_body = part.T_body_frame * self._pose(element, _attributes_of(element))
         self.poses[name] = self.poses[part.body] * T_parent_body
         inside = BodyElement(element, name, EYE, self._childclass(part))
-        joints, bodies, cylinders = self._contents(inside)
+        joints, bodies, visuals = self._contents(inside)
         at, T_at_body = part.body, T_parent_body
         if at == WORLD and self._is_free(joints):
             self.tree.joint(self._unused(f"{name}_free"), "floating", at, name, T_at_body)
@@ -207,7 +212,7 @@ class MjcfReader:
             at, T_at_body = self._joint(joint, at, T_at_body, last=last, only=only)
         if at != name:
             self.tree.joint(self._unused(f"{name}_fixed"), "fixed", at, name, T_at_body)
-        self.tree.link(name, tuple(cylinders))
+        self.tree.link(name, visuals)
         return bodies
 
     def _is_free(self, joints: list[BodyElement]) -> bool:
@@ -324,16 +329,18 @@ class MjcfReader:
             return None
         return lower, upper
 
-    def _cylinder(self, part: BodyElement) -> TextCylinder | None:
-        """Return the cylinder of a geom of type cylinder or capsule, else None."""
+    def _visual(self, part: BodyElement) -> str:
+        """Return the ``<visual>`` of a geom of type cylinder, capsule or mesh, else nothing."""
         element, attributes = part.element, self._attributes(part)
         kind = attributes.get("type", "sphere")
         if kind not in _GEOMS:
             self.problems.add(
                 element, f"has the type '{kind}', needed one of {', '.join(_GEOMS)}", "correct it"
             )
+        if kind == "mesh":
+            return self._mesh(part, attributes)
         if kind not in ("cylinder", "capsule") or "mesh" in attributes:
-            return None
+            return ""
         size = self._numbers(element, attributes, "size", (1, 2, 3))
         T, length = self._between(element, attributes)
         if T is None:
@@ -345,8 +352,26 @@ class MjcfReader:
                 "is a cylinder without a radius and a length above zero",
                 "write size, or fromto and size",
             )
-            return None
-        return TextCylinder(part.T_body_frame * T, float(size[0]), length)
+            return ""
+        return visual_xml(origin_xml(part.T_body_frame * T), float(size[0]), length)
+
+    def _mesh(self, part: BodyElement, attributes: Attributes) -> str:
+        """Return the ``<visual>`` of a mesh that MuJoCo shows (groups 0 to 2), else nothing."""
+        asset = self._meshes.get(attributes.get("mesh", ""))
+        group = number_list(attributes.get("group", "0"), 1)
+        if asset is None or group is None or group[0] > _SHOWN_GROUPS:
+            return ""
+        element, stated = asset, self._attributes(BodyElement(asset, WORLD, EYE, "main"))
+        scale = self._numbers(element, stated, "scale", (3,))
+        position = self._numbers(element, stated, "refpos", (3,))
+        turn = self._numbers(element, stated, "refquat", (4,))
+        T_file_mesh = RigidTransform.from_components(
+            np.zeros(3) if position is None else position,
+            Rotation.identity() if turn is None else Rotation.from_quat(np.roll(turn, -1)),
+        )
+        T = part.T_body_frame * self._pose(part.element, attributes) * T_file_mesh.inv()
+        file = str(Path(self._mesh_folder) / stated.get("file", ""))
+        return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
 
     def _site(self, part: BodyElement) -> None:
         """Register a site by name."""
@@ -648,6 +673,7 @@ class MjcfReader:
         self._eulerseq = sequence
         if element.get("angle") is not None:
             self._degrees = element.get("angle") != "radian"
+        self._mesh_folder = element.get("meshdir", element.get("assetdir", self._mesh_folder))
         if element.get("autolimits") is not None:
             self._autolimits = element.get("autolimits") != "false"
 
@@ -666,21 +692,16 @@ def _without_loose_bodies(
     urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
     """Return the tree without free bodies outside all closures, and the names of these."""
-    loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
+    moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
+    loose = {
+        link
+        for links, closed in moving_groups(urdf, frames)
+        if not closed and moved.isdisjoint(links)
+        for link in links
+    }
     if not loose:
         return urdf, []
     joints = [j for j in urdf.joints.values() if j.child in loose]
-    other = [j.name for j in joints if j.moves and j.type != "floating"]
-    if other:
-        raise OutOfClass(
-            Problem(
-                "the mechanism could not be read",
-                f"joints of something else beside it ('{other[0]}')",
-                "one mechanism in the file",
-                "remove the other bodies",
-                str(urdf.path),
-            )
-        )
     for joint in joints:
         del tree.joints[joint.name]
     for link in loose:

@@ -20,6 +20,7 @@ from legcal.machine.model import (
     vectors_A_to_B,
     vectors_at,
 )
+from legcal.machine.pose_input import Pose, pose_of
 from legcal.machine.solver import solve
 
 CLOSED = 2.5e-12  # residual of a closed chain [mean leg lengths, rad]
@@ -140,7 +141,7 @@ def _column_units(machine: Machine) -> Array:
     return units
 
 
-def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
+def singularity(mechanism: Machine, T_base_platform: Pose) -> float:
     """Return the smallest singular value of the dimensionless Jacobian of the legs' equations.
 
     Rows are the lengths of actuated and constant legs and all other constraints, as lengths at the
@@ -152,7 +153,7 @@ def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
     ----------
     mechanism : Machine
         The machine.
-    T_base_platform : RigidTransform
+    T_base_platform : RigidTransform, SE3 or (4, 4) array
         A pose; its readings need not be inside the travel.
 
     Returns
@@ -161,7 +162,7 @@ def singularity(mechanism: Machine, T_base_platform: RigidTransform) -> float:
         Zero at a singular pose, and if the motors do not determine the pose; of the order of the
         platform size in leg lengths at a good pose.
     """
-    return float(singularities(mechanism, T_base_platform.as_matrix()[None])[0])
+    return float(singularities(mechanism, pose_of(T_base_platform).as_matrix()[None])[0])
 
 
 def singularities(machine: Machine, poses: Array) -> Array:

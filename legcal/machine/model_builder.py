@@ -81,13 +81,13 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         motor, carried = motor_visuals(actuator, rods)
         on_base += motor
         tree.link(actuator.link)
-        tree.show(actuator.link, "".join(carried))
+        tree.link(actuator.link, "".join(carried))
         kind = actuator.kind.value
         moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
         links = "base", actuator.link
         _joint(tree, actuator.joint, kind, links, actuator.point, moving=moving)
     if on_base:
-        tree.show("base", "".join(on_base))
+        tree.link("base", "".join(on_base))
 
 
 def _hangs_from_base(leg: AssembledLeg) -> bool:
@@ -239,7 +239,7 @@ class _Branch:
             length = VISIBLE * leg.shortest_shown
             end = length if near else -length
         at = f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>'
-        self._tree.show(self._link, visual_xml(at, radius, length))
+        self._tree.link(self._link, visual_xml(at, radius, length))
 
 
 def _unit(vector: Array) -> Array:
@@ -253,6 +253,7 @@ class Created:
     machine: Machine  # the model as loaded again
     yaml_path: Path
     urdf_path: Path
+    notes: tuple[str, ...] = ()  # on what was assumed
 
 
 def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
@@ -273,7 +274,7 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
             "--output, or --force to replace them."
         )
     try:
-        return _write(machine, described.source, output)
+        return replace(_write(machine, described.source, output), notes=tuple(described.notes))
     except OSError as error:
         raise OutOfResources(
             f"{output}: the model could not be written: found '{error.strerror}', needed a folder "

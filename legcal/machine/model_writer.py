@@ -21,8 +21,7 @@ from legcal.errors import DidNotConverge, OutOfResources, Problem, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.files import FOLDER_YAML, read_file
-from legcal.machine.formats import XML_SUFFIXES
+from legcal.machine.files import FOLDER_YAML, is_xml, read_file
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -219,7 +218,7 @@ def _with_home(text: str, home: RigidTransform) -> str:
 
 def _is_written_down(machine: Machine) -> bool:
     """Return whether a mechanism has a YAML of our format, for its URDF as it is."""
-    if machine.yaml_path.suffix.lower() in XML_SUFFIXES:
+    if is_xml(machine.yaml_path):
         return False
     content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
     document = yaml.compose(content, Loader=yaml.SafeLoader)

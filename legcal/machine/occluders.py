@@ -25,7 +25,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.bodies import Bodies
 from legcal.machine.cylinders import Half, VisualCylinder, halves_of_leg, is_measured
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
-from legcal.machine.meshes import mesh_file, read_mesh
+from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
 from legcal.machine.urdf import Urdf, number_list, origins_of, parse_robot
 
 SIDES = 24  # sides of the prism around a round solid
@@ -276,10 +276,7 @@ def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
 @lru_cache(maxsize=256)
 def _caster(mesh: Occluder) -> Any:
     """Return the ray caster of a mesh."""
-    import trimesh  # 30 MB and half a second: imported only for meshes
-    from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-    return RayMeshIntersector(trimesh.Trimesh(mesh.corners, mesh.triangles, process=False))
+    return ray_caster(mesh.corners, mesh.triangles)
 
 
 def visual_solids(urdf: Urdf) -> list[VisualSolid]:
@@ -357,9 +354,12 @@ def occluders_of(
             radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
             low, high = corners[:, 2].min(), corners[:, 2].max()
             occluder = replace(occluder, corners=prism(radius, (float(low), float(high))))
-        try:
-            occluder.planes  # noqa: B018
-        except QhullError:  # flat
+        if solid.triangles is None:
+            try:
+                occluder.planes  # noqa: B018
+            except QhullError:  # flat
+                continue
+        elif np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)[-1] <= EMPTY:
             continue
         occluders.append(occluder)
     return tuple(occluders)

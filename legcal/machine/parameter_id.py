@@ -10,7 +10,8 @@ ARMS = ("arm_axis", "arm_point")  # kinds of the line of an arm
 _XYZ, _TWO = ("x", "y", "z"), ("1", "2")
 _COMPONENTS = {
     **dict.fromkeys(JOINTS, _XYZ),
-    **dict.fromkeys((*AXES, *ARMS, "direction", "axis", "axis_point"), _TWO),
+    **dict.fromkeys(AXES, (*_TWO, *_XYZ)),  # turns in R_b or R_e, and about the axes of a link
+    **dict.fromkeys((*ARMS, "direction", "axis", "axis_point"), _TWO),
 }
 _RADIUS = ".radius."
 

@@ -1,5 +1,6 @@
 """The YAML of a mechanism: its schema, strict reading, and writing."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -88,6 +89,7 @@ class MechanismFile(BaseModel):
 def read_mechanism_file(path: Path) -> MechanismFile:
     """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
     content = read_file(path, FILE_KIND)
+    _refuse_other_text(content, path)
     try:
         document = parse_yaml(content, path, FILE_KIND)
         _check_kind(document, path)
@@ -98,6 +100,30 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     if problems:
         raise ModelError(problems)
     return file
+
+
+_OTHER_TEXT = {  # kinds of files of other programs, by the first line that is no comment
+    "a HAL file of LinuxCNC": re.compile(rb"(loadrt|loadusr|setp|net|addf)\s"),
+    "a configuration with [sections]": re.compile(rb"\[[\w .:-]+\]\s*([#;].*)?$"),
+    "G-code": re.compile(rb"[GM]\d+(\s|$)"),
+}
+
+
+def _refuse_other_text(content: bytes, path: Path) -> None:
+    """Refuse files of other programs that hold dimensions but are no model."""
+    lines = (line.strip() for line in content.splitlines())
+    first = next((line for line in lines if line and line[:1] not in b"#;"), b"")
+    kind = next((kind for kind, pattern in _OTHER_TEXT.items() if pattern.match(first)), None)
+    if kind is not None:
+        raise ModelError(
+            Problem(
+                f"the {FILE_KIND} could not be read",
+                kind,
+                "a mechanism YAML, URDF or MJCF file",
+                f"make a model of it with: legcal new {path} -o DIR",
+                str(path),
+            )
+        )
 
 
 def _check_kind(document: Mapping[str, Any], path: Path) -> None:

@@ -38,19 +38,13 @@ class Source:
     poses: Mapping[str, RigidTransform] | None = None
     is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
     drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
+    base: str | None = None  # stated links of a file without a block
+    platform: str | None = None
+    leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
 
 
 FULL_TURN = 2.0 * pi
 EYE = RigidTransform.identity()
-
-
-@dataclass(frozen=True, eq=False)
-class TextCylinder:
-    """A visual cylinder on a link: its pose there, radius and length [m]."""
-
-    T_link_cylinder: RigidTransform
-    radius: float
-    length: float
 
 
 @dataclass
@@ -69,16 +63,7 @@ class UrdfBuilder:
             unused = f"{name}_{number}"
         return unused
 
-    def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
-        """Add a link with its visible cylinders."""
-        self.show(
-            name,
-            "".join(
-                visual_xml(origin_xml(c.T_link_cylinder), c.radius, c.length) for c in cylinders
-            ),
-        )
-
-    def show(self, name: str, visuals: str) -> None:
+    def link(self, name: str, visuals: str = "") -> None:
         """Add or replace a link with its visuals."""
         inside = f">{visuals}</link>" if visuals else "/>"
         self.links[name] = f"  <link name={_quoted(name)}{inside}"
@@ -137,6 +122,12 @@ def axis_xml(axis: Array) -> str:
 def visual_xml(at: str, radius: float, length: float) -> str:
     """Return the ``<visual>`` of a cylinder at an ``<origin>``."""
     shape = f'<cylinder radius="{radius!r}" length="{length!r}"/>'
+    return f"<visual>{at}<geometry>{shape}</geometry></visual>"
+
+
+def mesh_xml(at: str, file: str, scale: Array) -> str:
+    """Return the ``<visual>`` of a mesh file at an ``<origin>``."""
+    shape = f'<mesh filename={_quoted(file)} scale="{_numbers(scale)}"/>'
     return f"<visual>{at}<geometry>{shape}</geometry></visual>"
 
 

@@ -20,7 +20,7 @@ _HEAD = """\
 # Replace the numbers by those of your machine. Keys are explained in docs/formats.md.
 legcal_table: 1
 name: {name}
-unit: {unit:<24}# of every length here; mm or m
+unit: {unit:<24}# of every length here: mm, m, in, ...
 """
 _HEXAPOD = """
 # Joints of a leg from base to platform: R (hinge), U (cardan) or S (ball), with P for a slider.

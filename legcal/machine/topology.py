@@ -151,37 +151,131 @@ def _paths(
 
 
 def propose_block(
-    urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str], path: Path
+    urdf: Urdf,
+    closures: Sequence[Closure],
+    motors: Sequence[str] | None,
+    path: Path,
+    ends: tuple[str | None, str | None] = (None, None),
 ) -> LegcalBlock:
     """Return the default block ``legcal`` for a file without one.
+
+    Without *motors* all revolute joints on the base may be motors of arms. The links of base and
+    platform may be stated as *ends*.
 
     Raises
     ------
     OutOfClass
         If no body is the platform of separate legs of the class.
     """
+    bodies = rigid_bodies(urdf, closures, None)
+    root, problems = bodies.body_of[urdf.root], list[OutOfClass]()
+    blocks = dict[str, LegcalBlock]()
+    bases = [root, *_joined_bodies(bodies, urdf, root)]
+    if ends[0] is not None:
+        bases = [bodies.body_of[ends[0]]]
+    for base in bases:
+        on_base = motors_on(bodies, urdf, base) if motors is None else motors
+        try:
+            blocks[base] = _block_on(base, urdf, closures, on_base, path, ends)
+        except OutOfClass as error:
+            problems.append(error)
+        if root in blocks:
+            return blocks[root]
+    if len(blocks) > 1:
+        pairs = " or ".join(f"'{b.base}' (platform '{b.platform}')" for b in blocks.values())
+        raise OutOfClass(
+            Problem(
+                "no base could be proposed",
+                f"legs between several pairs of links, with the base {pairs}",
+                "one",
+                urdf.wording.state_ends,
+                str(path),
+            )
+        )
+    if not blocks:
+        raise problems[0]
+    return next(iter(blocks.values()))
+
+
+def _joined_bodies(bodies: Bodies, urdf: Urdf, root: str) -> list[str]:
+    """Return the bodies other than the root on which several chains end, in the file's order."""
+    ends = [body for c in _without_virtual(bodies, urdf) for body in c.bodies]
+    order = dict.fromkeys(bodies.body_of[link] for link in urdf.links)
+    return [body for body in order if body != root and ends.count(body) > 2]
+
+
+def motors_on(bodies: Bodies, urdf: Urdf, base: str) -> list[str]:
+    """Return the joints on a body that could be motors of arms, for a file that names none."""
+    return [
+        c.joint
+        for c in bodies.connections
+        if c.joint is not None and base in c.bodies and c.type == "revolute"
+    ]
+
+
+def _block_on(
+    base: str,
+    urdf: Urdf,
+    closures: Sequence[Closure],
+    motors: Sequence[str],
+    path: Path,
+    ends: tuple[str | None, str | None],
+) -> LegcalBlock:
+    """Return the default block ``legcal`` with a body as the base.
+
+    Raises
+    ------
+    OutOfClass
+        If no body is the platform of separate legs on it.
+    """
     virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
     bodies = rigid_bodies(urdf, closures, None)
-    base = bodies.body_of[urdf.root]
     real = replace(bodies, connections=_without_virtual(bodies, urdf))
     carried = [bodies.body_of[j.child] for j in virtual]
-    platform = _platform_body(real, base, carried, urdf, path, motors)
+    root = bodies.body_of[urdf.root]
+    base_link = ends[0] or urdf.root
+    if ends[0] is None and (base != root or not _is_used(urdf, closures, urdf.root)):
+        base_link = _main_link(urdf, closures, bodies, base)
+    if ends[1] is None:
+        platform = _platform_body(real, base, base_link, carried, urdf, path, motors)
+    else:
+        platform = bodies.body_of[ends[1]]
     carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
         base, platform}]  # fmt: skip
     joint = carrier[0].name if carrier else None
     link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
+    link = ends[1] or link
     bodies = rigid_bodies(urdf, closures, joint)
-    chains = in_order(find_chains(bodies, urdf, urdf.root, link, motors), motors, urdf)
+    chains = in_order(find_chains(bodies, urdf, base_link, link, motors), motors, urdf)
+    needed = n_frame_legs(spatial=plane_of_motion(chains) is None)
+    if len(chains) < needed and base != root and ends[0] is None:
+        raise OutOfClass(
+            Problem(
+                "this is not a platform on legs",
+                f"{len(chains)} legs on link '{base_link}'",
+                f"at least {needed}",
+                urdf.wording.state_ends,
+                str(path),
+            )
+        )
     joints = [distinct_joint(chain) for chain in chains]
     names = _leg_names(joints)
     block = LegcalBlock(
         version=1,
-        base=urdf.root,
+        base=base_link,
         platform=link,
         platform_joint=joint,
         legs=dict(zip(names, joints, strict=True)),
     )
     return block.model_copy(update={"base_frame": propose_frame(names, chains)})
+
+
+def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
+    """Return whether a moving joint or a closure is on a link itself."""
+    ends = {frame_link(urdf, frame) for c in closures for frame in (c.frame_1, c.frame_2)}
+    return link in ends or any(
+        j.moves and link in (j.parent, j.child) for j in urdf.joints.values()
+    )
 
 
 def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]:
@@ -584,9 +678,18 @@ def _not_a_chain(
         course = (
             f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         )
-        moved = "a motor in name_mot that moves this link"
-        needed = f"joints whose centres are fixed in the base, or {moved}"
+        needed = (
+            "joints whose centres are fixed in the base, or a motor in name_mot that moves this "
+            "link itself"
+        )
         remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
+        if first.joint in motors:
+            between = _name(steps[1].connection) if len(steps) > 1 else "another joint"
+            course = (
+                f"carries {n_onward} rods on link '{body}' behind {between}, which stands between "
+                f"them and the motor '{first.joint}'"
+            )
+            remedy = f"make {between} fixed if it does not move, otherwise "
     else:
         course = f"shares link '{body}' with another leg or branches there"
     return Problem(
@@ -639,7 +742,13 @@ def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
 
 
 def _platform_body(
-    bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path, motors: Sequence[str]
+    bodies: Bodies,
+    base: str,
+    base_link: str,
+    carried: Sequence[str],
+    urdf: Urdf,
+    path: Path,
+    motors: Sequence[str],
 ) -> str:
     """Return the body where the legs end: every chain from the base to it is a supported leg."""
     at: dict[str, list[str]] = {}
@@ -665,7 +774,7 @@ def _platform_body(
     platforms, reasons = [], list[OutOfClass]()
     for body in candidates:
         try:
-            find_chains(bodies, urdf, urdf.root, body, motors)
+            find_chains(bodies, urdf, base_link, body, motors)
         except OutOfClass as error:
             reasons.append(error)
         else:

@@ -524,8 +524,14 @@ def _limits(
     if bounds[0] is None or bounds[1] is None:
         return None
     lower, upper = bounds[0][0], bounds[1][0]
-    if lower > upper or (kind == "prismatic" and lower == upper):
+    if lower > upper:
         problems.add(element, f"has the limits {lower:g} to {upper:g}", "give the lower one first")
+    elif kind == "prismatic" and lower == upper:
+        problems.add(
+            element,
+            f"has the limits {lower:g} to {upper:g}, which leave it no travel",
+            "write the travel of its motor as lower and upper [m]",
+        )
     return lower, upper
 
 

@@ -2,7 +2,7 @@
 
 A mechanism YAML with a block ``legcal`` states home, base, platform and legs; without the block
 they follow from the tree and its drawn pose. MJCF files and URDFs with loops have no place for a
-block.
+block: what they leave open is an option of ``legcal inspect``, which writes a model with a block.
 """
 
 from __future__ import annotations
@@ -35,13 +35,17 @@ NO_BLOCK = Wording(
     state_ends="add a block legcal with base, platform and legs",
     correct_ends="add a block legcal with another base or platform",
 )
+_NAMED_ENDS = (
+    "name the links, with legcal inspect FILE --base LINK --platform LINK --write DIR, and use the "
+    "model in DIR"
+)
 _DRAWING = replace(
     NO_BLOCK,
     state_home="draw the machine nearer to closed",
     correct_home="correct the pose that the file draws",
     state_readings="draw the machine closed",
-    state_ends="write it as a URDF with a mechanism YAML that names base, platform and legs",
-    correct_ends="see that the root of the tree is the base",
+    state_ends=_NAMED_ENDS,
+    correct_ends=_NAMED_ENDS,
 )
 URDF_LOOPS = replace(_DRAWING, closures="<loop_joint> or <constraint>")
 MJCF = replace(_DRAWING, closures="<equality>", root="<worldbody>")

@@ -1,5 +1,5 @@
 """Pages for a browser, each a single file that needs no network and no other file.
 
 In goes a :class:`Page` of sections and blocks with plain texts; out comes HTML from one template
-(:func:`page_html`), with one style sheet and script, and plotly inside if it has plots.
+(:func:`page_html`), with one style sheet and the scripts that its blocks need.
 """

@@ -8,13 +8,11 @@ from __future__ import annotations
 import base64
 import gzip
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
-from markupsafe import Markup, escape
-
-from legcal.errors import printable
+from markupsafe import Markup
 
 MAX_ROWS = 2000  # maximum number of rows shown of a table
 Light = Literal["good", "doubtful", "bad"]
@@ -99,6 +97,7 @@ class Drawing:
     svg: Markup
     caption: str = ""
     wide: bool = True
+    title: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,20 +109,27 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Plot:
-    """A chart or a scene of plotly, drawn when it comes into sight.
+class Charts:
+    """Drawings side by side whose points stand for things with a label, and maybe a link.
 
-    A scene may have ``modes``, see ``page.js``: the motions of its sliders.
+    The paths of their points have the numbers of these things in ``data-points``.
     """
 
-    kind: ClassVar = "plot"
+    kind: ClassVar = "charts"
+    charts: Sequence[Drawing]
+    labels: Mapping[int, str]  # by number
+    links: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene in space on a canvas; its content is described in ``scene.js``."""
+
+    kind: ClassVar = "scene"
     name: str
-    data: Sequence[Mapping[str, Any]]
-    layout: Mapping[str, Any]
+    content: Mapping[str, Any]
     height: int
     caption: str = ""
-    extra: Mapping[str, Any] = field(default_factory=dict)
-    title: str = ""
 
 
 @dataclass(frozen=True)
@@ -240,12 +246,6 @@ class Page:
     subtitle: str
     verdict: Verdict | None
     sections: Sequence[Section]
-
-
-def plain(text: str, most: int = 60) -> str:
-    """Return a text for plotly, which would interpret tags in it; long texts are cut."""
-    shown = printable(text)
-    return str(escape(shown if len(shown) <= most else f"{shown[: most - 3]}..."))
 
 
 def number(value: float | None, digits: int, *, signed: bool = False) -> Number:

@@ -1,4 +1,4 @@
-"""A page as one HTML file: template, style sheet, script and, where it has plots, plotly inside."""
+"""A page as one HTML file: template, style sheet, and the scripts that its blocks need."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from legcal.errors import printable
 from legcal.files.folder import OutputFile
-from legcal.pages.document import LandmarkEditor, OutlineEditor, Page, Picture, Plot, Row
+from legcal.pages.document import LandmarkEditor, OutlineEditor, Page, Picture, Row, Scene
 from legcal.version import __version__
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ PAGE = OutputFile(
     "the page", "page", "", "a new file or an earlier page of legcal", mark=MARK.encode()
 )
 
-_EDITORS = {OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
+_SCRIPTS = {Scene: "scene.js", OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
 
 
 def time_of_page() -> str:
@@ -48,15 +48,16 @@ def page_html(page: Page) -> str:
             mark=MARK,
             version=__version__,
             style=_asset("page.css"),
-            script=_asset("page.js"),
-            editor_scripts=[
-                _asset(name)
-                for kind, name in _EDITORS.items()
-                if any(isinstance(block, kind) for block in blocks)
+            scripts=[
+                _asset("page.js"),
+                *(
+                    _asset(name)
+                    for kind, name in _SCRIPTS.items()
+                    if any(isinstance(block, kind) for block in blocks)
+                ),
             ],
             served=any(isinstance(block, LandmarkEditor) and block.token for block in blocks),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
-            plotly=_plotly() if any(isinstance(block, Plot) for block in blocks) else "",
         )
     )
 
@@ -85,8 +86,3 @@ def _shown(value: Any) -> Any:
 @cache
 def _asset(name: str) -> Markup:
     return Markup((files("legcal.pages") / "assets" / name).read_text("utf-8"))
-
-
-def _plotly() -> Markup:
-    """Return the script of plotly; its package has no smaller bundle."""
-    return Markup((files("plotly") / "package_data" / "plotly.min.js").read_text("utf-8"))

@@ -4,16 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
 
 from legcal.errors import printable
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
 _MAX_BARS = 14  # maximum number of bars of a histogram
 _FONT = 'font-family="system-ui, sans-serif"'
+_COLOURS = ("#1f5fa8", "#b26a00", "#1e7d46", "#8e44ad", "#b3261e", "#4a5568", "#00838f", "#6d4c41")
+_MARKS = (  # paths about a point, as different as their colours
+    "m-1.6 0a1.6 1.6 0 1 1 0 .1z",
+    "m-1.6-1.6h3.2v3.2h-3.2z",
+    "m0-2.2l2.2 2.2-2.2 2.2-2.2-2.2z",
+    "m-2 0h4m-2-2v4",
+    "m-1.6-1.6l3.2 3.2m0-3.2l-3.2 3.2",
+    "m0-2l2 3.4h-4z",
+    "m-2 0h4m-3-1.7l2 3.4m0-3.4l-2 3.4",
+    "m0 2l2-3.4h-4z",
+)
 
 
 @dataclass
@@ -53,10 +65,14 @@ class Canvas:
         anchor: str = "start",
         size: float = 12,
         colour: str = INK,
+        upwards: bool = False,
     ) -> None:
-        """Write a text."""
+        """Write a text, to the right or upwards."""
+        place = f'x="{x:.1f}" y="{y:.1f}"'
+        if upwards:
+            place = f'transform="translate({x:.1f} {y:.1f}) rotate(-90)"'
         self.parts.append(
-            f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size:g}" '
+            f'<text {place} text-anchor="{anchor}" font-size="{size:g}" '
             f'fill="{colour}">{escape(printable(text))}</text>'
         )
 
@@ -68,6 +84,12 @@ class Canvas:
             f'width="{self.width:g}" height="{self.height:g}" role="img" aria-label="{label}" '
             f"{_FONT}>" + "".join(self.parts) + "</svg>"
         )
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text without control characters, cut to *most* characters."""
+    shown = printable(text)
+    return shown if len(shown) <= most else f"{shown[: most - 3]}..."
 
 
 def ticks(low: float, high: float, n: int = 5) -> list[float]:
@@ -104,8 +126,7 @@ def change_bars(
     canvas.text(left, 16.0, f"change against the nominal model [{unit}]", size=12, colour=DIM)
     for k, (name, value, sigma) in enumerate(zip(names, values, sigmas, strict=True)):
         y = top + step * (k + 0.5)
-        shown = name if len(name) < 28 else f"{name[:25]}..."
-        canvas.text(left - 12.0, y + 4.0, shown, anchor="end", size=11.5)
+        canvas.text(left - 12.0, y + 4.0, shortened(name, 28), anchor="end", size=11.5)
         spread = "" if sigma is None else f" +- {sigma:.3g} {unit} (1 sigma)"
         tip = f"{name}: {value:+.4g} {unit}{spread}"
         canvas.box(zero + scale * min(value, 0.0), y - 4.5, scale * abs(value), 9.0, "#9dbbe0", tip)
@@ -152,8 +173,7 @@ def error_bars(
         canvas.text(x, height - 10.0, f"{10.0**decade:g}", anchor="middle", size=11, colour=DIM)
     for k, name in enumerate(names):
         y, sigma = top + step * (k + 0.5), sigmas[k]
-        word = name if len(name) < 28 else f"{name[:25]}..."
-        canvas.text(left - 12.0, y + 4.0, word, anchor="end", size=11.5)
+        canvas.text(left - 12.0, y + 4.0, shortened(name, 28), anchor="end", size=11.5)
         tips = (f"{name}, nominal: {before[k]:.3g} {unit}", f"calibrated: {after[k]:.3g} {unit}")
         canvas.box(left, y - 7.5, place(before[k]) - left, 7.0, "#d6dae0", tips[0])
         canvas.box(left, y + 0.5, place(after[k]) - left, 7.0, BLUE, f"{name}, {tips[1]}")
@@ -256,13 +276,9 @@ def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
     if size > 8.0:
         for k, name in enumerate(names):
             middle = left + size * (k + 0.5)
-            shown = name if len(name) < 20 else f"{name[:17]}..."
+            shown = shortened(name, 20)
             canvas.text(left - 6.0, middle + 3.5, shown, anchor="end", size=min(11.0, 0.8 * size))
-            canvas.parts.append(
-                f'<text transform="translate({middle + 3.5:.1f} {top - 6:.1f}) rotate(-90)" '
-                f'font-size="{min(11.0, 0.8 * size):g}" fill="{INK}">'
-                f"{escape(printable(shown))}</text>"
-            )
+            canvas.text(middle + 3.5, top - 6.0, shown, size=min(11.0, 0.8 * size), upwards=True)
     canvas.parts.append(
         f'<rect x="{left}" y="{top}" width="{size * n:.1f}" height="{size * n:.1f}" fill="none" '
         f'stroke="{RULE}"/>'
@@ -283,3 +299,83 @@ def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
                 f"<title>{tip}</title></rect>"
             )
     return canvas.markup()
+
+
+class Points(NamedTuple):
+    """Points of a chart, in the colour and shape of their group."""
+
+    x: Array  # (n,)
+    y: Array  # (n,)
+    numbers: IntArray  # (n,) what they stand for
+    group: int = 0
+
+
+def scatter(
+    title: str,
+    groups: Sequence[Points],
+    x_label: str,
+    y_label: str,
+    *,
+    words: Sequence[str] = (),
+    diagonal: bool = False,
+) -> Markup:
+    """Draw points, whose numbers are for the script of the page.
+
+    *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y.
+    """
+    left, top, width, height = 52.0, 8.0, 340.0, 290.0
+    x, y = (np.concatenate([points[k] for points in groups]) for k in range(2))
+    (x_low, x_high), (y_low, y_high) = _limits(x), _limits(y)
+    names = [shortened(word, 14) for word in words]
+    upwards = sum(map(len, names)) > 34
+    bottom = height - (44.0 if not upwards else 26.0 + 6.5 * max(map(len, names)))
+    if words:
+        x_low, x_high = -0.5, len(words) - 0.5
+    sx, sy = (width - left - 6.0) / (x_high - x_low), (bottom - top) / (y_high - y_low)
+
+    def on_paper(x: Array, y: Array) -> list[list[float]]:
+        uv = np.stack([left + sx * (x - x_low), bottom - sy * (y - y_low)], axis=-1)
+        return [[u, v] for u, v in uv.tolist()]
+
+    canvas = Canvas(width, height, title)
+    for tick in ticks(y_low, y_high, 5):
+        v = bottom - sy * (tick - y_low)
+        canvas.line(left, v, width - 6.0, v, GREY if tick == 0.0 else RULE)
+        canvas.text(left - 6.0, v + 4.0, f"{tick:g}", anchor="end", size=11, colour=DIM)
+    every = -(-len(names) // 24)
+    marks = list(zip(range(len(names)), names, strict=True))[::every] if words else [
+        (tick, f"{tick:g}") for tick in ticks(x_low, x_high, 5)
+    ]  # fmt: skip
+    for tick, word in marks:
+        u = left + sx * (tick - x_low)
+        if not words:
+            canvas.line(u, top, u, bottom)
+        if upwards:
+            canvas.text(
+                u + 4.0, bottom + 6.0, word, anchor="end", size=11, colour=DIM, upwards=True
+            )
+        else:
+            canvas.text(u, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
+    canvas.line(left, top, left, bottom, GREY)
+    if diagonal:
+        ends = np.array([max(x_low, y_low), min(x_high, y_high)])
+        (x1, y1), (x2, y2) = on_paper(ends, ends)
+        canvas.line(x1, y1, x2, y2, GREY)
+    for points in groups:
+        colour, mark = (of[points.group % len(of)] for of in (_COLOURS, _MARKS))
+        path = "".join(f"M{u:.1f} {v:.1f}{mark}" for u, v in on_paper(points.x, points.y))
+        numbers = " ".join(map(str, points.numbers.tolist()))
+        canvas.parts.append(
+            f'<path d="{path}" data-points="{numbers}" fill="{colour}" stroke="{colour}" '
+            'fill-opacity="0.7" stroke-opacity="0.8"/>'
+        )
+    canvas.text(left + 0.5 * (width - left), height - 6.0, x_label, anchor="middle", size=12)
+    canvas.text(12.0, 0.5 * (top + bottom), y_label, anchor="middle", size=12, upwards=True)
+    return canvas.markup()
+
+
+def _limits(values: Array) -> tuple[float, float]:
+    """Return the ends of an axis: those of the values with a margin."""
+    low, high = float(values.min()), float(values.max())
+    margin = 0.04 * (high - low) or 1.0
+    return low - margin, high + margin

@@ -99,6 +99,7 @@ class PoseCandidates:
     by_outlines: bool | None = None  # whether outlines measured at the poses support the first
     # one; None where pairs were clear
     along_edges: float = 0.0  # legs with edges along them at the first pose, where it is by edges
+    is_given: bool = False  # whether clicks on joints have the first pose
 
     @property
     def needed(self) -> float:
@@ -134,6 +135,8 @@ class PoseCandidates:
     @property
     def is_convincing(self) -> bool:
         """Whether the first pose is accepted."""
+        if self.is_given:
+            return True
         if self.by_outlines is not None:
             return self.by_outlines
         return self.is_enough and (self.hinted or self.leads)
@@ -315,6 +318,15 @@ def place_near(
     return replace(candidates, hinted=True)
 
 
+def place_at(
+    pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
+) -> PoseCandidates:
+    """Return a camera pose that clicks give, as it is: pictures hardly show the legs."""
+    T = T_base_camera.inv()
+    pose = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
+    return replace(_candidates(Pictures.of(pictures), pose), hinted=True, is_given=True)
+
+
 def with_first(
     placed: PoseCandidates, i: int, pose: CameraPoses, pictures: Sequence[Picture]
 ) -> PoseCandidates:
@@ -491,6 +503,8 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 def may_be_mirrored(original: PoseCandidates) -> bool:
     """Return whether a placed view needs to be compared with its mirror image."""
+    if original.is_given:
+        return False
     return not original.is_convincing or original.share < NOT_MIRRORED_SUPPORT
 
 

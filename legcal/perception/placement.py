@@ -307,6 +307,7 @@ class Group:
     some: list[int]  # a few of them, at even distances
     view_of_row: dict[int, int]
     hint: RigidTransform | None  # T_base_group, roughly
+    is_placed: bool = False  # by clicks: the hint is its camera where its images show too little
 
     def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
         """Return the pictures of some rows, in the frame of the group."""
@@ -337,11 +338,13 @@ def group_views(
         T = {v: RigidTransform.identity() for v in group}
         if joined is not None and group == together:
             T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
-        given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
-        hint = None if not given else given[0][0] * given[0][1].inv()
+        given = [(hint, v) for v in group if (hint := hints[v]) is not None]
+        placed = [(hint, v) for hint, v in given if measurements.views[v].is_placed]
+        known = [hint * T[v].inv() for hint, v in placed or given]
         spread = np.unique(
             np.rint(np.linspace(0, len(rows_of_group) - 1, min(NEAR_IMAGES, len(rows_of_group))))
         )
         some = [rows_of_group[k] for k in spread.astype(int).tolist()]
-        found.append(Group(group, T, rows_of_group, some, view_of, hint))
+        hint = known[0] if known else None
+        found.append(Group(group, T, rows_of_group, some, view_of, hint, bool(placed)))
     return found

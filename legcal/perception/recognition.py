@@ -29,6 +29,7 @@ from legcal.perception.camera_search import (
     is_mirrored,
     may_be_mirrored,
     mirrored,
+    place_at,
     place_by_edges,
     place_camera,
     place_near,
@@ -151,6 +152,10 @@ class PlacedViews:
     def _decided(self, radii: RadiusFactors, run: Run) -> Placement:
         """Return the views together, by outlines where pairs are ambiguous."""
         placed = list(run(self.decided_by_outlines, range(len(self.groups))))
+        for g, (group, one) in enumerate(zip(self.groups, placed, strict=True)):
+            if group.is_placed and group.hint is not None and not one.is_convincing:
+                seen = self.of_group(g, [r for r in group.rows if r in self.pictures])
+                placed[g] = place_at(seen, group.hint, self.search.n_legs)
         return _gathered(replace(self, placed=placed), radii, run)
 
     def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:

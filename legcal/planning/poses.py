@@ -70,12 +70,18 @@ def surely_reached(
     """Return a mask of poses that random machines within tolerance reach at the same readings.
 
     Near a singularity, or at the boundary of the workspace, small errors make poses unreachable.
+    Readings of redundant motors contradict each other in all machines but one: there the pose of
+    least squares counts, where all rods have their lengths.
     """
     reached = np.ones(len(poses.poses), dtype=np.bool_)
     if not machine.is_determined or not len(reached):
         return reached
     rng, nearby = np.random.default_rng(0), platforms_in_base(machine, poses.poses)
-    measured = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.PASSIVE]
+    measured = [
+        j
+        for j, leg in enumerate(machine.legs)
+        if leg.kind is not LegKind.PASSIVE and not (machine.is_redundant and leg.is_motor)
+    ]
     t_nearby = Frames.of(nearby).t
     wider = replace(setting, length=_WIDER * setting.length, angle=_WIDER * setting.angle)
     for _ in range(N_REACHING):
@@ -84,7 +90,7 @@ def surely_reached(
         ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
         A, target_length = _at_readings(drawn, poses.readings)
         length = np.linalg.norm(ends - A, axis=2)
-        residual = np.abs(length - target_length)[:, measured].max(axis=1)
+        residual = np.abs(length - target_length)[:, measured].max(axis=1, initial=0.0)
         moved = np.linalg.norm(t - t_nearby, axis=1)
         reached &= (residual < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
     return reached

@@ -11,7 +11,7 @@ import numpy as np
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.reading_units import sigmas_of
-from legcal.errors import DatasetError, NotIdentifiable, UsageError
+from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.feasibility import poses_at
 from legcal.machine.kinematics import follow_each
@@ -129,6 +129,7 @@ def plan(
         If one of the processes is ended from outside, or the cluster lost.
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
+    _check_visible(machine)
     setting = default_setting(machine.size) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
     n_views = _n_views(cameras, len(listed), hand_held=hand_held)
@@ -189,7 +190,7 @@ def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[s
     return Choices(priors={f"{rod.name}.length": Prior(rod.q0, sigma)}), (
         f"Angle readings do not determine the scale; the plan assumes that the rod of {rod.name} "
         f"is measured to {1e3 * sigma:.2g} mm (legcal calibrate --length "
-        f"{ends}={1e3 * rod.q0:.3f}+-{1e3 * sigma:.2g}mm, with the measured value).",
+        f"{ends}=MEASURED±{1e3 * sigma:.2g}mm).",
     )
 
 
@@ -305,6 +306,27 @@ def _n_images(images: int | None, per_view: int | None, n_views: int, target: fl
             f"each at least; give {n_views} --images or more, or fewer --cameras."
         )
     return n
+
+
+def _check_visible(machine: Machine) -> None:
+    """Refuse a machine none of whose legs and arms a camera can see.
+
+    Raises
+    ------
+    ModelError
+        If the model has no cylinder along any of them.
+    """
+    if not any(leg.cylinders or leg.arm for leg in machine.legs):
+        raise ModelError(
+            Problem(
+                "no session could be planned",
+                "no leg with a visible cylinder in the model",
+                "the radius of one leg at least",
+                "add <visual> cylinders along the legs, or write a model with: legcal "
+                "inspect FILE --leg-radius MM --write DIR",
+                str(machine.urdf_path),
+            )
+        )
 
 
 def _check(

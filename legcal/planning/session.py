@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.calibration.closeness import PLAN_NAME
+from legcal.calibration.closeness import PLAN_NAME, POSES_NAME
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
@@ -71,7 +71,7 @@ def write_session(
             CAMERA: camera_info(plan.camera, "camera"),
             DATASET_YAML: _dataset(plan, yaml_path.relative_to(folder).as_posix()),
             MEASUREMENTS: _measurements(plan),
-            "poses.csv": _poses(plan),
+            POSES_NAME: _poses(plan),
             PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
             **(pictures or {}),
         }

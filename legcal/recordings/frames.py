@@ -7,6 +7,7 @@ import re
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from datetime import UTC
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
@@ -25,7 +26,11 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
 MAX_FRAMES = 1_000_000
-_STAMP = re.compile(r"\d{10,19}", re.ASCII)  # a Unix time in s, ms, us or ns
+# A Unix time: seconds with a fraction after a point, or after _ in ms, us or ns; or whole s, ms, us
+# or ns.
+_STAMP = re.compile(
+    r"(?<!\d)(?:(\d{10})(?:\.(\d{1,9})|_(\d{3}|\d{6}|\d{9}))(?!\d)|(\d{10,19}))", re.ASCII
+)
 _LOST = 0.02  # share of missing frames of a video, below which its length is just rounded
 
 
@@ -138,6 +143,13 @@ class ImageFolder:
                 "camera); for photographs of single poses use legcal init."
             )
         ordered = sorted(photographs, key=lambda p: times[p.name] or 0.0)
+        for before, after in pairwise(ordered):
+            if times[before.name] == times[after.name]:
+                raise DatasetError(
+                    f"{self.path}: {after.name} could not be used: found the time of {before.name} "
+                    "again, needed one of its own for each image; write the fraction of the second "
+                    "into the names, as in 1700000000.125.png."
+                )
         for number, photograph in enumerate(ordered):
             if only is not None and number not in only:
                 continue
@@ -167,6 +179,9 @@ def _taken(photograph: Photograph) -> float | None:
 
 
 def stamp_in(text: str) -> float | None:
-    """Return the Unix time [s] in a text, in any unit, or None."""
+    """Return the last Unix time [s] in a text, in any unit, or None."""
     stamps = _STAMP.findall(text)
-    return unix_seconds(float(stamps[-1])) if stamps else None
+    if not stamps:
+        return None
+    seconds, after_point, after_line, whole = stamps[-1]
+    return unix_seconds(float(whole)) if whole else float(f"{seconds}.{after_point or after_line}")

@@ -10,16 +10,16 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
-from legcal.calibration.link_joints import FRAMES, joints_title, mark_in_words
+from legcal.calibration.link_joints import joints_title, mark_in_words
+from legcal.calibration.quantities import DIGITS, FRAMES, joints_of, parameters_of
 from legcal.calibration.summary import (
     NUMBERS,
-    UNITS,
-    ParameterTable,
     brief_sentences,
     residuals_in_words,
     sentences,
     tables,
 )
+from legcal.files.quantity import SHOWN_IN
 from legcal.machine.parameter_id import ParameterId
 from legcal.report.render import report, table
 
@@ -82,17 +82,13 @@ def _platform(platform: PlatformBlock) -> RenderableType:
 
 def _largest_changes(result: Result) -> RenderableType | None:
     """Return the lengths and coordinates that changed most, joints in the links."""
-    rows = [
-        (f"{row['leg']}.{row['joint']}.{row['axis']}", row["change"], row["sigma"])
-        for row in ParameterTable.of_joints(result)
-        if row["sigma"] is not None
+    others = [q for q in parameters_of(result) if not q.parameter.is_joint_coordinate]
+    changes = [
+        (q.name, q.change, q.sigma)
+        for q in (*joints_of(result), *others)
+        if q.unit == "mm" and q.change is not None and q.sigma is not None
     ]
-    rows += [
-        (row["parameter"], row["change"], row["sigma"])
-        for row in ParameterTable.of(result, joints=False)
-        if row["unit"] == "mm" and row["sigma"] is not None
-    ]
-    largest = sorted(rows, key=lambda row: -abs(row[1]))[:_LARGEST]
+    largest = sorted(changes, key=lambda row: -abs(row[1]))[:_LARGEST]
     if not largest:
         return None
     return table(
@@ -134,7 +130,8 @@ def _amount(explanation: Explanation) -> str:
     components = zip(change.components, change.units, change.links, strict=True)
     numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
     for (name, unit, link), (value, sigma) in zip(components, numbers, strict=True):
-        scale, shown, digits = UNITS[unit]
+        scale, shown = SHOWN_IN[unit]
+        digits = DIGITS[shown]
         amount = f"{scale * value:+.{digits}f} {shown}"
         moved = f"{amount} in {name} of {link}" if link else f"{name} {amount}"
         parts.append(f"{moved} (1 sigma {scale * sigma:.{digits}f})")
@@ -150,7 +147,7 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
             f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
             f"(max {dX.max():.4f}), orientation {dE.mean():.4f} deg (max {dE.max():.4f})"
         )
-    scale = np.array([UNITS[unit][0] for unit in evaluation.units])
+    scale = np.array([SHOWN_IN[unit][0] for unit in evaluation.units])
     values, references = scale * evaluation.values, scale * evaluation.references
     rows = [
         (name, f"{value:z.4f}", f"{reference:z.4f}", f"{value - reference:+z.4f}")

@@ -1,4 +1,4 @@
-"""Positions of joints at readings, and their motion by a calibration or a weak direction."""
+"""A machine beside another model of it: nominal and calibrated, or moved along a direction."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
-from legcal.machine.drawing import motor_lines
+from legcal.machine.drawing import corners_of_base, motor_lines
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import Parametrization
+from legcal.machine.parameters import Parametrization, moved_legs, parametrization_of
 from legcal.machine.rods import ends_in_base, first_rods
+from legcal.scene.shapes import around, ellipsoids
 
 if TYPE_CHECKING:
     from legcal.calibration.documents import Result
@@ -37,41 +38,91 @@ class PlacedModel(NamedTuple):
         """Return the geometry at a share of the difference to another model, or beyond it."""
         return PlacedModel(*(a + share * (b - a) for a, b in zip(self, other, strict=True)))
 
-    def first_step(self, other: PlacedModel, size: float) -> int:
-        """Return the default index of ``FACTORS`` for the difference to another model."""
-        moved = max(float(np.abs(other.A - self.A).max()), float(np.abs(other.B - self.B).max()))
-        wanted = _SHOWN * size / max(moved, 1e-12)
+
+class MachineScene:
+    """A machine with the models that it is compared with.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine, whose frames R_b and R_e both models have.
+    legs : sequence of Leg
+        The legs that are shown, in R_b and R_e.
+    nominal : sequence of Leg, optional
+        The legs of the nominal model.
+    result : Result, optional
+        The document of the calibration: the source of directions and ellipsoids.
+    parameters : Parametrization, optional
+        The parameters of the calibration, by default those of the machine.
+
+    Attributes
+    ----------
+    size : float
+        Size of the machine at home [m].
+    rims : dict
+        Joints, or motors of the base, in order around base and platform, the first twice.
+    directions : list of (str, (p,) array)
+        Names and steps of the parameters along weak and held directions.
+    ellipsoids : dict
+        Half axes of one sigma at the joints, (n, 3, 3) [m], by side.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        legs: Sequence[Leg],
+        nominal: Sequence[Leg] | None = None,
+        result: Result | None = None,
+        parameters: Parametrization | None = None,
+    ) -> None:
+        self.machine, self.legs, self.nominal = machine, legs, nominal
+        A, B = machine.A_base, machine.home.apply(machine.B_platform)
+        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
+        anchors = motor_lines(machine.legs, A[None]).anchors
+        self.rims = {"base": around(corners_of_base(A, anchors)), "platform": around(B)}
+        self._parameters = parameters or parametrization_of(machine, twists=True)
+        length = float(np.mean(np.linalg.norm(B - A, axis=1)))
+        self.directions = [] if result is None else _steps(result, self._parameters, length)
+        self.ellipsoids = {} if result is None else ellipsoids(result)
+
+    def placed(
+        self,
+        legs: Sequence[Leg],
+        q: Array,
+        near: Sequence[RigidTransform],
+        *,
+        by_readings: bool = True,
+    ) -> PlacedModel:
+        """Return the geometry of legs in R_b and R_e, motors and platform at readings q (k, n).
+
+        Poses T_Rb_Re are solved *near* others, which are kept unless *by_readings*. Motors are
+        fixed in the base link, even if A defines R_b.
+        """
+        poses = near
+        if by_readings:
+            from legcal.calibration.joint_fit.platform import poses_at_readings
+
+            poses = poses_at_readings(self.machine, legs, q, near)
+        frame = self.machine.T_base_Rb
+        A, B = ends_in_base(legs, frame, *components(poses), q[:, first_rods(legs)])
+        turn = frame.rotation.as_matrix()
+        lines = motor_lines(legs, (A - frame.translation) @ turn)
+        return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
+
+    def moved(self, direction: int) -> tuple[Leg, ...]:
+        """Return the legs after a step along a direction."""
+        return moved_legs(self.legs, self._parameters.place, self.directions[direction][1])
+
+    def first_step(self, before: PlacedModel, after: PlacedModel) -> int:
+        """Return the default index of ``FACTORS`` for the difference between two models."""
+        moved = max(
+            float(np.abs(after.A - before.A).max()), float(np.abs(after.B - before.B).max())
+        )
+        wanted = _SHOWN * self.size / max(moved, 1e-12)
         return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
 
 
-def placed_model(
-    machine: Machine,
-    legs: Sequence[Leg],
-    q: Array,
-    near: Sequence[RigidTransform],
-    *,
-    by_readings: bool = True,
-) -> PlacedModel:
-    """Return the geometry of legs in R_b and R_e, motors and platform at readings q (k, n).
-
-    Poses T_Rb_Re are solved *near* others, which are kept unless *by_readings*. Motors are fixed in
-    the base link, even if A defines R_b.
-    """
-    poses = near
-    if by_readings:
-        from legcal.calibration.joint_fit.platform import poses_at_readings
-
-        poses = poses_at_readings(machine, legs, q, near)
-    frame = machine.T_base_Rb
-    A, B = ends_in_base(legs, frame, *components(poses), q[:, first_rods(legs)])
-    turn = frame.rotation.as_matrix()
-    lines = motor_lines(legs, (A - frame.translation) @ turn)
-    return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
-
-
-def directions(
-    result: Result, parameters: Parametrization, length: float
-) -> list[tuple[str, Array]]:
+def _steps(result: Result, parameters: Parametrization, length: float) -> list[tuple[str, Array]]:
     """Return steps of the parameters (p,) along weak and held directions, with words.
 
     Weak steps are one standard deviation long, held ones a small fraction of the leg *length* [m],

@@ -198,8 +198,8 @@ class PaperSummary:
         ).document()
 
     def files(self) -> dict[str, bytes]:
-        """Return figure 4, to look at in a browser and as a picture."""
-        return {"fig4.html": _as_html(self), "fig4.png": _as_png(self)}
+        """Return figure 4 as a picture, and as a drawing to enlarge."""
+        return {"fig4.svg": _figure(self, "svg"), "fig4.png": _figure(self, "png")}
 
 
 class EstimatorRow(Document):
@@ -286,50 +286,9 @@ def _label(name: str) -> str:
     return f"{_LETTERS[kind]}{leg.removeprefix('leg')}{''.join(axis)}"
 
 
-def _as_html(summary: PaperSummary) -> bytes:
-    """Return the figure as one HTML page that works without a network."""
-    import plotly.graph_objects as go
-    from plotly.subplots import make_subplots
-
-    grid, names = _panels(summary), list(map(_label, summary.names))
-    n_rows, n_columns = len(grid), len(grid[0])
-    decades = np.log10(_limits(grid)).tolist()
-    tick = {"symbol": "line-ew", "size": 9, "line": {"width": 2, "color": _LIMIT}}
-    line = {"color": _LINE, "width": 1}
-    figure = make_subplots(
-        rows=n_rows,
-        cols=n_columns,
-        specs=[[{"secondary_y": True}] * n_columns] * n_rows,
-        subplot_titles=[panel.title for row in grid for panel in row],
-        vertical_spacing=0.1,
-        horizontal_spacing=0.18,
-    )
-    for i, row in enumerate(grid):
-        for j, panel in enumerate(row):
-            place = {"row": i + 1, "col": j + 1}
-            left, right = {**place, "secondary_y": False}, {**place, "secondary_y": True}
-            for trace, axis in (
-                (go.Bar(x=names, y=panel.errors, name=_BARS, marker_color=_BAR), left),
-                (
-                    go.Scatter(x=names, y=panel.limit, name=_MARKS, mode="markers", marker=tick),
-                    left,
-                ),
-                (go.Scatter(x=names, y=panel.truth, name=_TRUE, line=line), right),
-            ):
-                trace.update(showlegend=i == j == 0, legendgroup=trace.name)
-                figure.add_trace(trace, **axis)
-            figure.update_yaxes(title_text=_ERROR_AXIS, type="log", range=decades, **left)
-            figure.update_yaxes(title_text=_TRUTH_AXIS, showgrid=False, **right)
-    figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
-    figure.update_layout(
-        title=_title(summary), height=360 * n_rows, template="plotly_white", legend_orientation="h"
-    )
-    page: str = figure.to_html(include_plotlyjs=True, include_mathjax=False, div_id="fig4")
-    return page.encode()
-
-
-def _as_png(summary: PaperSummary) -> bytes:
-    """Return the figure as a PNG picture."""
+def _figure(summary: PaperSummary, kind: str) -> bytes:
+    """Return the figure as a file of a kind: svg or png."""
+    import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -353,7 +312,9 @@ def _as_png(summary: PaperSummary) -> bytes:
     figure.suptitle(_title(summary), fontsize=11, y=1.0 - 0.15 / height)
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+    with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
+        figure.savefig(content, format=kind, dpi=110, metadata=metadata)
     return content.getvalue()
 
 

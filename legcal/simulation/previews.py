@@ -34,7 +34,7 @@ def preview(
         camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
     )
     first = Configurations(poses.configurations[:1], poses.readings[:1], poses.poses[:1])
-    (posed,) = pose_machine(machine, dressed(machine), first)
+    (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), first)
     if board is not None:
         posed = PlacedBoard(board.board, board.T_base_board).beside(posed)
     rng = np.random.default_rng(0)

@@ -47,7 +47,7 @@ from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, SimulationSettings
-from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
+from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
@@ -188,8 +188,10 @@ class _Simulator:
         """Return boards and cameras around the machine, according to plan and settings."""
         # Meshes are beside the nominal URDF; the URDF of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
-        is_solid = self.settings.occlusion or self.settings.level == Level.PHOTOGRAPHS
-        solids = dressed(replace(self.truth, urdf=urdf)) if is_solid else ()
+        has_images = self.settings.level == Level.PHOTOGRAPHS
+        solids: tuple[Solid, ...] = ()
+        if self.settings.occlusion or has_images:
+            solids = dressed(replace(self.truth, urdf=urdf), meshes_needed=has_images)
         posed = pose_machine(self.truth, solids, poses)
         on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:

@@ -20,7 +20,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
 from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
-from legcal.machine.meshes import mesh_file, read_mesh
+from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
 from legcal.machine.urdf import number_list, origins_of, parse_robot
@@ -89,12 +89,19 @@ def _check(urdf_path: Path, element: etree._Element) -> None:
             raise ValueError(f'found <{tag} {name}="{text}">, needed {needed}; write it [m]')
 
 
+def _is_empty(element: etree._Element) -> bool:
+    """Return whether a shape is a box without a size."""
+    sizes = number_list(element.get("size", ""), 3) if element.tag == "box" else None
+    return sizes is not None and not any(sizes)
+
+
 def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
     """Check that a mesh has a file and a size."""
     name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
     if mesh_file(urdf_path, name) is None:
         raise ValueError(
-            f"found no mesh file '{name}', needed it beside the URDF; copy it or correct the name"
+            f"found no mesh file '{name}', needed it beside the URDF; copy it, correct the name, "
+            "or simulate with --level outlines, which draws no meshes"
         )
     factors = number_list(scale, 3)
     if factors is None or min(abs(factor) for factor in factors) == 0.0:
@@ -185,8 +192,12 @@ class PlacedSolid:
     T_base_solid: RigidTransform
 
 
-def solids_of(machine: Machine) -> tuple[Solid, ...]:
-    """Return the visuals of a mechanism, with the legs that they are coaxial with."""
+def solids_of(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, ...]:
+    """Return the visuals of a mechanism, with the legs that they are coaxial with.
+
+    Empty boxes, which CAD exports put on links without a part, are left out, and so are meshes that
+    cannot be read unless they are needed.
+    """
     urdf = machine.urdf
     robot = parse_robot(urdf.path, urdf.content)
     colours = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
@@ -197,12 +208,14 @@ def solids_of(machine: Machine) -> tuple[Solid, ...]:
         link, number = element.get("name", ""), 0
         for visual in element.findall("visual"):
             geometry = visual.find("geometry")
-            if geometry is None or len(geometry) == 0:
+            if geometry is None or len(geometry) == 0 or _is_empty(geometry[0]):
                 continue
             try:
                 _check(urdf.path, geometry[0])
                 shape, T = _shown(urdf.path, visual)
             except ValueError as error:
+                if geometry[0].tag == "mesh" and not meshes_needed:
+                    continue
                 problems.append(
                     f"{urdf.path}, line {visual.sourceline}: the visual of link "
                     f"'{link}' could not be shown: {error}."
@@ -280,7 +293,7 @@ _POST = Material(albedo=0.04, specular=0.10, shininess=20.0, limb=0.3)
 _PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=0.06)
 
 
-def dressed(machine: Machine) -> tuple[Solid, ...]:
+def dressed(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, ...]:
     """Return all solids of a mechanism in pictures: its visuals, and parts added to these.
 
     A link without a visual gets balls at the joint centres and, for three joints or more, a round
@@ -288,7 +301,7 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
     balls only, and a base with nothing but such motors nothing. Both plates of a planar machine are
     below its legs, the plate of the base lowest, so that the legs are visible from above.
     """
-    shown = solids_of(machine)
+    shown = solids_of(machine, meshes_needed=meshes_needed)
     bare = {machine.base, machine.platform} - {s.link for s in shown if s.leg is None}
     radii = np.array([_radius(leg, machine) for leg in machine.legs])
     added: list[Solid] = []
@@ -462,10 +475,7 @@ def pose_machine(
 @lru_cache(maxsize=8)  # several cameras see one machine, and there may be thousands of machines
 def _caster(posed: PosedMachine) -> Any:
     """Return the ray caster of a machine."""
-    import trimesh  # 30 MB and half a second: only where there are solids
-    from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-    return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
+    return ray_caster(posed.vertices, posed.faces)
 
 
 @lru_cache(maxsize=256)  # links share shapes, and each camera sees all of them

@@ -113,7 +113,7 @@ def draw_radii(
     counts: dict[str, int] = {}
     radii: dict[tuple[str, int], float] = {}
     tubes: dict[tuple[int, int], list[tuple[str, int]]] = {}
-    for solid in solids_of(nominal):
+    for solid in solids_of(nominal, meshes_needed=False):
         if isinstance(solid.shape, SolidCylinder) and solid.link is not None:
             place = solid.link, counts.setdefault(solid.link, 0)
             counts[solid.link] += 1

@@ -384,7 +384,8 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
     if not any(leg.cylinders for leg in legs):
         return (
             f"{start} no leg with a visible cylinder in the model, needed URDF visuals that are "
-            "cylinders coaxial with the legs; add them."
+            "cylinders coaxial with the legs; add them, or write a model with: legcal "
+            "inspect FILE --leg-radius MM --write DIR."
         )
     most = max(leg.share for view in views for leg in view)
     if most >= MIN_SHARE:

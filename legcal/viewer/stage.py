@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -13,9 +12,9 @@ from legcal.machine.drawing import corners_of_base, motor_lines
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, moved_legs, parametrization_of
-from legcal.scene.motions import FACTORS, PlacedModel, directions, placed_model
-from legcal.scene.shapes import around, ellipsoids, enlargement
+from legcal.machine.parameters import geometries
+from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
+from legcal.scene.shapes import enlargement
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 
@@ -54,27 +53,30 @@ class Stage:
 
     Attributes
     ----------
+    scene : MachineScene
+        The machine, its nominal model and its directions of motion.
     size : float
         Size of the machine at home [m].
-    rims : tuple of two lists of int
-        Joints of base and platform in order around it, the first twice.
     rod_legs : (m,) array of int
         The leg of each rod.
     rod_is_thick : (m,) array of bool
         Whether it belongs to the half at the base.
     n_standing : int
         Number of fixed parts, which are first in ``Seen.motors``.
-    motions : tuple of str
-        Names of further motions: weak and held directions.
+    magnification : float
+        Factor by which ellipsoids are enlarged.
     """
 
     def __init__(self, source: Source) -> None:
         self.source = source
         self.machine: Machine = source.machine
-        self._legs = geometries(self.machine)
-        self._nominal = None if source.nominal is None else geometries(source.nominal)
-        A, B = self.machine.A_base, self.machine.home.apply(self.machine.B_platform)
-        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
+        self.scene = MachineScene(
+            self.machine,
+            geometries(self.machine),
+            None if source.nominal is None else geometries(source.nominal),
+            None if source.result is None else source.result.result,
+        )
+        self.size = self.scene.size
         parts = [
             (j, c.radius, c.side == "base", c)
             for j, leg in enumerate(self.machine.legs)
@@ -87,38 +89,16 @@ class Stage:
         thin = _THIN * self.size
         self._radii = np.array([p[1] for p in parts] + [thin] * len(bare))
         self.n_standing = len(self.machine.actuators)
-        home = motor_lines(self.machine.legs, A[None])
+        home = motor_lines(self.machine.legs, self.machine.A_base[None])
         thickest = float(self._radii.max())
         self._motor_radii = thickest * np.array(
             [_STANDING] * self.n_standing + [_MOVING] * home.moving.shape[1]
         )
-        self.rims = around(corners_of_base(A, home.anchors)), around(B)
         self.ball_radii = _JOINT * np.array(
             [self._radii[self.rod_legs == j].max() for j in range(self.machine.n_legs)]
         )
-
-    @cached_property
-    def _directions(self) -> list[tuple[str, Array]]:
-        if self.source.result is None:
-            return []
-        parameters = parametrization_of(self.machine, twists=True)
-        A, B = self.machine.A_base, self.machine.home.apply(self.machine.B_platform)
-        length = float(np.mean(np.linalg.norm(B - A, axis=1)))
-        return directions(self.source.result.result, parameters, length)
-
-    @property
-    def motions(self) -> tuple[str, ...]:
-        """Names of the weak and held directions."""
-        return tuple(words for words, _ in self._directions)
-
-    @cached_property
-    def ellipsoids(self) -> tuple[dict[str, Array], float]:
-        """Half axes of one sigma by side, (n, 3, 3) [m], and their magnification."""
-        if self.source.result is None:
-            return {}, 1.0
-        axes = ellipsoids(self.source.result.result)
         radius = max(_USUAL * self.size, _WIDER * float(self.ball_radii.max()))
-        return axes, enlargement(axes, radius)
+        self.magnification = enlargement(self.scene.ellipsoids, radius)
 
     def compared(
         self, posture: Posture, motion: int | None = None
@@ -127,23 +107,19 @@ class Stage:
 
         They differ by the calibration, or by one sigma along the direction with index *motion*.
         """
-        here = self._placed(self._legs, posture, by_readings=False)
+        here = self._here(posture)
         if motion is not None:
-            parameters = parametrization_of(self.machine, twists=True)
-            step = self._directions[motion][1]
-            moved = moved_legs(self._legs, parameters.place, step)
-            return here, self._placed(moved, posture)
-        if self._nominal is None:
+            return here, self._placed(self.scene.moved(motion), posture)
+        if self.scene.nominal is None:
             return None
-        return self._placed(self._nominal, posture), here
+        return self._placed(self.scene.nominal, posture), here
 
     def first_step(self, posture: Posture, motion: int) -> int:
         """Return the index of the default magnification for a direction."""
         compared = self.compared(posture, motion)
         if compared is None:
             return FACTORS.index(1)
-        before, after = compared
-        return before.first_step(after, self.size)
+        return self.scene.first_step(*compared)
 
     def seen(
         self,
@@ -167,7 +143,7 @@ class Stage:
         """
         compared = self.compared(posture, motion)
         if compared is None:
-            here, before, apart = self._placed(self._legs, posture, by_readings=False), None, 0.0
+            here, before, apart = self._here(posture), None, 0.0
         else:
             before, after = compared
             apart = float(np.linalg.norm(np.subtract(after[:2], before[:2]), axis=-1).max())
@@ -183,19 +159,23 @@ class Stage:
             apart,
         )
 
-    def _placed(
-        self, legs: Sequence[Leg], posture: Posture, *, by_readings: bool = True
-    ) -> PlacedModel:
-        """Return the model of legs at the readings of a posture, k = 1."""
+    def _here(self, posture: Posture) -> PlacedModel:
+        """Return the machine at a posture, k = 1."""
         near = platform_in_base(self.machine, posture.T)
-        by_readings = by_readings and self.machine.is_determined
-        return placed_model(self.machine, legs, posture.q[None], [near], by_readings=by_readings)
+        return self.scene.placed(self.scene.legs, posture.q[None], [near], by_readings=False)
+
+    def _placed(self, legs: Sequence[Leg], posture: Posture) -> PlacedModel:
+        """Return a model at the readings of a posture, k = 1, if readings determine its pose."""
+        near = platform_in_base(self.machine, posture.T)
+        by_readings = self.machine.is_determined
+        return self.scene.placed(legs, posture.q[None], [near], by_readings=by_readings)
 
     def _skeleton(self, placed: PlacedModel) -> Array:
         """Return legs, motors and rims as lines (m, 2, 3)."""
         A, B = placed.A[0], placed.B[0]
         lines = [np.stack([A, B], axis=1), _motors(placed)]
-        for joints, rim in zip((corners_of_base(A, placed.anchors), B), self.rims, strict=True):
+        rims = self.scene.rims.values()
+        for joints, rim in zip((corners_of_base(A, placed.anchors), B), rims, strict=True):
             lines.append(np.stack([joints[rim[:-1]], joints[rim[1:]]], axis=1))
         return np.concatenate(lines)
 

@@ -176,8 +176,8 @@ class Window:
                 flat_shading=True, cast_shadow=False,
             )
             for name, joints, rim, colour in (
-                ("/base", seen.base, stage.rims[0], _BASE),
-                ("/platform", seen.B, stage.rims[1], _PLATFORM),
+                ("/base", seen.base, stage.scene.rims["base"], _BASE),
+                ("/platform", seen.B, stage.scene.rims["platform"], _PLATFORM),
             )
         ]  # fmt: skip
         self._frame = scene.add_frame(
@@ -196,8 +196,10 @@ class Window:
             thickness_units="screen",
             visible=False,
         )  # fmt: skip
-        axes, enlarged = stage.ellipsoids
-        self._ellipsoid_axes = {side: enlarged * of_side for side, of_side in axes.items()}
+        axes = stage.scene.ellipsoids
+        self._ellipsoid_axes = {
+            side: stage.magnification * of_side for side, of_side in axes.items()
+        }
         self._ellipsoids = None
         if axes:
             rotations, scales = zip(
@@ -267,7 +269,9 @@ class Window:
             self._motors.batched_wxyzs = seen.motors.wxyz.astype(np.float32)
             self._motors.batched_scales = seen.motors.scale.astype(np.float32)
         self._balls.batched_positions = np.concatenate([seen.A, seen.B]).astype(np.float32)
-        for plate, joints, rim in zip(self._plates, (seen.base, seen.B), stage.rims, strict=True):
+        for plate, joints, rim in zip(
+            self._plates, (seen.base, seen.B), stage.scene.rims.values(), strict=True
+        ):
             plate.vertices = _plate(joints, rim)[0]
         T = posture.T
         self._frame.position, self._frame.wxyz = T.translation, T.rotation.as_quat()[[3, 0, 1, 2]]
@@ -450,9 +454,11 @@ class Window:
         with gui.add_folder("Calibration"):
             self._show_beside = gui.add_checkbox("grey beside it", True)
             self._show_ellipsoids = gui.add_checkbox("uncertainty", True)
-            enlarged = stage.ellipsoids[1]
-            gui.add_markdown(f"Ellipsoids: 1 sigma, {enlarged:g} times as large.")
-            options = (_PLAIN, *(f"{k + 1}. {w}" for k, w in enumerate(stage.motions)))
+            gui.add_markdown(f"Ellipsoids: 1 sigma, {stage.magnification:g} times as large.")
+            options = (
+                _PLAIN,
+                *(f"{k + 1}. {w}" for k, (w, _) in enumerate(stage.scene.directions)),
+            )
             self._show = gui.add_dropdown("show", options)
             self._play = gui.add_checkbox("play", False)
             self._exaggerate = gui.add_slider(

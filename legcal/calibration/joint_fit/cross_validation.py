@@ -56,7 +56,7 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     """
     if problem.n_elements < 2:
         return None
-    problem = _with_weights(problem, state)
+    problem = with_weights(problem, state)
     linear, block = linearize(problem, state), _blocks(state)
     squares, dof = squares_of_left_out(problem, state, linear, block)
     n = problem.n_kinematic
@@ -79,7 +79,7 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     return CrossValidation(squares, dof, gain)
 
 
-def _with_weights(problem: FitProblem, state: State) -> FitProblem:
+def with_weights(problem: FitProblem, state: State) -> FitProblem:
     """Replace the robust loss by the weights that it gives measurements at a state."""
     weighted = []
     for factor in problem.factors:

@@ -473,6 +473,7 @@ class Readings:
     sign: Array  # (n,) sign of the reading in the length
     length: Array  # (n,) sign * q: the leg length without its offset [m]
     sigma: Array  # (n,) standard deviations [m]
+    by_zero: Array  # (n, n_own_zeros) derivative of residuals by the zeros of some images
     n_legs: int  # of the mechanism
     memory: Memory = field(default_factory=Memory, repr=False)
 
@@ -489,8 +490,12 @@ class Readings:
         return -self.sign * rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
-        """Return the leg closures |AB| - sign q - q0, (n, 1) [m], with their derivatives."""
-        rows: Residuals = self.memory.of(lambda: self._rows(state), state.legs, state.platform_pose)
+        """Return the leg closures |AB| - sign q - q0, (n, 1) [m], with their derivatives.
+
+        Of readings q less the zeros of some images.
+        """
+        inputs = state.legs, state.platform_pose, state.own_zeros
+        rows: Residuals = self.memory.of(lambda: self._rows(state), *inputs)
         return rows
 
     def _rows(self, state: State) -> Residuals:
@@ -498,19 +503,21 @@ class Readings:
         R_pose = _by_measurement(state.platform_pose.R, self.pose)
         along = end - state.A.T[:, self.leg]
         length = np.sqrt(np.einsum("in,in->n", along, along))
-        slope, n_q = np.empty((7, 1, len(self))), state.platform_pose.q.shape[1]
+        n_q, n_kept = state.platform_pose.q.shape[1], 7 + len(state.own_zeros)
+        slope = np.empty((n_kept, 1, len(self)))
         np.divide(along, length, out=slope[3:6, 0])
-        slope[:3], slope[6] = -slope[3:6], -1.0
+        slope[:3], slope[6], slope[7:, 0] = -slope[3:6], -1.0, self.by_zero.T
 
         def chain(slope: Array) -> tuple[Array, Array]:
             by_length = slope.T
-            b, J = by_length[3:6], np.zeros((13 + n_q, *by_length.shape[1:]))
-            J[:3], J[6], J[10:13] = by_length[:3], by_length[6], b
+            b, J = by_length[3:6], np.zeros((n_kept + 6 + n_q, *by_length.shape[1:]))
+            J[:3], J[6:n_kept], J[n_kept + 3 : n_kept + 6] = by_length[:3], by_length[6:], b
             np.einsum("jin,jqn->iqn", R_pose, b, out=J[3:6])
-            J[7:10] = _cross(arm[:, None], b)
-            return J[:7].T, J[7:].T
+            J[n_kept : n_kept + 3] = _cross(arm[:, None], b)
+            return J[:n_kept].T, J[n_kept:].T
 
-        return Residuals((length - self.length - state.lengths[self.leg])[:, None], slope.T, chain)
+        r = length - self.length + self.by_zero @ state.own_zeros - state.lengths[self.leg]
+        return Residuals(r[:, None], slope.T, chain)
 
     @cached_property
     def _end(self) -> IntArray:
@@ -519,7 +526,7 @@ class Readings:
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor; readings do not depend on intrinsics."""
         del keys
-        touches = (("legs", self.leg, slice(0, 7)),)
+        touches = (("legs", self.leg, slice(0, 7)), _own_zeros(self.by_zero))
         whitening = 1.0 / self.sigma[:, None, None]
         return Factor("readings", self.rows, touches, len(self), 1, self.pose, whitening)
 
@@ -534,7 +541,24 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
     sigma = measurements.sigma_of(legs.nominal)[leg]
     sign = legs.sign[leg].astype(np.float64)
-    return Readings(leg, pose, sign, length[pose, leg], sigma, legs.n_legs)
+    by_zero = sign[:, None] * _in_own_zeros(measurements, legs, leg, pose)
+    return Readings(leg, pose, sign, length[pose, leg], sigma, by_zero, legs.n_legs)
+
+
+def _in_own_zeros(
+    measurements: Measurements, legs: FittedLegs, leg: IntArray, pose: IntArray
+) -> Array:
+    """Return which readings have a zero of their own, (n, n_own_zeros) zeros and ones."""
+    motors = np.array([nominal.motor_label for nominal in legs.nominal], dtype=object)
+    own = measurements.own_zeros
+    has = [(motors == one.motor)[leg] & one.rows[measurements.first_rows][pose] for one in own]
+    return np.array(has, dtype=np.float64).reshape(len(own), len(leg)).T
+
+
+def _own_zeros(by_zero: Array) -> Touch:
+    """Return that readings depend on the zeros of some images."""
+    n, n_zeros = by_zero.shape
+    return "own_zeros", np.tile(np.arange(n_zeros, dtype=np.intp), (n, 1)), _ONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -545,6 +569,7 @@ class ActuatorReadings:
     pose: IntArray  # (n,) indices
     reading: Array  # (n,) [m or rad]
     sigma: Array  # (n,) standard deviations in the same unit
+    by_zero: Array  # (n, n_own_zeros) derivative of residuals by the zeros of some images
     leg: IntArray  # (n,) indices of the first rod on each actuator
 
     def __len__(self) -> int:
@@ -564,14 +589,14 @@ class ActuatorReadings:
         q = state.platform_pose.q
         by_posture = np.zeros((len(self), 1, 6 + q.shape[1]))
         by_posture[np.arange(len(self)), 0, 6 + self.actuator] = 1.0
-        r = q[self.pose, self.actuator] - self.reading
-        return Residuals.of(r[:, None], np.zeros((len(self), 1, 0)), by_posture)
+        r = q[self.pose, self.actuator] - self.reading + self.by_zero @ state.own_zeros
+        return Residuals.of(r[:, None], self.by_zero[:, None], by_posture)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor; readings depend only on the posture."""
+        """Return the factor; readings depend on the posture, and on zeros of some images."""
         del keys
-        whitening = 1.0 / self.sigma[:, None, None]
-        return Factor("actuator_readings", self.rows, (), len(self), 1, self.pose, whitening)
+        whitening, touches = 1.0 / self.sigma[:, None, None], (_own_zeros(self.by_zero),)
+        return Factor("actuator_readings", self.rows, touches, len(self), 1, self.pose, whitening)
 
 
 def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> ActuatorReadings:
@@ -582,7 +607,8 @@ def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> 
     actuator, pose = np.nonzero(np.isfinite(q).T)
     sigma = measurements.sigma_of(legs.nominal)[first]
     leg = np.array(first, dtype=np.intp)[actuator]
-    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator], leg)
+    by_zero = _in_own_zeros(measurements, legs, leg, pose)
+    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator], by_zero, leg)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,10 +2,10 @@
 
 The blocks, in the order of x: kinematic parameters (``legs``), ``radii``, intrinsics (``cameras``),
 ``board_scale`` of the board on each link, common-mode edge ``biases``, all of which have names;
-``camera_pose`` and ``board_pose``; and the eliminated ``platform_pose``. Another kind of
-measurement is a class with a factor, registered in
+``camera_pose``, ``board_pose`` and ``own_zeros`` of encoders in some images; and the eliminated
+``platform_pose``. Another kind of measurement is a class with a factor, registered in
 :class:`legcal.calibration.joint_fit.factors.Observed`; what it depends on besides is a field of
-:class:`State` and a block in :func:`_built`.
+:class:`State` and a block in :func:`_build_problem`.
 """
 
 from __future__ import annotations
@@ -193,6 +193,7 @@ class FitProblem(EstimationProblem[State]):
             Frames.of(start.T_camera_Rb),
             Frames.of([start.T_Rb_board, start.T_Re_board]),
             self.postures(start.legs, start.T_Rb_Re),
+            np.zeros(self.block("own_zeros").n_unknowns),
         )
 
     def postures(self, legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
@@ -372,6 +373,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
         no_biases,
         Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("board_pose", board_pose, Frames.moved, max_step=_MAX_STEP),
+        Variables("own_zeros", all_free(observed.readings.by_zero.shape[1], 1)),
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),

@@ -1,30 +1,43 @@
-"""Absolute scale of a machine: from a measured length, or from radii alone.
+"""Absolute scale of a machine: its witnesses, and how they agree with each other.
 
 Encoders of arms measure angles, and passive legs have none. Without a measured length, such a
 machine at twice the size, with rods twice as thick and cameras twice as far, gives the same
-measurements.
+measurements. Where several things say a length, each pair of them can be compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+from scipy.special import ndtri
 
-from legcal.calibration.joint_fit.diagnostics import RADIUS_SIGMAS, stated_parameters
+from legcal.calibration.joint_fit.cross_validation import with_weights
+from legcal.calibration.joint_fit.diagnostics import stated_parameters
+from legcal.calibration.joint_fit.factors import measured_lengths
+from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_of_length
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.sensitivity import Sensitivity
+from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
 from legcal.errors import DidNotConverge, NotIdentifiable
+from legcal.estimation.problem import Linearization, linearize
+from legcal.estimation.solver import inverse_on_range, normal_equations
+from legcal.estimation.uncertainty import residual_changes, response, score_test
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
+from legcal.vision.board import LINKS
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
-_FEWEST = 3  # radii
-_SPREAD = 0.25  # of their common difference
+TRAVEL, BOARD = "the travel of the motors", "the calibration board"
+RADII, MODEL = "the radii", "the nominal model"
+CHANCE = 0.0027  # of any pair of a healthy session to disagree
+_CLEARLY = 4.0  # squared sigmas, by which the others agree better without one witness
 _LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters with a length
 
 
@@ -93,18 +106,38 @@ def sensitivity_to_scale(
 
 def scale_witnesses(problem: FitProblem) -> list[str]:
     """Return what says how large the machine is, besides radii and the nominal model, in words."""
-    priors = problem.choices.priors
-    lengths = [n for n in priors if ":" in n or ParameterId.parse(n).kind in _LENGTHS]
-    return [*_witnesses_in_images(problem), *(f"the stated {name}" for name in lengths)]
+    return [*_witnesses_in_images(problem), *(name for name, _ in _stated_lengths(problem))]
 
 
 def _witnesses_in_images(problem: FitProblem) -> list[str]:
     """Return the measured lengths that images come with: readings, a board."""
-    actuators = actuators_of(problem.legs.nominal)
-    read = problem.observed.actuator_readings.actuator.tolist()
-    has_travel = len(problem.readings) > 0 or any(not actuators[a].turns for a in read)
     has_board = any(len(corners) for corners in problem.boards)
-    return ["the travel of the motors"] * has_travel + ["the calibration board"] * has_board
+    return [TRAVEL] * bool(_travel(problem)) + [BOARD] * has_board
+
+
+def _travel(problem: FitProblem) -> dict[str, Array]:
+    """Return the readings of motors by factor, (n,) [m]; zero where they are angles."""
+    actuators = actuators_of(problem.legs.nominal)
+    of_actuators = problem.observed.actuator_readings
+    turns = np.array([a.turns for a in actuators], dtype=np.bool_)[of_actuators.actuator]
+    travel = {
+        "readings": -problem.readings.by_scale,
+        "actuator_readings": np.where(turns, 0.0, of_actuators.reading),
+    }
+    return {name: lengths for name, lengths in travel.items() if lengths.any()}
+
+
+def _stated_lengths(problem: FitProblem) -> list[tuple[str, list[str]]]:
+    """Return stated lengths in words with the names of their priors; coordinates count together."""
+    lengths, coordinates = list[tuple[str, list[str]]](), list[str]()
+    for name in sorted(problem.choices.priors):
+        kind = "" if ":" in name else ParameterId.parse(name).kind
+        if kind in ("base", "platform"):
+            coordinates.append(name)
+        elif not kind or kind in _LENGTHS:
+            lengths.append((f"the stated {name}", [name]))
+    together = [("the stated coordinates of joints", coordinates)] if coordinates else []
+    return lengths + together
 
 
 def single_witness(problem: FitProblem) -> str:
@@ -118,20 +151,190 @@ def single_witness(problem: FitProblem) -> str:
     )
 
 
-def scale_notes(problem: FitProblem, state: State) -> tuple[str, ...]:
-    """Return a note on radii that are all larger or smaller than the model's by one factor."""
-    free = problem.block("radii").unknown[:, 0] >= 0
-    nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
-    change = (state.radii / nominal - 1.0)[free]
-    if len(change) < _FEWEST:
-        return ()
-    common = float(np.median(change))
-    alike = bool(np.all(np.abs(change - common) < _SPREAD * abs(common)))
-    if not alike or abs(common) < RADIUS_SIGMAS * problem.settings.radius_sigma:
-        return ()
-    way = "smaller" if common < 0.0 else "larger"
-    return (
-        f"All fitted radii are {1e2 * abs(common):.0f} % {way} than the model's, so the whole "
-        "result may be scaled by that factor; check the unit and the scale of the encoders, or "
-        "the radii of the model.",
+@dataclass(frozen=True)
+class NominalSize:
+    """What the nominal model says of the size of the machine.
+
+    Attributes
+    ----------
+    by_parameter : Array
+        (p,) relative size of the machine by changes of parameters, those of the problem.
+    excess : float
+        By how much the fitted machine is larger than the nominal one, relatively.
+    sigma : float
+        Standard deviation of the size of a machine built to its model, relative.
+    """
+
+    by_parameter: Array
+    excess: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Two witnesses of the scale that contradict each other."""
+
+    larger: int  # index of the witness by which the machine is larger
+    smaller: int
+    ratio: float  # of these sizes, less one
+    sigmas: float
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleComparison:
+    """How large the machine is by each witness, the radii and the nominal model.
+
+    Attributes
+    ----------
+    witnesses : tuple of str
+        In words.
+    size : Array
+        (n,) relative sizes, up to a common one.
+    covariance : Array
+        (n, n) of their differences.
+    steps : Array
+        (p, n) error of the fitted kinematic parameters by a witness that is too large by one unit.
+    """
+
+    witnesses: tuple[str, ...]
+    size: Array
+    covariance: Array
+    steps: Array
+
+    @property
+    def disagreements(self) -> list[Disagreement]:
+        """The pairs that differ by more than all of them do by chance, the surest first."""
+        found, pairs = list[Disagreement](), list(combinations(range(len(self.size)), 2))
+        most = -float(ndtri(0.5 * CHANCE / len(pairs)))
+        for i, j in pairs:
+            apart, variance = self.size[i] - self.size[j], self._contrasts([i, j])[1][0, 0]
+            sigmas = float(abs(apart) / np.sqrt(variance)) if variance > 0.0 else 0.0
+            if sigmas > most:
+                larger, smaller = (i, j) if apart > 0.0 else (j, i)
+                found.append(Disagreement(larger, smaller, float(abs(apart)), sigmas))
+        return sorted(found, key=lambda one: -one.sigmas)
+
+    def likelier_wrong(self) -> int | None:
+        """Return the witness without which the others agree best; None where that is not clear."""
+        n = len(self.size)
+        left = [self._squares([i for i in range(n) if i != without]) for without in range(n)]
+        first, second = np.argsort(left, kind="stable")[:2].tolist()
+        return first if left[second] - left[first] > _CLEARLY else None
+
+    def _squares(self, which: Sequence[int]) -> float:
+        """Return the squares of sizes about their mean, in standard deviations."""
+        if len(which) < 2:
+            return 0.0
+        difference, covariance = self._contrasts(which)
+        return float(difference @ np.linalg.solve(covariance, difference))
+
+    def _contrasts(self, which: Sequence[int]) -> tuple[Array, Array]:
+        """Return the differences of sizes from the first one, and their covariance."""
+        by_size = np.eye(len(self.size))[list(which[1:])]
+        by_size[:, which[0]] = -1.0
+        return by_size @ self.size, by_size @ self.covariance @ by_size.T
+
+
+@dataclass(frozen=True, eq=False)
+class _Error:
+    """What a witness that is too large by one unit does to whitened residuals."""
+
+    witness: str
+    factors: Mapping[str, Array]  # (n, q) by name
+    priors: Array  # (n_priors,)
+    common: float = 0.0  # standard deviation that its numbers share, relative
+
+
+def compare_scales(posterior: Posterior, nominal: NominalSize) -> ScaleComparison | None:
+    """Compare the witnesses of the scale in pairs; None where there is none in the fit.
+
+    Each gets a number, its relative error. All of them are estimated together by the derivatives
+    of the fit, without another fit; as the size of the machine is open then, the first one's is
+    zero. The nominal model has no part in the fit.
+    """
+    state = posterior.state
+    problem = with_weights(posterior.problem, state)
+    linear = linearize(problem, state)
+    errors = _errors(problem, state, linear)
+    if not errors:
+        return None
+    normal = normal_equations(problem, state, linear)
+    stacked = {
+        factor.name: np.stack(
+            [e.factors.get(factor.name, np.zeros((factor.n, factor.n_rows))) for e in errors], -1
+        )
+        for factor in problem.factors
+    }
+    priors = np.stack([e.priors for e in errors], axis=-1)
+    score, information = score_test(problem, linear, normal, stacked)
+    by_priors = linear.prior_J.T @ priors
+    moved_by_priors = -normal.moved_by(by_priors)
+    moved = response(problem, linear, normal, stacked)
+    crossed = by_priors.T @ moved
+    score = score + priors.T @ linear.prior_r
+    information = (
+        information + priors.T @ priors + by_priors.T @ moved_by_priors + crossed + crossed.T
     )
+    steps = kinematic_steps(problem, moved + moved_by_priors)
+    others = slice(1, None)
+    of_others = inverse_on_range(information[others, others])
+    n = len(errors) + 1
+    size, covariance = np.zeros(n), np.zeros((n, n))
+    size[1:-1] = of_others @ score[others]
+    covariance[1:-1, 1:-1] = of_others
+    by_error = nominal.by_parameter @ steps[:, others]
+    b = nominal.by_parameter[problem.free]
+    p = problem.n_kinematic
+    size[-1] = by_error @ size[1:-1] - nominal.excess
+    covariance[-1, 1:-1] = covariance[1:-1, -1] = of_others @ by_error
+    covariance[-1, -1] = (
+        nominal.sigma**2 + b @ posterior.covariance[:p, :p] @ b + by_error @ of_others @ by_error
+    )
+    covariance += np.diag([*(e.common**2 for e in errors), 0.0])
+    return ScaleComparison(
+        (*(e.witness for e in errors), MODEL),
+        size,
+        covariance,
+        np.column_stack([steps, np.zeros(len(steps))]),
+    )
+
+
+def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_Error]:
+    """Return the errors of all witnesses in a fit, those of radii last."""
+    priors = problem.priors
+    names = [problem.named[i] for i in priors.unknown.tolist()]
+    by_mean = -priors.mean / priors.sigma
+    no_prior = np.zeros(len(names))
+
+    def of_priors(which: Collection[str]) -> Array:
+        return np.where([name in which for name in names], by_mean, 0.0)
+
+    errors = list[_Error]()
+    if travel := _travel(problem):
+        of_factor = {
+            name: -np.asarray(problem.factor(name).whitening)[:, :, 0] * lengths[:, None]
+            for name, lengths in travel.items()
+        }
+        errors.append(_Error(TRAVEL, of_factor, no_prior))
+    boards = [board_scale(corners.link) for corners in problem.boards if len(corners)]
+    if fixed := [name for name in boards if problem.choices.holds(name)]:
+        size = np.array([[float(board_scale(link) in fixed)] for link in LINKS])
+        by_size = residual_changes(problem, linear, "board_scale", size)
+        errors.append(_Error(BOARD, by_size, of_priors(boards)))
+    elif set(boards) & set(names):
+        errors.append(_Error(BOARD, {}, of_priors(boards)))
+    distances = measured_lengths(problem.legs.names, problem.choices)
+    of_distances = [name for name in sorted(problem.choices.priors) if joints_of_length(name)]
+    for words, stated in _stated_lengths(problem):
+        if stated[0] in of_distances:
+            at = np.equal(of_distances, stated[0])
+            error = np.where(at, -distances.length / distances.sigma, 0.0)[:, None]
+            errors.append(_Error(words, {"lengths": error}, no_prior))
+        elif set(stated) & set(names):
+            errors.append(_Error(words, {}, of_priors(stated)))
+    radii = problem.block("radii").labels
+    of_radii = np.array([name in radii for name in names], dtype=np.bool_)
+    if of_radii.any():
+        common = float(np.max(priors.sigma[of_radii] / priors.mean[of_radii]))
+        errors.append(_Error(RADII, {}, of_priors(radii), common))
+    return errors

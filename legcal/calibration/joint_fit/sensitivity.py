@@ -312,6 +312,11 @@ class CameraResiduals:
             for name, by in self.derivatives.items()
         }
 
+    def zoomed(self, view: int) -> dict[str, Array]:
+        """Return the change of whitened residuals (n, q) by an error of a view's focal length."""
+        error = _camera_error(self.state, _FOCAL, {})
+        return self.changes(error * (np.arange(len(error)) == view)[:, None])
+
     def contradicted(self) -> list[WrongIntrinsic]:
         """Return the intrinsics in camera files that contradict the measurements.
 

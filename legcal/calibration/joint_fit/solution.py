@@ -37,7 +37,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
-from legcal.calibration.joint_fit.scale import scale_notes, sensitivity_to_scale
+from legcal.calibration.joint_fit.scale import sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     Sensitivity,
@@ -267,7 +267,6 @@ def assemble_solution(
     cameras = CameraResiduals(problem, state, linear)
     doubts = CameraDoubts.of(cameras, kept)
     gammas = _gammas(problem, state, kept, outlines)
-    scale = scale_notes(problem, state)
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.camera_pose.motions,
@@ -308,7 +307,7 @@ def assemble_solution(
                 Topic.IMAGES,
                 notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             ),
-            *Note.about(Topic.MODEL, scale or contradicted_radii(problem, state, normal)),
+            *Note.about(Topic.MODEL, contradicted_radii(problem, state, normal)),
             *(_misfit_of_axes(quality) if len(problem.axes) else ()),
             *Note.about(Topic.CAMERAS, doubts.notes),
         ),

@@ -132,6 +132,8 @@ class State:
     camera_pose: Frames  # T_camera_Rb, one a view
     board_pose: Frames  # T_Rb_board and T_Re_board; of no meaning where no image shows one
     platform_pose: Postures  # T_Rb_Re, one a pose
+    # (n_own_zeros,) readings in images with a zero of their own, over those in others [m or rad]
+    own_zeros: Array
 
     @cached_property
     def A(self) -> Array:

@@ -7,6 +7,14 @@ const downloadTable = (file, text) => {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 };
+// A text beside the pointer; none hides it.
+const showTip = ({ clientX, clientY }, text) => {
+  const tip = document.getElementById("tip");
+  tip.hidden = !text;
+  tip.textContent = text ?? "";
+  tip.style.left = `${Math.min(clientX + 14, innerWidth - tip.offsetWidth - 8)}px`;
+  tip.style.top = `${Math.min(clientY + 14, innerHeight - tip.offsetHeight - 8)}px`;
+};
 (() => {
   // Tables sort by a column: numbers by their exact value, texts as people count.
   const order = new Intl.Collator(undefined, { numeric: true }).compare;
@@ -30,105 +38,46 @@ const downloadTable = (file, text) => {
     }));
   }
 
-  // Plots are drawn when they come near the window, and all of them for the printer.
-  const config = { displaylogo: false, responsive: true, displayModeBar: false };
-  const waiting = new Map();
-  const draw = (div) => {
-    const spec = waiting.get(div);
-    if (!spec) return;
-    waiting.delete(div);
-    Plotly.newPlot(div, spec.data, spec.layout, config);
-    if (spec.extra.modes) control(div, spec);
-    if (spec.extra.links) {
-      div.on("plotly_click", ({ points: [point] }) => {
-        const to = spec.extra.links[point.customdata[0]];
+  // Points of charts tell what they stand for, and lead there.
+  for (const charts of document.querySelectorAll(".charts")) {
+    const { labels, links } = JSON.parse(charts.querySelector("script").textContent);
+    for (const svg of charts.querySelectorAll("svg")) {
+      const points = [...svg.querySelectorAll("[data-points]")].flatMap((path) => {
+        const places = [...path.getAttribute("d").matchAll(/M([-\d.]+) ([-\d.]+)/g)];
+        return path.dataset.points.split(" ").map((number, k) => [Number(places[k][1]), Number(places[k][2]), number]);
+      });
+      const pointed = (event) => {
+        const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+        const far = ([x, y]) => Math.hypot(x - at.x, y - at.y);
+        const nearest = points.reduce((a, b) => (far(b) < far(a) ? b : a));
+        return far(nearest) < 7 ? nearest[2] : undefined;
+      };
+      svg.addEventListener("pointermove", (event) => {
+        const number = pointed(event);
+        svg.style.cursor = links[number] ? "pointer" : "";
+        showTip(event, labels[number]);
+      });
+      svg.addEventListener("pointerleave", (event) => showTip(event, ""));
+      svg.addEventListener("click", (event) => {
+        const to = links[pointed(event)];
         if (to) location.assign(to);
       });
     }
-    div.dataset.drawn = "";
-  };
-  const near = new IntersectionObserver((entries) => {
-    for (const entry of entries) if (entry.isIntersecting) { near.unobserve(entry.target); draw(entry.target); }
-  }, { rootMargin: "300px" });
-  for (const script of document.querySelectorAll("script[data-plot]")) {
-    const div = document.getElementById(script.dataset.plot);
-    waiting.set(div, JSON.parse(script.textContent));
   }
-  document.addEventListener("DOMContentLoaded", () => { for (const div of waiting.keys()) near.observe(div); });
 
-  // Printers get none of what WebGL drew once it is shown: scenes are copied while it is there.
+  // Printers get what is folded too.
   addEventListener("beforeprint", () => {
     for (const part of document.querySelectorAll("details:not([open])")) {
       part.open = true;
       part.dataset.folded = ""; // until it is printed
     }
-    for (const div of [...waiting.keys()]) draw(div);
-    for (const div of document.querySelectorAll(".plot")) {
-      const scene = div._fullLayout?.scene?._scene;
-      if (!scene?.glplot) continue;
-      scene.glplot.redraw();
-      const drawn = scene.glplot.canvas, copy = document.createElement("canvas");
-      copy.className = "copy"; copy.width = drawn.width; copy.height = drawn.height;
-      copy.getContext("2d").drawImage(drawn, 0, 0);
-      drawn.after(copy);
-    }
   });
   addEventListener("afterprint", () => {
-    for (const copy of document.querySelectorAll(".plot .copy")) copy.remove();
     for (const part of document.querySelectorAll("details[data-folded]")) {
       part.open = false;
       delete part.dataset.folded;
     }
   });
-
-  // A scene: legs from A to B of a model and of another one, whose difference is exaggerated.
-  const control = (div, { extra }) => {
-    const form = document.querySelector(`form[data-for="${div.id}"]`), { elements } = form;
-    const show = () => {
-      const mode = extra.modes[Number(elements.mode.value)];
-      const pose = elements.pose ? Number(elements.pose.value) : 0;
-      const factor = extra.factors[Number(elements.factor.value)];
-      elements.factor_text.value = `${factor} times`;
-      if (elements.pose) elements.pose_text.value = extra.poses[pose];
-      const between = (a, b) => a.map((p, i) => p.map((x, k) => x + factor * (b[i][k] - x)));
-      const base = mode.base[pose] ?? mode.base[0], platform = mode.platform[pose];
-      const parts = [[base[0], platform[0]], [between(...base), between(...platform)]];
-      const motors = mode.motors?.[pose] ?? mode.motors?.[0], moves = motors?.[0].length > 0;
-      const bodies = moves && [motors[0], between(...motors)];
-      const standing = moves && [mode.standing[0], between(...mode.standing)];
-      const apart = (ends) => ends.flatMap((p, k) => (k % 2 ? [p, null] : [p]));
-      const x = [[], [], []], which = [];
-      const put = (trace, points) => {
-        which.push(trace);
-        for (let k = 0; k < 3; k++) x[k].push(points.map((p) => p && p[k]));
-      };
-      parts.forEach(([A, B], i) => {
-        put(extra.traces.legs[i], A.flatMap((a, j) => [a, B[j], null]));
-        if (bodies) {
-          put(extra.traces.base[i], apart(standing[i]));
-          put(extra.traces.motors[i], apart(bodies[i]));
-        } else put(extra.traces.base[i], extra.outline.base.map((j) => A[j]));
-        put(extra.traces.platform[i], extra.outline.platform.map((j) => B[j]));
-      });
-      const [A, B] = parts[1];
-      const rings = (centres, shapes) => centres.flatMap((c, j) =>
-        shapes[j].flatMap((ring) => [...ring.map((p) => p.map((v, k) => c[k] + v)), null]));
-      if (extra.rings) {
-        const R = extra.turns[pose];
-        const turned = extra.rings.platform.map((rs) => rs.map((ring) => ring.map((p) =>
-          R.map((r) => r[0] * p[0] + r[1] * p[1] + r[2] * p[2]))));
-        put(extra.traces.rings, [...rings(A, extra.rings.base), ...rings(B, turned)]);
-      }
-      Plotly.restyle(div, { x: x[0], y: x[1], z: x[2] }, which);
-      Plotly.restyle(div, { name: mode.legend }, extra.traces.legs);
-    };
-    elements.mode.addEventListener("input", () => {
-      elements.factor.value = extra.modes[Number(elements.mode.value)].step;
-    });
-    form.addEventListener("input", show);
-    form.addEventListener("submit", (event) => event.preventDefault());
-    show();
-  };
 
   // A crop that is chosen fills the window: wheel and drag zoom and move it.
   const dialog = document.getElementById("enlarged"), stage = dialog.querySelector("div");

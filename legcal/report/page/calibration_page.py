@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from legcal.calibration.result import Calibration
-from legcal.pages.document import Gallery, Items, Page, Row, Section, Text
+from legcal.pages.document import Gallery, Items, Page, Section, Text
 from legcal.pages.html import time_of_page
 from legcal.report.page.crops import outline_crops
 from legcal.report.page.evidence import (
@@ -19,7 +19,7 @@ from legcal.report.page.evidence import (
 )
 from legcal.report.page.parameter_rows import change_charts, parameter_tables
 from legcal.report.page.platform_blocks import platform_blocks
-from legcal.report.page.residual_plots import residual_plots
+from legcal.report.page.residual_charts import residual_charts
 from legcal.report.page.scene import machine_scene
 from legcal.report.page.verdicts import next_steps, verdict_of
 
@@ -83,7 +83,7 @@ def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence
         if gallery
     ]
     sections: list[tuple[str, str, Sequence[Any]]] = [
-        ("residuals", "Residuals", [Row(residual_plots(calibration, crops.links))])
+        ("residuals", "Residuals", [residual_charts(calibration, crops.links)])
     ]
     if galleries or missing:
         sections.append(("outlines", "Outlines", [*missing, lines, *galleries]))

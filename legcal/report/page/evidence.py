@@ -13,10 +13,11 @@ import numpy as np
 
 from legcal.calibration.identify.identifiability import ranks_of_dataset
 from legcal.calibration.notes import Topic, topic_of
+from legcal.calibration.quantities import DIGITS
 from legcal.calibration.result import Calibration
-from legcal.calibration.summary import UNITS
 from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
 from legcal.errors import LegcalError
+from legcal.files.quantity import SHOWN_IN
 from legcal.pages.document import Cell, Drawing, Facts, Items, Table, Text, number
 from legcal.pages.svg import matrix
 from legcal.report.identify import CONDITIONS
@@ -203,8 +204,11 @@ def _chosen(calibration: Calibration) -> str:
     units = {row.name: row.unit for row in calibration.result.parameters}
 
     def shown(name: str, *values: float) -> str:
-        scale, unit, digits = UNITS[units.get(name, "")]
-        return " +- ".join(f"{scale * value:.{digits}f}" for value in values) + f" {unit}".rstrip()
+        scale, unit = SHOWN_IN[units.get(name, "")]
+        return (
+            " +- ".join(f"{scale * value:.{DIGITS[unit]}f}" for value in values)
+            + f" {unit}".rstrip()
+        )
 
     choices_in_words = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
     choices_in_words += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]

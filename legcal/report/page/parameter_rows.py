@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from legcal.calibration.documents import Result
+from legcal.calibration.quantities import FRAMES, Quantity, joints_of, parameters_of
 from legcal.calibration.result import Calibration
-from legcal.calibration.summary import UNITS
+from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
-from legcal.machine.parameter_id import ParameterId
 from legcal.pages.document import Cell, Drawing, Table, number
 from legcal.pages.svg import change_bars
 
@@ -22,52 +23,33 @@ _STATUS = {
     "fixed": "fixed",
     "weak": "undetermined combination, kept nominal",
 }
+_BY_ALL = "by images, readings and its prior"
 _JOINT = {"base": "A", "platform": "B"}
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A number of the machine, nominal and calibrated [m, rad, px]."""
-
-    name: str
-    nominal: float
-    value: float
-    sigma: float | None
-    unit: str
-    prior: float | None
-    determination: str
-
-    @property
-    def parameter(self) -> ParameterId:
-        """The parsed name."""
-        return ParameterId.parse(self.name)
-
-    @property
-    def cells(self) -> list[Cell]:
-        """The cells of the table."""
-        scale, unit, digits = UNITS[self.unit]
-        sigma, prior = (None if s is None else scale * s for s in (self.sigma, self.prior))
-        return [
-            self.name,
-            number(scale * self.nominal, digits),
-            number(scale * self.value, digits),
-            number(scale * (self.value - self.nominal), digits, signed=True),
-            number(sigma, digits),
-            unit,
-            number(prior, digits),
-            self.determination,
-        ]
 
 
 def parameter_tables(calibration: Calibration) -> list[Table]:
     """Return joints in the links with all other parameters, and the rows of ``result.json``."""
     columns = ("parameter", ">nominal", ">calibrated", ">change", ">sigma", "unit", ">prior sigma",
                "how determined")  # fmt: skip
-    link_rows, rows = _link_rows(calibration), _parameters(calibration)
-    if not link_rows:
-        return [Table(columns, [row.cells for row in rows], note=_IN_FRAMES)]
-    links = [block.link for block in (calibration.result.links or {}).values()]
-    others = [row for row in rows if not row.parameter.is_joint_coordinate]
+    priors, result = _prior_sigmas(calibration), calibration.result
+    rows = [_cells(q.name, q, priors.get(q.name)) for q in parameters_of(result)]
+    if not result.links:
+        return [Table(columns, rows, note=_IN_FRAMES)]
+    links = [block.link for block in result.links.values()]
+    turns: dict[str, Array] = {
+        side: np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
+        for side, block in result.links.items()
+    }
+    in_links = []
+    for q in _in_links(result):
+        prior = priors.get(q.name)
+        if (name := q.parameter).is_joint_coordinate:
+            row = turns[name.kind]["xyz".index(name.component)]
+            along = int(row.argmax())  # a prior of one axis of the frame, if parallel
+            prior = None
+            if row[along] > 1.0 - _PARALLEL:
+                prior = priors.get(str(replace(name, component="xyz"[along])))
+        in_links.append(_cells(_label(q), q, prior))
     machine = calibration.dataset.machine
     motors = ""
     if any(motor.turns for motor in machine.actuators):
@@ -83,8 +65,8 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
         "or R_e, which photographs of legs cannot determine. Click a heading to sort."
     )
     return [
-        Table(columns, [row.cells for row in (*link_rows, *others)], note=note),
-        Table(columns, [row.cells for row in rows], "The same in R_b and R_e, as in result.json",
+        Table(columns, in_links, note=note),
+        Table(columns, rows, "The same in R_b and R_e, as in result.json",
               _IN_FRAMES, folded=True),
     ]  # fmt: skip
 
@@ -94,82 +76,68 @@ _IN_FRAMES = "Joints of the base in R_b, those of the platform in R_e; axes are 
 
 def change_charts(calibration: Calibration) -> list[Drawing]:
     """Return the changes of the parameters as bars, a chart for each unit."""
-    link_rows, rows = _link_rows(calibration), _parameters(calibration)
-    if link_rows:
-        rows = [
-            *link_rows,
-            *(row for row in rows if not row.parameter.is_joint_coordinate),
-        ]
     charts = []
-    for unit_of_chart in ("m", "rad"):
+    for unit in ("mm", "deg"):
         shown = [
-            r for r in rows if r.unit == unit_of_chart and r.sigma and r.parameter.kind != "radius"
+            q
+            for q in _in_links(calibration.result)
+            if q.unit == unit and q.sigma and q.parameter.kind != "radius"
         ]
         if shown:
-            scale, unit, _ = UNITS[unit_of_chart]
-            svg = change_bars(
-                [row.name for row in shown],
-                [scale * (row.value - row.nominal) for row in shown],
-                [None if row.sigma is None else scale * row.sigma for row in shown],
-                unit,
-            )
+            names, changes = [_label(q) for q in shown], [q.change or 0.0 for q in shown]
+            svg = change_bars(names, changes, [q.sigma for q in shown], unit)
             caption = "Bars are changes, lines two standard deviations to both sides."
             charts.append(Drawing(svg, caption))
     return charts
 
 
-def _link_rows(calibration: Calibration) -> list[_Row]:
-    """Return the rows of joint coordinates in the links of the model."""
-    rows, priors = [], _prior_sigmas(calibration)
-    for side, block in (calibration.result.links or {}).items():
-        turn = np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
-        for joint in block.joints:
-            for k, axis in enumerate("xyz"):
-                status, sigma = joint.status[k], joint.sigma[k]
-                along = int(turn[k].argmax())  # a prior of one axis of the frame, if parallel
-                prior = (
-                    priors.get(f"{joint.leg}.{side}.{'xyz'[along]}")
-                    if status == "estimated" and turn[k, along] > 1.0 - _PARALLEL
-                    else None
-                )
-                how = (
-                    _determination(status, sigma, prior)
-                    if status in _STATUS
-                    else f"the joint defines the {joint.defines} of the frame"
-                )
-                name = f"{joint.leg} {_JOINT[side]} {axis}"
-                values = joint.nominal[k], joint.xyz[k], sigma
-                rows.append(_Row(name, *values, "m", prior, how))
-    return rows
+def _in_links(result: Result) -> list[Quantity]:
+    """Return joints in the links of the model, where they are known, and all other parameters."""
+    joints, parameters = list(joints_of(result)), parameters_of(result)
+    others = [q for q in parameters if not (joints and q.parameter.is_joint_coordinate)]
+    return [*joints, *others]
 
 
-def _parameters(calibration: Calibration) -> list[_Row]:
-    """Return the parameters of the result."""
-    priors = _prior_sigmas(calibration)
+def _label(q: Quantity) -> str:
+    """Return the name of a quantity: ``leg1 A x`` of a joint in its link."""
+    name = q.parameter
+    if q.frame in ("", *FRAMES.values()):
+        return q.name
+    return f"{name.owner} {_JOINT[name.kind]} {name.component}"
+
+
+def _cells(name: str, q: Quantity, prior: float | None) -> list[Cell]:
+    """Return the cells of a row."""
+    prior = prior if q.status == "estimated" else None
     return [
-        _Row(row.name, row.nominal, row.value, row.sigma, row.unit,
-             priors.get(row.name) if row.status == "estimated" else None,
-             _determination(row.status, row.sigma, priors.get(row.name)))
-        for row in calibration.result.parameters
-        if row.is_shown
-    ]  # fmt: skip
+        name,
+        number(q.nominal, q.digits),
+        number(q.value, q.digits),
+        number(q.change, q.digits, signed=True),
+        number(q.sigma, q.digits),
+        q.unit,
+        number(prior, q.digits),
+        _determination(q, prior),
+    ]
 
 
 def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
-    """Return the standard deviations of priors by the name of their parameter [m, rad, px]."""
+    """Return the standard deviations of priors by the name of their parameter [mm, deg, px]."""
     problem = calibration.solution.posterior.problem
     priors, named = problem.priors, problem.named
     numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
     sigma_by_name = {named[i]: sigma for i, sigma in numbers if i < len(named)}
-    return sigma_by_name | dict(calibration.solution.estimates.prior_sigma)
+    sigma_by_name |= dict(calibration.solution.estimates.prior_sigma)
+    units = {row.name: row.unit for row in calibration.result.parameters}
+    return {k: SHOWN_IN[units[k]][0] * sigma for k, sigma in sigma_by_name.items() if k in units}
 
 
-def _determination(status: str, sigma: float | None, prior: float | None) -> str:
-    if status != "estimated" or sigma is None or prior is None:
-        return _STATUS[status]
-    if sigma > _BY_PRIOR * prior:
-        return "mostly by its prior"
-    return "by images, readings and its prior"
+def _determination(q: Quantity, prior: float | None) -> str:
+    if q.status == "frame":
+        return f"the joint defines the {q.defines} of the frame"
+    if q.sigma is None or prior is None:
+        return _STATUS[q.status]
+    return "mostly by its prior" if q.sigma > _BY_PRIOR * prior else _BY_ALL
 
 
 def correlation(calibration: Calibration) -> tuple[Sequence[str], Array]:

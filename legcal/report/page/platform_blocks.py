@@ -9,20 +9,9 @@ import numpy as np
 from legcal.calibration.result import Calibration
 from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.geometry.types import Array
-from legcal.pages.document import Drawing, Plot, Row, Table, Text, number
+from legcal.pages.document import Drawing, Row, Table, Text, number
 from legcal.pages.svg import histogram, number_grid
-from legcal.report.page.residual_plots import FONT
-
-_FLAT = 1e-3  # height of a planar workspace, relative to its extent
-_IN_SPACE = {
-    "aspectmode": "data",
-    "camera": {"eye": {"x": 1.1, "y": -1.6, "z": 1.1}, "center": {"z": -0.2}},
-}
-_IN_A_PLANE = {
-    "aspectmode": "manual",  # "data" would make a flat scene tiny
-    "aspectratio": {"x": 1.0, "y": 1.0, "z": 0.01},
-    "camera": {"eye": {"x": 0.0, "y": 0.0, "z": 1.6}, "up": {"x": 0.0, "y": 1.0, "z": 0.0}},
-}
+from legcal.report.page.scene import platform_scene
 
 
 def platform_blocks(calibration: Calibration) -> list[Any]:
@@ -100,48 +89,5 @@ def _maps(workspace: PlatformMap) -> list[Any]:
         blocks.append(
             Text(["Slices at the orientation of home; empty cells are out of reach."], dim=True)
         )
-    blocks.append(_in_space(workspace, before, after))
+    blocks.append(platform_scene(workspace))
     return blocks
-
-
-def _in_space(workspace: PlatformMap, before: Array, after: Array) -> Plot:
-    is_flat = np.ptp(workspace.position[:, 2]) < _FLAT * np.ptp(workspace.position, axis=0).max()
-    x, y, z = np.round(1e3 * workspace.position, 1).T.tolist()
-    data = [
-        {
-            "type": "scatter3d",
-            "mode": "markers",
-            "name": name,
-            "visible": k == 0,
-            "x": x,
-            "y": y,
-            "z": z,
-            "customdata": np.round(values, 5).tolist(),
-            "hovertemplate": "(%{x}, %{y}, %{z}) mm: %{customdata:.4f} mm<extra></extra>",
-            "marker": {
-                "size": np.round(3.0 + 9.0 * values / max(float(values.max()), 1e-12), 1).tolist(),
-                "color": np.round(values, 5).tolist(),
-                "colorscale": [[0, "#dbe7f5"], [1, "#1a4a86"]],
-                "colorbar": {"title": {"text": "mm"}, "thickness": 12, "len": 0.7},
-                "line": {"width": 0.5, "color": "#667080"},
-            },
-        }
-        for k, (name, values) in enumerate((("after", after), ("before", before)))
-    ]
-    buttons = [
-        {"label": label, "method": "update", "args": [{"visible": [k == 0, k == 1]}]}
-        for k, label in enumerate(("after, 1 sigma", "before"))
-    ]
-    axis = {"showbackground": False, "gridcolor": "#e8ebef",
-            "tickfont": {"size": 10, "color": "#667080"}}  # fmt: skip
-    look = {
-        "font": FONT,
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "showlegend": False,
-        "updatemenus": [{"type": "buttons", "direction": "right", "x": 0, "xanchor": "left",
-                         "y": 1.0, "yanchor": "top", "buttons": buttons, "showactive": True}],
-        "scene": {f"{a}axis": {**axis, "title": {"text": f"{a} [mm]"}} for a in "xyz"}
-        | (_IN_A_PLANE if is_flat else _IN_SPACE),
-    }  # fmt: skip
-    caption = "The same in space: larger and darker marks are larger errors."
-    return Plot("platform-space", data, look, 420, caption)

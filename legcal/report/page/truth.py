@@ -11,7 +11,7 @@ import numpy as np
 
 from legcal.calibration.evaluation import Evaluation, evaluate
 from legcal.calibration.result import Calibration
-from legcal.calibration.summary import UNITS
+from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Drawing, Text
 from legcal.pages.svg import error_bars
@@ -40,7 +40,7 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
         ]
         if not indices:
             continue
-        scale, unit, _ = UNITS[unit_of_chart]
+        scale, unit = SHOWN_IN[unit_of_chart]
         before_errors, after_errors = (
             (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
             for evaluation in (before, after)

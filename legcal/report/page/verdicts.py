@@ -67,6 +67,15 @@ def _grounds(calibration: Calibration) -> list[str]:
     return found
 
 
+def _written_beside(command: str) -> str:
+    """Return a command with another output folder, so that the result of the first stays."""
+    words = shlex.split(command)
+    for k, word in enumerate(words[:-1]):
+        if word in ("-o", "--output"):
+            words[k + 1] = f"{words[k + 1].rstrip('/')}-holdout"
+    return shlex.join(words)
+
+
 def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]:
     """Return what to do next, the first thing first; *command* has made the result, if any has."""
     result, steps = calibration.result, list[str]()
@@ -85,7 +94,8 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]
         if result.holdout is None and calibration.dataset.machine.is_determined:
             steps.append(
                 "See how well it predicts images that it has not seen: "
-                f"{command or f'legcal calibrate {dataset} -o {out}'} --holdout 0.2."
+                f"{_written_beside(command or f'legcal calibrate {dataset} -o {out}')} "
+                "--holdout 0.2."
             )
         steps.append(
             "Where the base stands in the cell and the tool on the platform is not seen in "

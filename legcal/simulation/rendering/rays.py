@@ -12,6 +12,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.meshes import ray_caster
 from legcal.simulation.solids import Box, Material, Mesh, PlacedSolid, Shape, SolidCylinder, Sphere
 from legcal.vision.camera import Camera
 
@@ -185,9 +186,7 @@ def is_hidden(solid: SolidInView, mesh: Mesh, P: Single, lamp: Array) -> Single:
 @lru_cache(maxsize=256)
 def _caster(mesh: Mesh) -> Any:
     """Return the ray caster of a mesh."""
-    import trimesh  # half a second: only where there is a mesh
-
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).ray
+    return ray_caster(mesh.vertices, mesh.faces)
 
 
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:

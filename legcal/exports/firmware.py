@@ -1,0 +1,392 @@
+"""The nearest Delta that a firmware can express, as the lines to paste, and the error that remains.
+
+A firmware knows upright towers and two parallel rods as one (:mod:`legcal.machine.firmware`). Its
+numbers are those with which it puts the nozzle, the origin of the platform link, nearest to where
+the machine has it at the same steps from the endstops: least squares over the workspace, in a frame
+that the firmware may choose, because photographs see no bed. What is stated is computed with the
+numbers that are read back from the written lines.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from legcal.exports.correction import poses_at_readings, stacked
+from legcal.exports.identifiers import comment
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.actuator import Actuator
+from legcal.machine.configurations import random_poses
+from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
+from legcal.machine.firmware_files import read_delta
+from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.pages.svg import BLUE, DIM, GREY, Canvas, ticks
+from legcal.version import __version__
+
+DIGITS = 7  # decimals of a number [mm, deg]
+ROUNDS, RANK, SETTLED = 30, 1e-7, 1e-9  # of Gauss-Newton steps [mm, deg]
+N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
+STEP = 1e-4  # of differences [mm, deg]
+UPRIGHT = 0.97  # least cosine of a tower to the vertical
+TURNED = 5.0  # [deg] of all towers from the nominal angles, above which the frame is turned
+_MM = 1e3
+
+
+def firmware_refusal(name: str) -> Callable[[Subject], str | None]:
+    """Return the refusal of machines that a firmware does not know."""
+
+    def refusal(subject: Subject) -> str | None:
+        machine = subject.machine
+        actuators = machine.actuators
+        kinds = {firmware.turns for firmware in FIRMWARES if firmware.name == name}
+        title = next(firmware.title for firmware in FIRMWARES if firmware.name == name)
+        needed = f"needed a Delta with three {'' if True in kinds else 'linear '}motors ({title})"
+        if len(actuators) != TOWERS or machine.mobility != TOWERS:
+            carry = f"{len(actuators)} motors that carry rods"
+            return f"found {carry} and {machine.mobility} freedoms, {needed}"
+        if not machine.is_determined:
+            return f"found that {machine.undetermined}, {needed}"
+        turns = {actuator.turns for actuator in actuators}
+        if len(turns) > 1 or not turns <= kinds:
+            return f"found motors that {'turn' if True in turns else 'slide'}, {needed}"
+        up = _upwards(machine)
+        for actuator in actuators:
+            if (float(abs(actuator.axis @ up)) > UPRIGHT) is actuator.turns:
+                return f"found that '{actuator.joint}' does not move as in a Delta, {needed}"
+        return None
+
+    return refusal
+
+
+def firmware_files(name: str) -> Callable[[Subject, ExportOptions, Path], Rendered]:
+    """Return the renderer of a firmware."""
+
+    def render(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+        turns = subject.machine.actuators[0].turns
+        firmware = next(f for f in FIRMWARES if f.name == name and f.turns is turns)
+        return _rendered(subject, firmware, path)
+
+    return render
+
+
+def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
+    machine = subject.machine
+    mount = _mounted(machine, firmware)
+    readings, poses = _poses_to_print(mount)
+    seen = _Seen(mount.steps(readings), mount.nozzle(poses))
+    fit = _nearest(firmware, mount.start, seen)
+    names = [actuator.joint for actuator in mount.actuators]
+    texts = {key: number_text(value) for key, value in firmware.values(fit).items()}
+    texts["M669 A0"] = number_text(mount.lowest)
+    lines = re.sub(r"\{(.+?)\}", lambda key: texts[key[1]], firmware.lines)
+    ideal = read_delta(path, f"; {firmware.title}\n{lines}" if "M66" in lines else lines)
+    after, frame = _placed(ideal, seen)
+    before = None
+    if subject.nominal is not None:
+        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        then = _mounted(subject.nominal, firmware)
+        nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
+        before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
+    figures = {"remaining_mm": figures_of(after)}
+    sentences = [f"{firmware.title} is off by {describe_errors(after)} over the workspace."]
+    if before is not None:
+        figures["nominal_mm"] = figures_of(before)
+        sentences.append(
+            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
+        )
+    moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
+    if mount.is_turned or moved > 1e-3 or turned > 1e-3:
+        sentences.append(
+            f"Its frame is {moved:.3g} mm and {turned:.3g} deg from "
+            + ("the base link turned so that its towers stand as in the firmware"
+               if mount.is_turned else "the base link")
+            + "."
+        )  # fmt: skip
+    letters = "ABC" if firmware.name == "klipper" else "XYZ"
+    sentences.append(
+        "Towers: "
+        + ", ".join(f"{a} is '{comment(b)}'" for a, b in zip(letters, names, strict=True))
+        + "; the endstops are where their travel ends at the top."
+    )
+    if gains := other_gains(machine):
+        sentences.append(
+            f"Motors move by their steps times {gains}: divide the steps per mm (rotation_distance "
+            "multiplied) by it first, these numbers assume it done."
+        )
+    sentences.append(f"To use it, {firmware.after}.")
+    mark = "#" if firmware.name == "klipper" else ";"
+    head = [f"{firmware.title} of {comment(subject.name)}, written by legcal {__version__}."]
+    text = "".join(f"{mark} {line}\n" for line in [*head, *sentences]) + f"\n{lines}"
+    picture = picture_of(firmware.title, seen.nozzle, after, before)
+    return Rendered(
+        (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
+        tuple(sentences),
+        figures,
+    )
+
+
+def number_text(value: float) -> str:
+    """Return a number of a configuration [mm, deg]."""
+    return f"{round(value, DIGITS) + 0.0:.{DIGITS}f}".rstrip("0").rstrip(".")
+
+
+# --- the machine as a firmware sees it ----------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Mounted:
+    """A machine in a frame with z up, its towers counterclockwise."""
+
+    machine: Machine
+    frame: Array  # (3, 3) rotation of the frame in the base link
+    is_turned: bool
+    actuators: tuple[Actuator, ...]  # in the order of the towers
+    tops: Array  # (3,) readings at the endstops [m or rad]
+    signs: Array  # (3,) 1 where readings grow upwards
+    start: IdealDelta
+
+    @property
+    def _columns(self) -> list[int]:
+        legs = self.machine.legs
+        return [
+            next(j for j, leg in enumerate(legs) if _joint(leg.actuator) == actuator.joint)
+            for actuator in self.actuators
+        ]
+
+    @property
+    def _size(self) -> float:
+        return float(np.degrees(1.0)) if self.start.turns else _MM
+
+    def steps(self, readings: Array) -> Array:
+        """Return the way (k, 3) of the motors from their endstops, downwards [mm or deg]."""
+        return self._size * self.signs * (self.tops - readings[:, self._columns])
+
+    @property
+    def lowest(self) -> float:
+        """The lowest position of a motor."""
+        travel = np.array([actuator.travel for actuator in self.actuators])
+        way = self._size * np.abs(self.signs * self.tops - (self.signs * travel.T).min(axis=0))
+        return float(np.min(self.start.at_stops - way))
+
+    def nozzle(self, poses: Array) -> Array:
+        """Return the origin of the platform link (k, 3) at poses [mm]."""
+        return np.asarray(_MM * poses[:, :, 3] @ self.frame)
+
+
+def _joint(actuator: Actuator | None) -> str | None:
+    return None if actuator is None else actuator.joint
+
+
+def _upwards(machine: Machine) -> Array:
+    """Return the direction (3,) along the towers, or the axis of the arms, from the platform up."""
+    axes = np.array([actuator.axis for actuator in machine.actuators])
+    normal = np.linalg.svd(axes)[2][2 if machine.actuators[0].turns else 0]
+    hanging = vectors_A_to_B(machine, machine.home).mean(axis=0)
+    return np.asarray(-normal if hanging @ normal > 0.0 else normal)
+
+
+def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
+    """Return a machine in the frame of a firmware, with the start of its fit."""
+    up = _upwards(machine)
+    z = np.array([0.0, 0.0, 1.0])
+    frame = np.eye(3)
+    if up @ z < UPRIGHT:
+        x = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        x = x - (x @ up) * up
+        x /= np.linalg.norm(x)
+        frame = np.stack([x, cross(up, x), up], axis=1)
+    is_turned = bool(up @ z < UPRIGHT)
+    home = machine.home.rotation.as_matrix()
+    rows = []
+    for actuator in dict.fromkeys(machine.actuators):
+        rods = [j for j, leg in enumerate(machine.legs) if _joint(leg.actuator) == actuator.joint]
+        A = machine.A_base[rods].mean(axis=0)
+        B = home @ machine.B_platform[rods].mean(axis=0)
+        rod = float(np.mean([machine.legs[j].q0 for j in rods]))
+        rows.append(_Row.of(actuator, A @ frame, B @ frame, rod, frame))
+    places = np.array([row.across for row in rows])
+    angles = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
+    if ((angles[1] - angles[0]) % 360.0) > 180.0:
+        rows = [rows[0], rows[2], rows[1]]
+    angles = np.array([np.degrees(np.arctan2(row.across[1], row.across[0])) for row in rows])
+    nominal = np.array(firmware.nominal.get("angle", angles))
+    off = (angles - nominal + 180.0) % 360.0 - 180.0
+    off = off[0] + ((off - off[0] + 180.0) % 360.0 - 180.0)
+    turn = float(off.mean())
+    if "angle" in firmware.nominal and abs(turn) > TURNED:
+        frame = frame @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        off, is_turned = off - turn, True
+    start = IdealDelta(
+        firmware.turns,
+        radius=np.array([np.linalg.norm(row.across) for row in rows]),
+        angle=nominal + off if "angle" in firmware.nominal else angles % 360.0,
+        rod=np.array([row.rod for row in rows]),
+        arm=np.array([row.arm for row in rows]),
+        height=np.array([row.height for row in rows]),
+        stop=np.array([row.stop for row in rows]),
+        stops_at_angles=True,
+    )
+    if not firmware.stops_at_angles:  # the nozzle centred, under each tower's own endstop
+        C = start.joints(start.stop[None])[0]
+        across = np.linalg.norm(C[:, :2], axis=1)
+        start = replace(
+            start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_at_angles=False
+        )
+    start = firmware.ideal(firmware.values(start))
+    return _Mounted(
+        machine,
+        frame,
+        is_turned,
+        tuple(row.actuator for row in rows),
+        np.array([row.top for row in rows]),
+        np.array([row.sign for row in rows]),
+        start,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """A tower in the frame of a firmware [mm or deg]."""
+
+    actuator: Actuator
+    across: Array  # (2,) from the effector's joints to those of the carriage, or to the shaft
+    rod: float
+    arm: float
+    height: float
+    stop: float  # height of the carriage, or angle of the arm, at the endstop
+    top: float  # the reading there [m or rad]
+    sign: float
+
+    @classmethod
+    def of(cls, actuator: Actuator, A: Array, B: Array, rod: float, frame: Array) -> _Row:
+        """Return the tower of a motor with A at reading 0, both joints in the frame [m]."""
+        axis, point = actuator.axis @ frame, actuator.point @ frame
+        if not actuator.turns:
+            sign = 1.0 if axis[2] > 0.0 else -1.0
+            top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
+            at_top = A + actuator.gain * top * axis
+            height = _MM * (at_top[2] - B[2])
+            return cls(actuator, _MM * (at_top - B)[:2], _MM * rod, 0.0, 0.0, height, top, sign)
+        shaft = point + ((A - point) @ axis) * axis
+        across = (shaft - B)[:2]
+        outwards = np.array([*across, 0.0]) / np.linalg.norm(across)
+        arm = A - shaft
+        sign = 1.0 if cross(axis, outwards)[2] > 0.0 else -1.0
+        top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
+        at_zero = float(np.arctan2(arm[2], arm @ outwards))
+        stop = float(np.degrees(at_zero + sign * actuator.gain * top))
+        length, height = float(np.linalg.norm(arm)), float(shaft[2] - B[2])
+        return cls(actuator, _MM * across, _MM * rod, _MM * length, _MM * height, stop, top, sign)
+
+
+def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
+    """Return readings (k, n_legs) and poses (k, 3, 4) within the reach of the firmware."""
+    readings, motions = random_poses(mount.machine, N_POSES, SEED)
+    poses = stacked(motions)
+    off = np.linalg.norm(mount.nozzle(poses)[:, :2], axis=1)
+    inside = off <= max(mount.start.reach, float(np.sort(off)[LEAST_POSES]))
+    return readings[inside], poses[inside]
+
+
+# --- least squares ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Where a machine has its nozzle, in the frame of a firmware."""
+
+    steps: Array  # (k, 3) of the motors below their endstops [mm or deg]
+    nozzle: Array  # (k, 3) [mm]
+
+    def errors(self, ideal: IdealDelta, frame: Array) -> Array:
+        """Return the errors (k, 3) of a firmware [mm] in a frame: translation [mm], turn [rad]."""
+        commanded = ideal.positions(ideal.at_stops - self.steps)
+        turn = Rotation.from_rotvec(frame[3:])
+        return np.asarray(turn.apply(commanded) + frame[:3] - self.nozzle)
+
+
+def _nearest(firmware: Firmware, start: IdealDelta, seen: _Seen) -> IdealDelta:
+    """Return the Delta of a firmware that is nearest to a machine."""
+    n = len(firmware.free())
+    unit = np.array([1.0] * (n + 3) + [1.0 / np.mean(start.rod)] * 3)
+
+    def errors(x: Array) -> Array:
+        return seen.errors(firmware.moved(start, x[:n]), (unit * x)[n:]).ravel()
+
+    return firmware.moved(start, least_squares(errors, n + 6)[:n])
+
+
+def _placed(ideal: IdealDelta, seen: _Seen) -> tuple[Array, Array]:
+    """Return the errors (k, 3) [mm] of a Delta in its best frame, and the frame (6,)."""
+    unit = np.array([1.0] * 3 + [1.0 / np.mean(ideal.rod)] * 3)
+    frame = unit * least_squares(lambda x: seen.errors(ideal, unit * x).ravel(), 6)
+    return seen.errors(ideal, frame), frame
+
+
+def least_squares(errors: Callable[[Array], Array], n: int) -> Array:
+    """Return the unknowns (n,) of least errors, nearest to zero where several are as good."""
+    x = np.zeros(n)
+    for _ in range(ROUNDS):
+        steps = STEP * np.eye(n)
+        slope = np.stack([(errors(x + h) - errors(x - h)) / (2.0 * STEP) for h in steps], axis=1)
+        change = np.linalg.lstsq(slope, -errors(x), rcond=RANK)[0]
+        x = x + change
+        if np.abs(change).max() < SETTLED:
+            break
+    return x
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def figures_of(errors: Array) -> dict[str, float]:
+    """Return the sizes of errors (..., 3)."""
+    sizes = np.linalg.norm(errors, axis=-1)
+    return {"rms": float(np.sqrt(np.mean(sizes**2))), "max": float(sizes.max())}
+
+
+def describe_errors(errors: Array) -> str:
+    """Return the sizes of errors (..., 3) [mm] in words."""
+    figures = figures_of(errors)
+    return f"{figures['rms']:.3g} mm rms and {figures['max']:.3g} mm at most"
+
+
+def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
+    """Return the errors at poses of the workspace, from above, as SVG."""
+    panels = [(f"{title}: what remains", after)]
+    if before is not None:
+        panels.insert(0, ("with the nominal model", before))
+    side, edge = 420.0, 50.0
+    canvas = Canvas(side * len(panels), side + 30.0, f"Errors of the nozzle with {title}")
+    canvas.box(0.0, 0.0, canvas.width, canvas.height, "white")
+    middle = 0.5 * (nozzle.min(axis=0) + nozzle.max(axis=0))
+    scale = (side - 2.0 * edge) / max(float(np.ptp(nozzle[:, :2], axis=0).max()), 1e-6)
+    most = max(float(np.linalg.norm(errors, axis=1).max()) for _, errors in panels)
+    longest = max(next(iter(ticks(0.0, max(most, 1e-6), 1)[::-1])), 1e-9)
+    magnified = 40.0 / longest
+    for k, (label, errors) in enumerate(panels):
+        at = np.array([side * (k + 0.5), 0.5 * side])
+        canvas.text(side * k + 12.0, 20.0, f"{label}: {describe_errors(errors)}")
+        for point, error in zip(nozzle, errors, strict=True):
+            x, y = at + scale * (point - middle)[:2] * [1.0, -1.0]
+            place = " ".join(f"{coordinate:.1f}" for coordinate in point)
+            tip = f"x y z {place}: {np.linalg.norm(error):.3g} mm"
+            canvas.box(x - 2.0, y - 2.0, 4.0, 4.0, GREY, tip)
+            canvas.line(x, y, x + magnified * error[0], y - magnified * error[1], BLUE, 1.5)
+            canvas.line(x, y, x, y - magnified * error[2], "#b3541e", 1.0)
+    y = side + 10.0
+    canvas.line(12.0, y, 12.0 + magnified * longest, y, BLUE, 2.0)
+    canvas.text(
+        22.0 + magnified * longest,
+        y + 4.0,
+        f"{longest:g} mm across (blue) and of height (brown, upwards on paper)",
+        colour=DIM,
+    )
+    return str(canvas.markup()).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)

@@ -1,0 +1,432 @@
+"""Configurations of firmwares as the table of a machine (:mod:`legcal.machine.description_table`).
+
+The kind of a file is found from its content. Readings are the positions of the motors as the
+firmware counts them: the height of a carriage, the angle of an arm above the horizontal; the
+endstop is at the upper end of the travel. Struts of hexapods read their length less the one at
+encoder zero (LinuxCNC), or less the middle one (FlyPT Mover).
+
+A firmware knows the radius of its towers less that of the joints on the effector, and takes two
+parallel rods for one. The effector is therefore assumed from :data:`EFFECTOR`, unless it is stated.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from legcal.errors import ModelError
+from legcal.geometry.types import Array
+from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
+from legcal.machine.hexapod_files import NUMBER, Table, flypt_table, linuxcnc_table
+
+EFFECTOR = 0.25  # typical radius of the joints on an effector, in radii of towers, or in arms
+SPACING = 1.4  # typical distance of the two rods of a tower, in radii of the effector
+ROD = 0.01  # typical radius of a rod, in its length
+PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers, or in arms
+MIN_APART = 30.0  # [deg] between two towers
+SIZES = (30.0, 5000.0)  # rods [mm]
+HOME = 0.4  # height of home, relative to that of the endstops
+_IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
+
+
+@dataclass
+class Configuration:
+    """The numbers of a configuration, as written."""
+
+    firmware: Firmware
+    values: dict[str, float]
+    unit: str | None = None  # of lengths, if the file states it
+    printable: float | None = None  # radius
+    effector: float | None = None  # radius of the joints on it
+    lowest: float | None = None  # angle of an arm
+    notes: list[str] = field(default_factory=list)
+
+
+def firmware_table(
+    path: Path,
+    text: str,
+    unit: str | None = None,
+    given: Mapping[str, Any] = MappingProxyType({}),
+    effector: float | None = None,
+) -> Table | None:
+    """Return the table of a configuration and notes; None for a file of another kind.
+
+    *unit* is that of lengths, *given* has entries of the table and *effector* is the radius of the
+    joints on it, where stated by others.
+
+    Raises
+    ------
+    ModelError
+        With a sentence for each number that is missing or impossible.
+    """
+    for reads in _DELTAS:
+        if (read := reads(path, text)) is not None:
+            unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
+            return _table_of_delta(path, read, unit, effector)
+    for makes in (linuxcnc_table, flypt_table):
+        if (hexapod := makes(path, text, given)) is not None:
+            table, notes = hexapod
+            return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
+    return None
+
+
+def read_delta(path: Path, text: str) -> IdealDelta:
+    """Return the Delta of a printer's configuration, as the firmware takes it."""
+    read = next(filter(None, (reads(path, text) for reads in _DELTAS)))
+    return read.firmware.ideal(_completed(path, read))
+
+
+def _unit(path: Path, stated: str | None, given: str | None) -> str:
+    if stated is not None and given not in (None, stated):
+        raise ModelError(
+            f"{path}: the unit could not be decided: found --unit {given} and {stated} in the "
+            "file, needed one of them; leave out --unit."
+        )
+    if stated is None and given is None:
+        raise ModelError(
+            f"{path}: the lengths could not be read: found no unit, needed that of the machine; "
+            "give the INI file with LINEAR_UNITS in place of the HAL file, or --unit mm or in."
+        )
+    return str(stated or given)
+
+
+# --- text of each firmware ----------------------------------------------------------------------
+
+
+def _klipper(path: Path, text: str) -> Configuration | None:
+    """Return the numbers of a printer.cfg; those of its SAVE_CONFIG block count."""
+    section, values, words = "", dict[str, float](), dict[str, str]()
+    for line in text.splitlines():
+        line = re.split(r"[#;]", line.removeprefix("#*#"), maxsplit=1)[0].strip()
+        if match := re.fullmatch(r"\[(.+)\]", line):
+            section = match[1].strip()
+        elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
+            key = f"{section}.{match[1]}"
+            words[key] = match[2]
+            if re.fullmatch(NUMBER, match[2]):
+                values[key] = float(match[2])
+            else:
+                values.pop(key, None)
+    if not any(key.startswith(("printer.", "stepper_a.")) for key in words):
+        return None
+    kinematics = words.get("printer.kinematics")
+    if kinematics not in ("delta", "rotary_delta"):
+        raise ModelError(
+            f"{path}: the Klipper configuration could not be used: found kinematics "
+            f"{kinematics or 'nowhere'}, needed delta or rotary_delta; give the file with the "
+            "section [printer] and the sections [stepper_a] to [stepper_c] of a Delta."
+        )
+    firmware = _named("klipper", turns=kinematics == "rotary_delta")
+    for p in firmware.parameters:
+        if p.key in words and p.key not in values:
+            raise ModelError(
+                f"{path}: {_shown(p.key)} could not be read: found '{words[p.key]}', needed a "
+                "number; correct it."
+            )
+    return Configuration(firmware, values, printable=values.get("printer.print_radius"))
+
+
+def _named(name: str, *, turns: bool = False) -> Firmware:
+    return next(f for f in FIRMWARES if f.name == name and f.turns is turns)
+
+
+_DEFINES = {
+    "DELTA_DIAGONAL_ROD": ("M665 L",),
+    "DELTA_RADIUS": ("M665 R",),
+    "DELTA_HEIGHT": ("M665 H",),
+    "MANUAL_Z_HOME_POS": ("M665 H",),
+    "DELTA_TOWER_ANGLE_TRIM": ("M665 X", "M665 Y", "M665 Z"),
+    "DELTA_DIAGONAL_ROD_TRIM_TOWER": ("M665 A", "M665 B", "M665 C"),
+    "DELTA_ENDSTOP_ADJ": ("M666 X", "M666 Y", "M666 Z"),
+    "DELTA_RADIUS_TRIM_TOWER": tuple(f"DELTA_RADIUS_TRIM_TOWER{i}" for i in range(TOWERS)),
+    "DELTA_SMOOTH_ROD_OFFSET": ("smooth",),
+    "DELTA_EFFECTOR_OFFSET": ("effector",),
+    "DELTA_CARRIAGE_OFFSET": ("carriage",),
+    "DELTA_PRINTABLE_RADIUS": ("printable",),
+}
+
+
+def _marlin_header(path: Path, text: str) -> Configuration | None:
+    """Return the numbers of the #define lines of a Configuration.h."""
+    values = dict[str, float]()
+    plain = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
+    for name, rest in re.findall(r"^\s*#\s*define\s+(\w+)[ \t]+([^\n]*)", plain, re.MULTILINE):
+        keys = _DEFINES.get(name.removeprefix("DEFAULT_"), ())
+        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", rest)
+        if numbers:
+            of_name = map(float, re.findall(NUMBER, numbers[1]))
+            values |= dict(zip(keys, of_name, strict=False))
+    if not re.search(r"^\s*#\s*define\s+(DEFAULT_)?DELTA_\w", plain, re.MULTILINE):
+        return None
+    switch = re.compile(r"^\s*(//)?\s*#\s*define\s+DELTA\s*$", re.MULTILINE)
+    if switch.search(text) and not switch.search(plain):
+        raise ModelError(
+            f"{path}: the Marlin configuration could not be used: found DELTA commented out, "
+            "needed a Delta; remove the // before '#define DELTA' if it is one."
+        )
+    if values.keys() >= {"smooth", "effector", "carriage"}:
+        radius = values["smooth"] - values["effector"] - values["carriage"]
+        values.setdefault("M665 R", radius)
+    return Configuration(
+        _named("marlin"),
+        values,
+        printable=values.get("printable"),
+        effector=values.get("effector"),
+    )
+
+
+def _g_code(path: Path, text: str) -> Configuration | None:
+    """Return the numbers of M665, M666 and M669 of Marlin or RepRapFirmware."""
+    values, unit = dict[str, float](), None
+    for line in text.splitlines():
+        words = re.split(r"[;(]", re.sub(r"^\s*(?:N\d+|echo:)\s*", "", line))[0].upper().split()
+        if words and words[0] in ("G20", "G21"):
+            unit = {"G20": "in", "G21": "mm"}[words[0]]
+        if not words or words[0] not in ("M665", "M666", "M669"):
+            continue
+        for letter, numbers in re.findall(
+            rf"([A-Z])\s*({NUMBER}(?:\s*:\s*{NUMBER})*)", " ".join(words[1:])
+        ):
+            of_letter = [float(x) for x in numbers.split(":")]
+            for i, value in enumerate(of_letter):
+                values[f"{words[0]} {letter}{i}"] = value
+            values[f"{words[0]} {letter}"] = of_letter[0]
+    if not any(key.startswith(("M665", "M669")) for key in values):
+        return None
+    name = _speaker(path, text, values)
+    kinematics = values.get("M669 K")
+    turns = kinematics == 10.0 or (kinematics is None and "M669 U" in values)
+    if kinematics not in (None, 3.0, 10.0):
+        raise ModelError(
+            f"{path}: the RepRapFirmware configuration could not be used: found M669 K"
+            f"{kinematics:g}, needed the linear Delta (M665, or K3) or the rotary Delta (K10); "
+            "describe another machine in a table, for which legcal new --template writes a start."
+        )
+    if f"M665 L{TOWERS}" in values:
+        raise ModelError(
+            f"{path}: the RepRapFirmware configuration could not be used: found more than three "
+            "towers in L of M665, needed three; describe such a machine in a table."
+        )
+    read = Configuration(
+        _named(name, turns=turns),
+        values,
+        unit,
+        lowest=values.get("M669 A0"),
+        printable=values.get("M669 B" if turns else "M665 B") if name != "marlin" else None,
+    )
+    if not turns and name != "marlin" and (values.get("M666 A") or values.get("M666 B")):
+        read.notes.append(
+            "The tilt of the bed in M666 (A, B) is left out: heights z are along the towers; keep "
+            "both values in the firmware."
+        )
+    return read
+
+
+def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
+    """Return the firmware that reads some G-code: by its name, or by parameters of it alone."""
+    ends = [values.get(f"M666 {letter}", 0.0) for letter in "XYZ"]
+    lists = any(re.fullmatch(r"M66[59] [A-Z]1", key) for key in values)
+    known = {
+        "marlin": bool(re.search(r"marlin", text, re.IGNORECASE))
+        or any(key in values for key in ("M665 S", "M665 A", "M665 C")),
+        "reprapfirmware": bool(re.search(r"reprap ?firmware|\bduet|\brrf", text, re.IGNORECASE))
+        or lists
+        or any(key in values for key in ("M669 K", "M669 U", "M666 A", "M666 B"))
+        or max(ends) > 0.0,
+    }
+    named = [name for name, is_so in known.items() if is_so]
+    if len(named) == 1:
+        return named[0]
+    if not any(ends):
+        return "reprapfirmware"  # both read the rest alike
+    raise ModelError(
+        f"{path}: the endstops could not be read: found M666 lines that may be of "
+        f"{'both ' * bool(named)}Marlin {'and' if named else 'or'} RepRapFirmware, which count "
+        "them downwards and upwards, needed one of them; write the comment '; Marlin' or "
+        "'; RepRapFirmware' in the file."
+    )
+
+
+# --- Deltas -------------------------------------------------------------------------------------
+
+_WORDS = {
+    "radius": "the horizontal distance from the joints on a carriage (of an arm: the shaft) to "
+    "those on the centred effector",
+    "rod": "the length of the rods",
+    "arm": "the length of the arms",
+    "height": "the height of the shafts over the bed, less that of the effector's joints over the "
+    "nozzle",
+    "stop": "the height of the centred nozzle over the bed at the endstops",
+    "angle": "the angle of the tower",
+}
+
+
+def _shown(key: str) -> str:
+    """Return a parameter as its owner sees it."""
+    section, dot, name = key.rpartition(".")
+    if dot:
+        return f"{name} in [{section}]"
+    code, _, letter = key.partition(" ")
+    return f"{letter[0]} of {code}" if letter else key
+
+
+def _completed(path: Path, read: Configuration) -> dict[str, float]:
+    """Return the values of all parameters, with defaults; refuse those that are missing."""
+    values, missing = dict[str, float](), list[Parameter]()
+    for p in read.firmware.parameters:
+        value = read.values.get(p.key)
+        if value is None:
+            value = values.get(p.default) if isinstance(p.default, str) else p.default
+        if value is None and not isinstance(p.default, str):
+            missing.append(p)
+        values[p.key] = 0.0 if value is None else value
+    if missing:
+        raise ModelError(
+            [
+                f"{path}: the {read.firmware.title} configuration could not be read: found no "
+                f"{_shown(p.key)}, needed {_needed(read.firmware, p)}; write it, or give the file "
+                "that has it."
+                for p in missing
+            ]
+        )
+    return values
+
+
+def _needed(firmware: Firmware, p: Parameter) -> str:
+    if p.field == "stop" and firmware.stops_at_angles:
+        return "the lowest and highest angle of the arms"
+    return _WORDS[p.field]
+
+
+def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float | None) -> Table:
+    """Return the table of a Delta, and what was assumed."""
+    firmware = read.firmware
+    ideal = firmware.ideal(_completed(path, read))
+    _check(path, firmware, ideal, unit)
+    at_stops = ideal.at_stops
+    size = float(np.mean(ideal.arm if ideal.turns else ideal.radius))
+    stated = effector if effector is not None else read.effector
+    r = float(np.round(EFFECTOR * size, 1)) if stated is None else stated
+    pair = 0.5 * SPACING * r
+    out, along = ideal.out, np.stack([-ideal.out[:, 1], ideal.out[:, 0], np.zeros(TOWERS)], 1)
+    both = pair * np.stack([-along, along], axis=1)  # (3, 2, 3)
+    centre = np.array([0.0, 0.0, 1.0]) * ideal.height[:, None]
+    A = (ideal.radius + ideal.arm + r)[:, None] * out + centre
+    low = _lowest(read, ideal, size)
+    if not (np.isfinite(at_stops).all() and (low < at_stops).all()):
+        raise ModelError(
+            f"{path}: the endstops could not be used: found them where the nozzle "
+            f"{'is not over the bed' if np.isfinite(at_stops).all() else 'cannot be'}, needed "
+            "motors that move the nozzle from there to the bed; correct the numbers of the "
+            "endstops, or the unit of lengths."
+        )
+    travels = np.stack([low, at_stops], axis=1).tolist()
+    names = [firmware.motors.format(letter) for letter in "abc"]
+    motors: list[dict[str, Any]] = [{"direction": [0, 0, 1], "travel": q} for q in travels]
+    if ideal.turns:
+        shafts = ((ideal.radius + r)[:, None] * out + centre).tolist()
+        motors = [
+            {"point": point, "axis": axis, "travel_deg": q}
+            for point, axis, q in zip(shafts, (-along).tolist(), travels, strict=True)
+        ]
+    top = _nozzle_at(ideal, at_stops)[2]
+    thick = float(np.round(ROD * np.mean(ideal.rod), 2))
+    table = {
+        "legcal_table": 1,
+        "name": path.stem,
+        "unit": unit,
+        "type": f"6-{'R' if ideal.turns else 'P'}SS",
+        "actuators": dict(zip(names, motors, strict=True)),
+        "hangs_on": [name for name in names for _ in range(2)],
+        "base_joints": (A[:, None] + both).reshape(6, 3).tolist(),
+        "platform_joints": (r * out[:, None] + both).reshape(6, 3).tolist(),
+        "lengths": np.repeat(ideal.rod, 2).tolist(),
+        "radius": thick,
+        "home": {"xyz": [0, 0, float(np.round(HOME * top, 3))], "rpy_deg": [0, 0, 0]},
+    }
+    assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
+    assumed += [f"the rods of a tower {2.0 * pair:g} {unit} apart"]
+    return table, (
+        *read.notes,
+        f"{firmware.title} knows no effector: assumed are {' and '.join(assumed)} "
+        "(--platform-radius states its radius, from which the distance follows), and a radius of "
+        f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
+        "depends on these, the numbers of the firmware do not.",
+        f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
+        f"{firmware.title} counts it, the endstop the upper end of the travel.",
+    )
+
+
+def _nozzle_at(ideal: IdealDelta, motors: Array) -> Array:
+    return np.asarray(ideal.positions(motors[None])[0])
+
+
+def _lowest(read: Configuration, ideal: IdealDelta, size: float) -> Array:
+    """Return the lowest positions of the motors: those on the bed, or as stated."""
+    if read.lowest is not None:
+        return np.full(TOWERS, read.lowest)
+    turn = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    ring = (read.printable or PRINTABLE * size) * np.stack(
+        [np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1
+    )
+    on_bed = ideal.motors(np.concatenate([np.zeros((1, 3)), ring]))
+    return np.asarray(np.min(np.where(np.isfinite(on_bed), on_bed, np.inf), axis=0)) - 1e-3 * size
+
+
+def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None:
+    """Refuse a Delta that cannot be one, the most likely cause first."""
+    start = f"{path}: the {firmware.title} configuration could not be used: found"
+    apart = np.abs((ideal.angle - np.roll(ideal.angle, 1) + 180.0) % 360.0 - 180.0)
+    rod, radius, problems = ideal.rod, ideal.radius, []
+    if apart.min() < MIN_APART:
+        i = int(np.argmin(apart))
+        problems.append(
+            f"{start} towers {'abc'[i - 1]} and {'abc'[i]} {apart[i]:.4g} deg apart, at "
+            f"{ideal.angle[i - 1]:g} and {ideal.angle[i]:g} deg, needed towers around the bed, as "
+            f"a rule 120 deg apart; correct their angles."
+        )
+    sizes = rod * _IN_MM[unit]
+    if (np.ptp(sizes) > 0.5 * sizes.max()) or min(radius.min(), ideal.arm.min()) < 0.0:
+        problems.append(
+            f"{start} rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of "
+            f"{radius.min():g} {unit}, needed rods that are nearly alike and positive numbers; "
+            "write all lengths in one unit."
+        )
+    elif not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):
+        problems.append(
+            f"{start} rods of {rod.min():g} {unit}, needed {SIZES[0]:g} to {SIZES[1]:g} mm; state "
+            "their unit with --unit in or --unit m if they are in another one, or correct them."
+        )
+    elif not ideal.turns and (rod <= radius).any():
+        problems.append(
+            f"{start} rods of {rod.min():g} {unit} on a radius of {radius.max():g} {unit}, needed "
+            "rods that are longer than the radius, as a rule twice as long; write both in one "
+            "unit, or correct them."
+        )
+    elif not ideal.stops_at_angles and not (0.05 * rod < ideal.stop).all():
+        problems.append(
+            f"{start} endstops {ideal.stop.min():g} {unit} over the bed with rods of "
+            f"{rod.max():g} {unit}, needed the height of the nozzle at the endstops; write it in "
+            "the unit of the rods."
+        )
+    elif not ideal.turns and (ideal.stop > 15.0 * rod).any():
+        problems.append(
+            f"{start} endstops {ideal.stop.max():g} {unit} over the bed with rods of "
+            f"{rod.min():g} {unit}, needed the height of the nozzle at the endstops; write both "
+            "in one unit."
+        )
+    if problems:
+        raise ModelError(problems)
+
+
+_DELTAS: Sequence[Callable[[Path, str], Configuration | None]] = (
+    _klipper,
+    _marlin_header,
+    _g_code,
+)

@@ -1,0 +1,249 @@
+"""Configurations of firmwares, in their own numbers: read as machines, and written again."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from legcal.errors import LegcalError
+from legcal.exports.formats import export
+from legcal.geometry.types import Array
+from legcal.machine.dimensions import Dimensions
+from legcal.machine.family import description_of
+from legcal.machine.firmware_files import read_delta
+from legcal.machine.model import Machine
+from legcal.machine.model_builder import create_model
+
+KLIPPER = """
+[stepper_a]
+step_pin: PF0
+position_endstop: 301.35
+arm_length: 330.25
+angle: 209.6
+[stepper_b]
+position_endstop: 300.9  # above the bed
+arm_length = 330.75
+[stepper_c]
+position_endstop: 299.0
+[printer]
+kinematics: delta
+delta_radius: 168.2
+print_radius: 120
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# [stepper_c]
+#*# position_endstop = 300.6
+#*# angle = 90.45
+"""
+KLIPPER_ARMS = """
+[stepper_a]
+gear_ratio: 107:16, 60:16
+position_endstop: 250
+upper_arm_length: 168.5
+lower_arm_length: 322
+[stepper_b]
+lower_arm_length: 321.25
+angle: 150.8
+[stepper_c]
+upper_arm_length: 169
+position_endstop: 251.5
+[printer]
+kinematics: rotary_delta
+shoulder_radius: 35.4
+shoulder_height: 411.2
+"""
+DUET = """
+G21
+M665 L289.1:288.7:289.4 R131.15 B110 H305.2 X-0.4 Y0.25 Z0.1 ; all of it
+M666 X0.35 Y-0.2 Z-0.15
+"""
+DUET_ARMS = """
+M669 K10 U101.5:101.2:100.9 L221:220.4:220.7 H242:242.5:241.6 R48.2 A-40:62 X0.3 Y-0.2 Z0.15
+M666 X0.2 Y-0.3 Z0.1
+"""
+MARLIN = """
+; Marlin, from M503
+  M665 L250.4 R124.3 H252.7 S200 X0.12 Y-0.31 Z0.05 A0.2 B-0.3 C0.1
+  M666 X-0.4 Y0 Z-0.75
+"""
+MARLIN_HEADER = """
+#define DELTA
+#if ENABLED(DELTA)
+  #define DELTA_PRINTABLE_RADIUS 110.0 // mm
+  #define DELTA_DIAGONAL_ROD 250.4        // mm
+  #define DELTA_HEIGHT 252.7
+  #define DELTA_ENDSTOP_ADJ { -0.4, 0.0, -0.75 }
+  #define DELTA_RADIUS 124.3
+  #define DELTA_TOWER_ANGLE_TRIM { 0.12, -0.31, 0.05 }
+  //#define DELTA_RADIUS_TRIM_TOWER { 1.0, 0.0, 0.0 }
+  #define DELTA_DIAGONAL_ROD_TRIM_TOWER { 0.2, -0.3, 0.1 }
+#endif
+"""
+CONFIGURATIONS = {
+    "klipper": KLIPPER,
+    "klipper-arms": KLIPPER_ARMS,
+    "reprapfirmware": DUET,
+    "reprapfirmware-arms": DUET_ARMS,
+    "marlin": MARLIN,
+    "marlin-header": MARLIN_HEADER,
+}
+
+
+def machine_of(text: str, folder: Path, name: str = "printer.txt", **options: object) -> Machine:
+    """Return the machine of a configuration; the name of its file says nothing."""
+    path = folder / name
+    path.write_text(text)
+    return create_model(
+        description_of(path, Dimensions(**options)),  # type: ignore[arg-type]
+        folder,
+        force=True,
+    ).machine
+
+
+def numbers_in(text: str) -> list[float]:
+    """Return the numbers of a Delta, in the order of its fields."""
+    ideal = read_delta(Path("text"), text)
+    fields = (ideal.radius, ideal.angle, ideal.rod, ideal.arm, ideal.height, ideal.stop)
+    return np.concatenate(fields).tolist()
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) -> None:
+    text = CONFIGURATIONS[name]
+    machine = machine_of(text, tmp_path)
+    path = tmp_path / "again.txt"
+    exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
+    np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
+    assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+# --- hexapods -----------------------------------------------------------------------------------
+
+INI = """
+[KINS]
+KINEMATICS = genhexkins
+[HAL]
+HALFILE = LIB:basic_sim.tcl
+HALFILE = struts.hal
+[TRAJ]
+LINEAR_UNITS = inch
+HOME = 0.25 -0.5 21 1 -2 3
+"""
+FLYPT = """
+<FLYPT_MOVER Version="3.5.3"><RIG><Type>Mover.Rigs.LinearHexapod</Type><CONTROLS>
+<NUDCORX>15</NUDCORX><NUDCORY>-20</NUDCORY><NUDCORZ>240</NUDCORZ>
+<NUDRigL1>812.5</NUDRigL1><NUDRigL2>95</NUDRigL2><NUDRigL3>130.5</NUDRigL3>
+<NUDRigL4>1100</NUDRigL4><NUDRange>150</NUDRange><NUDMiddle>860</NUDMiddle>
+</CONTROLS></RIG></FLYPT_MOVER>
+"""
+SIX = np.arange(6)
+BASE = 18.0 * np.stack([np.cos(SIX + 0.1), np.sin(SIX + 0.1), 0.01 * SIX], axis=1)
+PLATFORM = 9.0 * np.stack([np.cos(SIX + 0.4), np.sin(SIX + 0.4), -0.02 * SIX], axis=1)
+
+
+def pins(base: Array = BASE, platform: Array = PLATFORM) -> str:
+    """Return the setp lines of a hexapod, and the INI sections of its joints."""
+    lines = [
+        f"setp genhexkins.{side}.{j}.{axis} {x!r}"
+        for side, points in (("base", base), ("platform", platform))
+        for j, point in enumerate(points.tolist())
+        for axis, x in zip("xyz", point, strict=True)
+    ]
+    return "\n".join(lines)
+
+
+def joints(offset: float = 15.0, limits: tuple[float, float] = (16.0, 30.0)) -> str:
+    sections = (
+        f"[JOINT_{j}]\nHOME_OFFSET = {offset + 0.1 * j}\nMIN_LIMIT = {limits[0]}\n"
+        f"MAX_LIMIT = {limits[1]}\n"
+        for j in range(6)
+    )
+    return "".join(sections)
+
+
+def test_a_linuxcnc_hexapod_in_inches_comes_back_from_its_hal_file(tmp_path: Path) -> None:
+    (tmp_path / "struts.hal").write_text(pins())
+    machine = machine_of(INI + joints(), tmp_path, "machine.txt")
+    np.testing.assert_allclose(machine.A_base, 0.0254 * BASE, atol=1e-12)
+    np.testing.assert_allclose(machine.B_platform, 0.0254 * PLATFORM, atol=1e-12)
+    np.testing.assert_allclose(machine.home.translation, 0.0254 * np.array([0.25, -0.5, 21.0]))
+    np.testing.assert_allclose(
+        machine.home.rotation.as_euler("xyz", degrees=True), [1.0, -2.0, 3.0], atol=1e-9
+    )
+    np.testing.assert_allclose([leg.length_at(leg.travel[1]) for leg in machine.legs], 0.0254 * 30)
+    path = tmp_path / "again.txt"
+    export(machine.yaml_path, "linuxcnc", path)
+    again = machine_of(path.read_text(), tmp_path, "again.txt")
+    for one, two in zip(machine.legs, again.legs, strict=True):
+        np.testing.assert_allclose([*one.A, *one.B, one.q0], [*two.A, *two.B, two.q0], atol=1e-9)
+        np.testing.assert_allclose(one.travel, two.travel, atol=1e-9)
+
+
+def test_a_rig_of_flypt_is_written_as_it_was_read(tmp_path: Path) -> None:
+    machine = machine_of(FLYPT, tmp_path, "rig.txt", leg_radius=20.0)
+    path = tmp_path / "again.txt"
+    exported = export(machine.yaml_path, "flypt", path)
+    values = dict(re.findall(r"^([\w ]+): ([-\d.]+)$", path.read_text(), re.MULTILINE))
+    stated = {
+        key.removeprefix("Rig").replace("COR", "COR "): float(value)
+        for key, value in re.findall(r"<NUD(\w+)>([-\d.]+)<", FLYPT)
+    }
+    assert {key: float(value) for key, value in values.items()} == pytest.approx(stated, abs=1e-6)
+    assert exported.figures["remaining_mm"]["max"] < 1e-6
+    lengths = [np.linalg.norm(leg.A - machine.home.apply(leg.B)) for leg in machine.legs]
+    np.testing.assert_allclose(lengths, 0.86)
+
+
+# --- mistakes -----------------------------------------------------------------------------------
+
+
+def without(text: str, *parts: str) -> str:
+    """Return a configuration without its lines that have some text."""
+    return "\n".join(line for line in text.splitlines() if not any(p in line for p in parts))
+
+
+REFUSED = [
+    # configuration, options, words that must be said
+    (without(KLIPPER, "arm_length: 330"), {}, ("no arm_length in [stepper_a]", "rods")),
+    (without(KLIPPER, "delta_radius"), {}, ("no delta_radius in [printer]", "carriage")),
+    (without(KLIPPER_ARMS, "shoulder_height"), {}, ("no shoulder_height in [printer]",)),
+    (without(KLIPPER, "kinematics"), {}, ("kinematics nowhere", "section [printer]")),
+    (KLIPPER.replace("delta\n", "corexy\n"), {}, ("corexy", "delta or rotary_delta")),
+    (KLIPPER.replace("330.25", "long"), {}, ("arm_length in [stepper_a]", "'long'")),
+    (KLIPPER.replace("209.6", "89"), {}, ("towers c and a 1.45 deg apart", "correct their angles")),
+    (KLIPPER.replace("330.25", "13.0").replace("330.75", "13.02"), {},
+     ("rods of 13 mm", "--unit in")),
+    (KLIPPER.replace("168.2", "368.2"), {}, ("longer than the radius", "one unit")),
+    (KLIPPER.replace("330.25", "13.0"), {}, ("13", "330.75", "one unit")),
+    (KLIPPER.replace("300.6", "11.8"), {}, ("endstops 11.8 mm", "the unit of the rods")),
+    (KLIPPER, {"unit": "in"}, ("330.25 in", "30 to 5000 mm")),
+    (DUET.replace("R131.15", ""), {}, ("no R of M665",)),
+    (DUET.replace("L289.1:288.7:289.4", "L289:289:289:289"), {}, ("more than three towers",)),
+    (DUET, {"unit": "in"}, ("--unit in and mm", "leave out --unit")),
+    (DUET_ARMS.replace("A-40:62", ""), {}, ("no A of M669", "highest angle")),
+    (DUET_ARMS.replace("K10", "K4"), {}, ("K4", "K10")),
+    ("M665 L250 R124 H250\nM666 X-0.5", {}, ("M666", "'; Marlin'")),
+    (without(MARLIN_HEADER, "DELTA_RADIUS 1"), {}, ("no R of M665",)),
+    (MARLIN_HEADER.replace("#define DELTA\n", "//#define DELTA\n"), {}, ("commented out",)),
+    (without(INI, "HALFILE") + joints(), {}, ("genhexkins.base.0.x' and 35 more", "HAL file")),
+    (pins(), {"height": 20.0}, ("no unit", "--unit mm or in")),
+    (pins(), {"unit": "in"}, ("no HOME in [TRAJ]", "--height")),
+    (INI.replace("genhexkins", "trivkins"), {}, ("trivkins", "genhexkins")),
+    (INI.replace("inch", "cubits") + pins(), {}, ("LINEAR_UNITS = cubits",)),
+    (INI.replace("inch", "mm") + pins() + "\n" + joints(380.0, (400.0, 700.0)), {},
+     ("limits of 400 to 700", "one unit")),
+    (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
+    (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),
+    (FLYPT.replace("<NUDMiddle>860", "<NUDMiddle>33"), {}, ("Middle 33", "all in mm")),
+    ("<robot name='x'/>", {}, ("found XML", "legcal inspect")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "options", "words"), REFUSED)
+def test_a_configuration_that_cannot_be_one_is_refused_in_a_sentence(
+    text: str, options: dict[str, object], words: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(LegcalError) as caught:
+        machine_of(text, tmp_path, **options)
+    said = caught.value.problems
+    assert all(word in said[0] for word in words), said
