@@ -403,7 +403,6 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         ("the slider 'j_leg0_0' on the base itself", "the joint at A moves"),
     ),
     "undriven-five-bar": (_drawn(partial(_planar_arms, 2), driven=False), ARMS),
-    "undriven-3-rrr": (_drawn(partial(_planar_arms, 3), driven=False), ARMS),
     "undriven-hinges": (_drawn(_hinges, driven=False), ("directly between base and platform",)),
     "h4": (_drawn(H4), SEVERAL),
     "h4-beside": (_h4_named_beside_its_middle(), ("legs end on link 'bar0'",)),
@@ -448,7 +447,6 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
     "u-off": (_specified(lambda: _axis_off("US", 0.02)), ("'leg1_a1' and 'leg1_a2'", "1.146 deg")),
     "one-leg": (_specified(lambda: of_types(["US"])), ("1 leg in space", "at least 3")),
     "two-legs": (_specified(lambda: of_types(["US"] * 2)), ("2 legs in space", "at least 3")),
-    "one-leg-rr": (_specified(lambda: of_types(["RR"])), ("at least 3",)),
     "one-leg-in-a-plane": (
         _specified(lambda: planar(kinds=("actuated",))),
         ("1 leg in a plane", "at least 2"),
