@@ -162,7 +162,8 @@ class _Mounted:
     def steps(self, readings: Array) -> Array:
         """Return the way (k, 3) of the motors from their endstops, downwards [mm or deg]."""
         gains = np.array([actuator.gain for actuator in self.actuators])
-        return self._size * self.signs * gains * (self.tops - readings[:, self._columns])
+        way = self.tops - readings[:, self._columns]
+        return np.asarray(self._size * self.signs * gains * way)
 
     @property
     def lowest(self) -> float:

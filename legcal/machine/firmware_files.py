@@ -306,10 +306,10 @@ def _shown(key: str) -> str:
 
 def _completed(path: Path, read: Configuration) -> dict[str, float]:
     """Return the values of all parameters, with defaults; refuse those that are missing."""
-    for key, value in read.values.items():
-        if not abs(value) < MAX_NUMBER:
+    for key, stated in read.values.items():
+        if not abs(stated) < MAX_NUMBER:
             raise ModelError(
-                f"{path}: {_shown(key)} could not be used: found {value:g}, needed a number below "
+                f"{path}: {_shown(key)} could not be used: found {stated:g}, needed a number below "
                 f"{MAX_NUMBER:g}; correct it."
             )
     values, missing = dict[str, float](), list[Parameter]()
@@ -333,9 +333,12 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
 
 
 def _needed(firmware: Firmware, p: Parameter) -> str:
-    if p.field == "stop" and firmware.stops_are_motors:
-        return "the lowest and highest angle of the arms"
-    return _WORDS[p.field]
+    """Return the meaning of a parameter."""
+    if p.field != "stop" or not firmware.stops_are_motors:
+        return _WORDS[p.field]
+    if p.key.startswith("JOINT"):
+        return "the position of the joint at its home switch"
+    return "the lowest and highest angle of the arms"
 
 
 def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float | None) -> Table:
