@@ -51,6 +51,8 @@ def firmware_refusal(name: str) -> Callable[[Subject], str | None]:
         if len(actuators) != TOWERS or machine.mobility != TOWERS:
             carry = f"{len(actuators)} motors that carry rods"
             return f"found {carry} and {machine.mobility} freedoms, {needed}"
+        if machine.n_legs != 2 * TOWERS:
+            return f"found {machine.n_legs} rods on them, {needed} and two rods on each"
         if not machine.is_determined:
             return f"found that {machine.undetermined}, {needed}"
         turns = {actuator.turns for actuator in actuators}
