@@ -13,18 +13,18 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.platform import PlatformError
+from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
 from legcal.calibration.quantities import mm_deg
 from legcal.files.motions import Pose
 from legcal.files.schema import Document, Number, Version
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
-from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, Setting
-from legcal.planning.sight import Seen
 from legcal.version import __version__
 from legcal.vision.camera import Camera
+from legcal.vision.sight import Seen
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,15 @@ from math import degrees
 
 from rich.text import Text
 
-from legcal.calibration.identify.predicted_observations import legs_in_words, views_in_words
 from legcal.calibration.identify.report import (
     BoardReport,
     CameraIntrinsics,
     Identifiability,
     Ranks,
     WeakDirection,
+    views_in_words,
 )
-from legcal.machine.directions import leg_labels, list_in_words
+from legcal.machine.directions import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table
 from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks
@@ -223,8 +223,7 @@ def _verdict(report: Identifiability) -> list[Part]:
         sigma = report.platform_sigma
         expected = (
             f"Predicted error of the platform (1 sigma): {_two_digits(1e3 * sigma.dX_m)} mm, "
-            f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
-            "at both ends of a leg."
+            f"{_two_digits(degrees(sigma.dE_rad))} deg."
         )
         lines.append(Text(expected, style="dim"))
         ways = [s.assumed for s in report.scale if s.sigma is not None and s.source != "radii"]
