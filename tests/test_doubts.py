@@ -26,7 +26,7 @@ from legcal import (
     simulate,
 )
 from legcal.calibration import doubts, verdict
-from legcal.calibration.doubts import MOST_SQUARES, Doubt, model_error
+from legcal.calibration.doubts import Doubt, model_error
 from legcal.calibration.joint_fit.cross_validation import cross_validate
 from legcal.calibration.joint_fit.diagnostics import DoubtedCamera
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
@@ -104,6 +104,10 @@ def _stretched(row: dict[str, str]) -> None:
             row[name] = repr(0.94 * float(row[name]))
 
 
+def _overrated(row: dict[str, str]) -> None:
+    row |= {name: repr(0.1 * float(row[name])) for name in ("s00", "s01", "s11")}
+
+
 def _moved_hint(found: dict[str, Any]) -> None:
     found["views"]["c2"]["T_base_camera"]["xyz"][0] += 0.3
 
@@ -111,7 +115,8 @@ def _moved_hint(found: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("code", "spoil", "said"),
     [
-        ("noise", _table("measurements.csv", _backlash), "all views scatter"),
+        ("noise", _table("observations.csv", _overrated), "all views scatter"),
+        ("reading_noise", _table("measurements.csv", _backlash), "leg1 scatter"),
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
         ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
         ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),
@@ -215,11 +220,8 @@ def test_left_out_images_contradict_a_model_that_was_led_away(healthy: Calibrati
     first, *others = posterior.state.legs
     away = replace(first, B=first.B + np.array([0.03, 0.0, 0.0]))
     state = replace(posterior.state, legs=(away, *others))
-    led_away = cross_validate(posterior.problem, state)
-    assert led_away is not None
-    assert led_away.ratio > MOST_SQUARES
     codes = {one.code for one in _judged(healthy, posterior=replace(posterior, state=state)).doubts}
-    assert "no_better" in codes
+    assert {"left_out", "no_better"} <= codes
 
 
 def _documented() -> dict[str, set[str]]:

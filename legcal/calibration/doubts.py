@@ -51,6 +51,7 @@ from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
+READING_NOISE = "reading_noise"  # code of the doubt in readings that scatter
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
@@ -145,6 +146,14 @@ def doubts_of(
     motors = {one.subject for one in session.findings} if course else set[str]()
     is_of_motors = any(one.kind in OF_MOTORS for one in session.findings) and bool(course)
     legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
+    symptoms = (
+        []
+        if causes
+        else _symptoms(dataset, solution, platform, changes, held_out, session, predicted)
+    )
+    if {one.code for one in causes} == {READING_NOISE}:
+        # A model that was led away scatters readings as well
+        symptoms = _left_out(predicted, platform)
     return (
         *([] if is_of_motors else _readings(solution)),
         *_legs_left_out(solution, legs),
@@ -154,7 +163,8 @@ def doubts_of(
         *_few_outlines(solution.outlines),
         *_nominal_lengths(dataset, solution, platform, changes),
         *_no_better(predicted, platform),
-        *(causes or _symptoms(dataset, solution, platform, changes, held_out, session, predicted)),
+        *causes,
+        *symptoms,
     )
 
 
@@ -173,7 +183,7 @@ def _symptoms(
         *_held_out(held_out),
         *_cameras(solution, platform),
         *_left_out(predicted, platform),
-        *_noise(solution, session),
+        *_noise(solution, session, platform),
     ]
 
 
@@ -394,16 +404,18 @@ def _changes(
 ) -> list[Doubt]:
     """Return what changed in the course of the session, and readings that do not follow motors.
 
-    It counts where it displaces the platform by more than that is known to.
+    It counts where it displaces the platform by more than that is known to; scatter of readings
+    also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
     """
     doubts = []
+    scatters = READING_NOISE if _noise(solution, session, platform) else ""
     for finding in session.findings:
         effect = None if platform is None else _effect_of(finding, dataset, solution)
         if platform is None or effect is None:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
-        elif effect[0] > platform.sigma.mean_displacement:
+        elif effect[0] > platform.sigma.mean_displacement or finding.kind == scatters:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
-    return doubts
+    return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
 
 
 def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[float, float]:
@@ -520,8 +532,13 @@ def _moved_parameters(
     return [Doubt("tolerance", what, remedy, *_mean(error))]
 
 
-def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or of a view, leg or period."""
+def _noise(
+    solution: Solution, session: SessionTests, platform: PlatformAccuracy | None
+) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or of a view, leg or period.
+
+    What is beyond the claim may be no noise, and move the platform as much as that.
+    """
     problem = solution.posterior.problem
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
@@ -540,7 +557,9 @@ def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
         "something moves that should not, or edges are not those of the legs: look at the worst "
         "outlines, for play, bending, a camera or board that moved, and readings of another moment"
     )
-    return [Doubt("noise", what, remedy)]
+    part = float(np.sqrt(times[worst] ** 2 - 1.0))
+    sigma = None if platform is None else platform.sigma
+    return [Doubt("noise", what, remedy, *_mean(sigma, part))]
 
 
 def _scale(
