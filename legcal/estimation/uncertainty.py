@@ -246,11 +246,17 @@ def score_test(
         np.zeros((c, c)),
     )
     element_products = np.zeros((problem.n_elements, problem.d_element, c))
-    for name, v in columns.items():
-        _add_products(problem.sparsity[name], linear[name], v, kept_products, element_products)
-        flat = v.reshape(-1, c)
-        score += flat.T @ linear[name].r.ravel()
-        projected += flat.T @ flat
+    for name, of_factor in columns.items():
+        acting = np.flatnonzero(of_factor.any(axis=(0, 1)))
+        if not len(acting):
+            continue
+        v = of_factor[..., acting]
+        kept, elements = kept_products[:, acting], element_products[..., acting]
+        _add_products(problem.sparsity[name], linear[name], v, kept, elements)
+        kept_products[:, acting], element_products[..., acting] = kept, elements
+        flat = v.reshape(-1, len(acting))
+        score[acting] += flat.T @ linear[name].r.ravel()
+        projected[np.ix_(acting, acting)] += flat.T @ flat
     following = _element_derivatives(normal).reshape(-1, problem.n_kept)
     kept = kept_products[:-1] + following.T @ element_products.reshape(-1, c)
     by_element = element_products
