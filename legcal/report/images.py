@@ -98,7 +98,8 @@ def _model_and_sheet(calibration: CameraCalibration) -> str:
     bend, sigma = 1e3 * abs(calibration.sheet[k]), 1e3 * calibration.sheet_sigma[k]
     wider, wider_sigma = 100.0 * calibration.sheet[3], 100.0 * calibration.sheet_sigma[3]
     sigma_px = calibration.projection_sigma
-    middle, worst = sigma_px[6, 8], sigma_px[np.isfinite(sigma_px)].max()
+    middle = np.sqrt(np.mean(sigma_px[3:10, 4:13] ** 2))
+    worst = sigma_px[np.isfinite(sigma_px)].max()
     return (
         f"Lens model {calibration.lens}{cross_validation}. Pixels are known to {middle:.2g} px (1 "
         f"sigma) in the middle of the image, {worst:.2g} px at worst. The board is bent by "
