@@ -269,6 +269,12 @@ def identify(
             help="Hand-held camera: a new pose for every image of a view; with --board and --view.",
         ),
     ] = False,
+    noise: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULT", help="Take the errors of outlines from this earlier result."
+        ),
+    ] = None,
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -280,7 +286,13 @@ def identify(
     check_page(page)
     views = [text.split(",") for text in view or []]
     identified = answer(
-        model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
+        model,
+        views,
+        images,
+        board=board,
+        platform_board=platform_board,
+        hand_held=hand_held,
+        noise=noise,
     )
     verdict = identify_verdict(identified)
     write_page(page, f"Identifiability of {model}", identify_table(identified), verdict)

@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.calibration.camera_calibration.projection import CameraComparison
-from legcal.report.render import heading, report, table
+from legcal.report.render import Report, heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
 _OFTEN = 0.5  # smallest share of images with a leg without a remark
 
 
-def camera_table(calibration: CameraCalibration, output: Path) -> RenderableType:
+def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     """Return a calibrated camera and its file."""
     used = [image for image in calibration.images if image.rms_px is not None]
     camera = calibration.camera
@@ -108,7 +107,7 @@ def _model_and_sheet(calibration: CameraCalibration) -> str:
     )
 
 
-def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
+def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Report:
     """Return the document of ``simulate``: the number of images of each view with each leg.
 
     *to_measure* is the distance that would fix the scale, if nothing in the dataset does.
