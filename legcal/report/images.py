@@ -54,11 +54,14 @@ def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     )
 
 
-_PARTS = (("top left", "top", "top right"), ("left", "middle", "right"),
-          ("bottom left", "bottom", "bottom right"))  # fmt: skip
+_PARTS = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
 
 
-def comparison_table(comparison: CameraComparison) -> RenderableType:
+def comparison_table(comparison: CameraComparison) -> Report:
     """Return the difference of two cameras in the nine parts of the image."""
     px, pixels = comparison.px, comparison.pixels
     worst = int(np.argmax(px))
@@ -69,11 +72,9 @@ def comparison_table(comparison: CameraComparison) -> RenderableType:
             inside = (cell[:, 0] == x) & (cell[:, 1] == y)
             if not inside.any():
                 continue
-            rms = float(np.sqrt(np.mean(px[inside] ** 2)))
-            sigma = "" if comparison.sigma_px is None else (
-                f"{np.sqrt(np.mean(comparison.sigma_px[inside] ** 2)):.3f} px"
-            )  # fmt: skip
-            rows.append((name, f"{rms:.3f} px", sigma))
+            lengths = [px] if comparison.sigma_px is None else [px, comparison.sigma_px]
+            rms = [f"{np.sqrt(np.mean(length[inside] ** 2)):.3f} px" for length in lengths]
+            rows.append((name, *rms, *[""] * (2 - len(rms))))
     u, v = pixels[worst]
     return report(
         heading("difference", f": {np.sqrt(np.mean(px**2)):.3f} px (rms) over the image"),
