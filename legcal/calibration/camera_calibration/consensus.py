@@ -293,13 +293,13 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
         i: min(faults, key=partial(complexity, i)) for i, faults in candidates.items() if faults
     }
     reasons = {}
-    covered = cv2.convexHull(corners.px[group[corners.image]].astype(np.float32))
+    in_group = corners.px[group[corners.image]]
     for i in candidates:
         name = best_names.get(i, "")
-        if name in _LIKE_A_LENS and _is_outside(corners.px[corners.image == i], covered):
+        if name in _LIKE_A_LENS and _is_outside(corners.px[corners.image == i], in_group):
             reasons[i] = (
-                "it reaches a part of the image that the others do not, where the lens model may not "
-                "hold; bring the board there in more images"
+                "it reaches a part of the image that the others do not, where the lens model may "
+                "not hold; bring the board there in more images"
             )
             continue
         equal = [candidates[k][name].change for k, other in best_names.items() if other == name]
@@ -334,9 +334,10 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
     return reasons
 
 
-def _is_outside(px: Array, covered: Array) -> bool:
+def _is_outside(px: Array, others: Array) -> bool:
     """Return whether most corners of an image lie outside the hull of others."""
-    inside = [cv2.pointPolygonTest(covered, point, False) >= 0.0 for point in px.tolist()]
+    hull = cv2.convexHull(others.astype(np.float32))
+    inside = [cv2.pointPolygonTest(hull, point, False) >= 0.0 for point in px.tolist()]
     return 2 * sum(inside) < len(inside)
 
 
