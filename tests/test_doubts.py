@@ -36,6 +36,8 @@ from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
 from legcal.simulation.settings import Level
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
