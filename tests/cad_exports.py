@@ -60,7 +60,7 @@ def rod_pose(A: np.ndarray, B: np.ndarray) -> RigidTransform:
     )
 
 
-def write_urdf(folder: Path, *, mesh: bool = True) -> Path:
+def write_head_urdf(folder: Path, *, mesh: bool = True) -> Path:
     """Write ``head.urdf`` and the mesh of its rods, and return its path."""
     lines = ['<robot name="head">', '<link name="foot"/>', '<link name="body"/>']
     lines += ['<link name="dummy"><visual><geometry><box size="0 0 0"/></geometry></visual></link>']
@@ -112,7 +112,7 @@ def write_urdf(folder: Path, *, mesh: bool = True) -> Path:
     return path
 
 
-def write_mjcf(folder: Path) -> Path:
+def write_head_mjcf(folder: Path) -> Path:
     """Write the same as ``head.xml``."""
     legs = horns()
     T_base_head = RigidTransform.from_translation(legs[5][2]) * TURNED

@@ -386,6 +386,7 @@ def _on_one_line() -> MachineSpec:
 
 
 ARMS = ("no slider and 3 joints in different places", "the joint at A moves")
+PLANE = ("a planar machine of arms", "axes are parallel", "cannot be calibrated")
 RODS = ("carries 2 rods on the moving link 'arm0'", "the joints at A move")
 LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
 SEVERAL = ("a platform of several bodies", "H4 or I4", "legs end on link 'bar", "joint 'j_bar0'")
@@ -402,7 +403,7 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         _drawn(_prs, driven=False),
         ("the slider 'j_leg0_0' on the base itself", "the joint at A moves"),
     ),
-    "undriven-five-bar": (_drawn(partial(_planar_arms, 2), driven=False), ARMS),
+    "undriven-five-bar": (_drawn(partial(_planar_arms, 2), driven=False), PLANE),
     "undriven-hinges": (_drawn(_hinges, driven=False), ("directly between base and platform",)),
     "h4": (_drawn(H4), SEVERAL),
     "h4-beside": (_h4_named_beside_its_middle(), ("legs end on link 'bar0'",)),
@@ -420,11 +421,8 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         _drawn(partial(_delta, parallelograms=True, elbows=2)),
         ("the motor 'j_arm0' of 2 rods", "'j_lower0_0'", "arms on arms"),
     ),
-    "3-rrr": (
-        _drawn(partial(_planar_arms, 3)),
-        ("found a planar machine whose joints at A move",),
-    ),
-    "one-loop": (_one_loop, ("one closed chain in which no link is a platform on legs",)),
+    "3-rrr": (_drawn(partial(_planar_arms, 3)), PLANE),
+    "one-loop": (_one_loop, PLANE),
     **{
         f"slider-off-{types}": (
             _specified(partial(missing, types, 0.002)),

@@ -1,14 +1,28 @@
 """Machines as CAD exports draw them: whole robots of meshes, with loops between named frames."""
 
+import re
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cad_exports import LENGTH, RADIUS, SHAFT, write_mjcf, write_urdf
+import trimesh
+from ankles import ROD, write_ankle
+from cad_exports import LENGTH, RADIUS, SHAFT, write_head_mjcf, write_head_urdf
 
-from legcal import load_mechanism
+from legcal import load_mechanism, plan
+from legcal.errors import ModelError
+from legcal.machine.home import home_of_legs
+from legcal.machine.mesh_cylinders import cylinder_about_z
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.model_writer import write_model
+from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
+from legcal.machine.parameters import (
+    geometries,
+    moved_legs,
+    parametrization_of,
+    reframed,
+    vector_of,
+)
 from legcal.machine.topology import level_rotation
 
 
@@ -25,7 +39,7 @@ def _check(machine: Machine, radius: float = RADIUS, length: float = LENGTH) -> 
     assert (level.inv() * machine.home.rotation).magnitude() < np.radians(0.1)
 
 
-@pytest.mark.parametrize("write", [write_urdf, write_mjcf])
+@pytest.mark.parametrize("write", [write_head_urdf, write_head_mjcf])
 def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -> None:
     machine = load_mechanism(write(tmp_path / "from"))  # type: ignore[operator]
     _check(machine)
@@ -43,3 +57,112 @@ def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -
     written = load_mechanism(write_model(machine, tmp_path / "to")[0])
     _check(written)
     assert written.leg_names == machine.leg_names
+
+
+def test_an_ankle_of_two_cranks_and_a_universal_joint_loads_and_is_written(tmp_path: Path) -> None:
+    machine = load_mechanism(write_ankle(tmp_path / "from"))
+    assert [leg.type for leg in machine.legs] == ["RSS", "RSS", "U"]
+    assert machine.mobility == len(machine.motors) == machine.motor_rank == 2
+    np.testing.assert_allclose([leg.q0 for leg in machine.legs[:2]], ROD, atol=1e-12)
+    np.testing.assert_allclose(machine.legs[2].A, 0.0, atol=1e-12)
+    # Other numbers of all legs, with those of the universal joint, are in the files.
+    parametrization = parametrization_of(machine, twists=True)
+    steps = 1e-3 * np.random.default_rng(2).uniform(-1.0, 1.0, len(parametrization))
+    wanted = moved_legs(geometries(machine), parametrization.place, steps)
+    wanted = reframed(wanted, machine.frame_legs)
+    write_urdf(machine, wanted, tmp_path / "calibrated.urdf")
+    home = home_of_legs(machine, wanted, 0.05)
+    write_calibrated_yaml(
+        machine, tmp_path / "calibrated.yaml", "calibrated.urdf", home=home, legs=wanted
+    )
+    written = load_mechanism(tmp_path / "calibrated.yaml")
+    values = [
+        vector_of(parametrization, legs, geometries(machine))
+        for legs in (geometries(written), wanted)
+    ]
+    names = [
+        name
+        for name in parametrization.names
+        if "gain" not in name and not name.startswith("pitch.platform_axis")
+    ]
+    of_names = [parametrization.names.index(name) for name in names]
+    np.testing.assert_allclose(values[0][of_names], values[1][of_names], rtol=0, atol=1e-9)
+
+
+def test_a_leg_without_a_round_part_gets_a_stated_radius(tmp_path: Path) -> None:
+    path = write_head_urdf(tmp_path / "from", mesh=False)
+    machine = load_mechanism(path)
+    assert not any(leg.cylinders for leg in machine.legs)
+    assert "--leg-radius" in " ".join(machine.diagnostics)
+    with pytest.raises(ModelError, match="no leg with a visible cylinder"):
+        plan(machine)
+    _check(load_mechanism(path, leg_radius=0.002), radius=0.002)
+    # A square bar is no rod, and a stated radius overrides that of a mesh.
+    assert cylinder_about_z(*_bar(4)) is None
+    found = cylinder_about_z(*_bar(32))
+    assert found is not None
+    np.testing.assert_allclose(found, (0.003, 0.0, 0.09), atol=1e-3)
+    _check(load_mechanism(write_head_urdf(tmp_path), leg_radius=0.002), radius=0.002)
+
+
+def _bar(sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and triangles of a prism of 3 mm radius along z."""
+    bar = trimesh.creation.cylinder(0.003, height=0.09, sections=sides)
+    return np.add(bar.vertices, [0.0, 0.0, 0.045]), np.asarray(bar.faces)
+
+
+REFUSED: dict[str, tuple[str, str, str]] = {
+    "half-a-loop": ("head.urdf", '<link name="closing_3_2"/>', "found the frame 'closing_3_1' and"),
+    "two-parents": (
+        "two.urdf",
+        '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
+        '<joint name="j" type="fixed"><parent link="a"/><child link="c"/></joint>'
+        '<joint name="k" type="fixed"><parent link="b"/><child link="c"/></joint></robot>',
+        "gives the link 'c' a second parent",
+    ),
+    "gazebo": ("model.sdf", '<?xml version="1.0"?>\n<sdf version="1.6"><model/></sdf>', "an SDF"),
+    "linuxcnc": ("m.hal", "# hexapod\nloadrt genhexkins\nsetp x 1\n", "legcal new .*m.hal -o DIR"),
+    "printer": ("printer.cfg", "[printer]\nkinematics: delta\n", "legcal new .*printer.cfg"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_files_of_other_programs_and_open_loops_get_their_sentence(
+    name: str, tmp_path: Path
+) -> None:
+    file, text, message = REFUSED[name]
+    path = tmp_path / file
+    if file == "head.urdf":
+        write_head_urdf(tmp_path)
+        frame = r'<joint name="closing_3_2_frame".*?</joint>'
+        text = re.sub(frame, "", path.read_text(), flags=re.S).replace(text, "")
+    path.write_text(text)
+    with pytest.raises(ModelError, match=message):
+        load_mechanism(path)
+
+
+def test_a_file_is_xml_by_its_content(tmp_path: Path) -> None:
+    path = write_head_urdf(tmp_path).rename(tmp_path / "head.urdf.txt")
+    _check(load_mechanism(path))
+
+
+@pytest.fixture(scope="module")
+def reachy_mini() -> Path:
+    """The descriptions of the robot Reachy Mini, as its package has them."""
+    try:
+        found = files("reachy_mini") or []
+    except PackageNotFoundError:
+        pytest.skip("reachy_mini is not installed: pip install --no-deps reachy_mini")
+    (urdf,) = [Path(str(f.locate())) for f in found if f.match("urdf/robot.urdf")]
+    return urdf.parents[1]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("name", ["urdf/robot.urdf", "mjcf/reachy_mini.xml"])
+def test_a_robot_that_people_have_loads_unedited(reachy_mini: Path, name: str) -> None:
+    machine = load_mechanism(reachy_mini / name)
+    _check(machine, radius=0.0025, length=0.085)
+    said = " ".join(machine.diagnostics)
+    assert "'yaw_body'" in said
+    assert "close no loop and are held as drawn" in said
+    assert "joints of the platform are level over those of the base" in said

@@ -15,7 +15,7 @@ from command_line import run
 from legcal import load_dataset, load_mechanism
 from legcal.data.measurements import reading_columns
 from legcal.geometry.types import Array
-from legcal.recordings.frames import VIDEOS
+from legcal.recordings.frames import VIDEOS, stamp_in
 
 MODEL = "hexapod"
 SIZE = 96, 64  # [px]
@@ -118,6 +118,15 @@ def _folder(motion: Motion, folder: Path) -> Path:
     for time, frame in zip(_stamps(motion), _frames(motion), strict=True):
         stamp = round(1e9 * (1.7e9 + AHEAD)) + round(1e9 * time)
         cv2.imwrite(str(place / f"{stamp}.png"), frame)
+    return place
+
+
+def _twice(motion: Motion, folder: Path) -> Path:
+    """Write a folder of images with two of one time, as whole seconds write them."""
+    place = _folder(motion, folder)
+    first = sorted(place.iterdir())[0]
+    first.rename(place / "1700000000.png")
+    (place / "left_1700000000.png").write_bytes((place / "1700000000.png").read_bytes())
     return place
 
 
@@ -237,6 +246,21 @@ def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
     assert 3 <= len(load_dataset(folder).measurements.q) < motion.rests
 
 
+@pytest.mark.parametrize(
+    ("name", "seconds"),
+    [
+        ("1305031102.175304", 1305031102.175304),
+        ("left-1700000000.100", 1700000000.1),
+        ("1700000000_100000000", 1700000000.1),
+        ("1700000000100000000", 1700000000.1),
+        ("frame_1700000000_12", 1700000000.0),  # the number of a frame is no fraction
+        ("frame_12", None),
+    ],
+)
+def test_times_in_names_keep_their_fraction(name: str, seconds: float | None) -> None:
+    assert stamp_in(name) == seconds
+
+
 REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = {
     "no such file": (lambda m, t: (t / "none.mp4",), "found no such file"),
     "damaged AVI header": (lambda m, t: (_written(t / "a.avi", b"RIFF0000AVI " + b"\xff" * 40),
@@ -259,6 +283,8 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
                    "needed times that overlap"),
     "no camera file": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t),
                                      "--camera", f"c1={t / 'nope.yaml'}"), "nope.yaml"),
+    "one time twice": (lambda m, t: (_twice(m, t), "--readings", _ticks(m, t)),
+                       "found the time of 1700000000.png again"),
     "no offset": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "nan"),
                   "correct --offset"),
     "a row without a time": (lambda m, t: (_video(m, t), "--readings", _holed(m, t)),

@@ -20,9 +20,11 @@ from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
+from legcal.machine.feasibility import feasible_poses
 from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,
@@ -35,6 +37,8 @@ from legcal.machine.model import Machine, slider_columns
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import reading_residuals
 from legcal.machine.solved_poses import solve_poses
+from legcal.planning.places import default_setting
+from legcal.planning.poses import surely_reached
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
 
@@ -106,6 +110,14 @@ def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> N
     assert machine.is_determined == (left == 0)
     assert machine.is_redundant == (name in REDUNDANT)
     assert machine.mobility == MOBILITY.get(name, machine.mobility)
+
+
+@pytest.mark.parametrize("name", ["7-UPS", "2-RPS + 2-SPS + rod"])
+def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: str) -> None:
+    machine = machine_of(name)
+    legs = fitted_legs(machine)
+    drawn = feasible_poses(machine, 8, np.random.default_rng(0), extreme=False)
+    assert surely_reached(machine, legs, default_setting(machine.size), drawn).mean() > 0.5
 
 
 def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() -> None:

@@ -80,6 +80,17 @@ def test_visuals_that_cannot_be_shown_are_named(tmp_path: Path, visual: str, mes
         solids_of(hexapod_showing(tmp_path, f"<visual><geometry>{visual}</geometry></visual>"))
 
 
+def test_only_photographs_need_meshes_and_empty_boxes_are_no_parts(tmp_path: Path) -> None:
+    shapes = '<mesh filename="gone.stl"/>', '<box size="0 0 0"/>', '<sphere radius="0.02"/>'
+    visuals = "".join(f"<visual><geometry>{shape}</geometry></visual>" for shape in shapes)
+    machine = hexapod_showing(tmp_path, visuals)
+    shown = [s for s in solids_of(machine, meshes_needed=False) if s.link == "platform"]
+    assert [s.shape for s in shown] == [Sphere(0.02)]
+    with pytest.raises(ModelError, match=r"--level outlines") as refusal:
+        solids_of(machine)
+    assert len(refusal.value.problems) == 1
+
+
 @pytest.mark.parametrize("name", ["hexapod", "delta", "3-prs"])
 def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None:
     machine = load_mechanism(ROOT / "models" / f"{name}.yaml")

@@ -47,7 +47,7 @@ from legcal.workers import Run
 
 # largest leg residual that errors of a nominal model explain, relative to the mean leg length
 MAX_NOMINAL_RESIDUAL = 0.03
-_STARTS = 12  # poses of other images near which the pose of accused readings is looked for
+_STARTS = 12  # poses of other images near which a pose that was not reached is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +237,7 @@ def nominal_poses(
     unreached = [k for k, (_, failure) in enumerate(followed) if failure is not None]
     residual = np.zeros(len(q))
     if unreached:
-        nearest, residual[unreached] = _least_squares(
-            machine, q[unreached], [T[k] for k in unreached]
-        )
-        for k, pose in zip(unreached, nearest, strict=True):
-            T[k] = pose
+        residual[unreached] = _solve_anew(machine, q, T, unreached)
     limit, first = _largest_residual(machine), measurements.first_rows.tolist()
     T, contradicting = _contradictions(machine, measurements, T)
     refused = {
@@ -306,15 +302,28 @@ def _contradictions(
     T, q = list(T_Rb_Re), measurements.q_of_poses
     motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
     accused = contradictions(machine, T, q[:, motors], sigma[motors])
-    others = [pose for k, pose in enumerate(T) if k not in accused]
-    starts = [platform_in_base(machine, machine.home), *others[:: 1 + len(others) // _STARTS]]
-    for k in accused:
-        near = [T[k], *starts]
-        poses, missed = _least_squares(machine, np.repeat(q[[k]], len(near), axis=0), near)
-        T[k] = poses[int(np.argmin(missed))]
     if accused:
+        _solve_anew(machine, q, T, list(accused))
         accused = contradictions(machine, T, q[:, motors], sigma[motors])
     return T, accused
+
+
+def _solve_anew(
+    machine: Machine, q: Array, T: list[RigidTransform], these: Sequence[int]
+) -> list[float]:
+    """Put the least-squares poses of some readings into T_Rb_Re; return their residuals [m].
+
+    Each is the best one of those near the pose so far, home, and the poses of other readings.
+    """
+    others = [pose for k, pose in enumerate(T) if k not in these]
+    others = [platform_in_base(machine, machine.home), *others[:: 1 + len(others) // _STARTS]]
+    residuals = []
+    for k in these:
+        starts = [T[k], *others]
+        poses, missed = _least_squares(machine, np.repeat(q[[k]], len(starts), axis=0), starts)
+        T[k] = poses[int(np.argmin(missed))]
+        residuals.append(float(missed.min()))
+    return residuals
 
 
 def _is_refused(contradiction: Contradiction, machine: Machine) -> bool:

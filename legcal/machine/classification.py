@@ -65,6 +65,9 @@ def classify_leg(
     leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
     hangs = is_actuator(steps[0], motors) and len(steps) > 2
     try:
+        carrier = None if sliders else _carrier(axes, poses[-1], platform_origin, leg, within)
+        if carrier is not None:
+            return LegChain(tuple(steps), tuple(poses), len(steps), None, *carrier)
         if hangs:
             _check_rod_alone(steps, motors, leg)
             slider, (n_lower, ends) = None, _rod(axes[1:], leg, within, axes[0].name)
@@ -477,6 +480,37 @@ def _rod(
         "joint at A; name this motor in name_mot, otherwise the machine cannot be calibrated this "
         "way."
     )
+
+
+def _carrier(
+    axes: Sequence[Axis], pose: Array, platform_origin: Array, leg: str, within: float
+) -> LegEnds | None:
+    """Return the ends of a joint that holds the platform on the base itself, else None.
+
+    It is a leg of constant length that is fixed to the platform, as the shin of an ankle on its
+    universal joint. Where B is on the platform is arbitrary: it is as far from the joint as the
+    machine is large, in a direction of the platform across the inner axis, towards the origin of
+    the platform link if that is not in the joint.
+    """
+    if len(axes) > 3 or len(_places(axes, within)) > 1:
+        return None
+    base = _pivot(axes, None, leg, within)
+    if base.spare or base.type is JointType.FIXED:
+        return None
+    A = axes[0].point if base.centre is None else base.centre
+    towards = matrix_applied(pose, platform_origin) - A
+    turns = np.array([axis.direction for axis in axes if axis.direction is not None]).reshape(-1, 3)
+    if base.type is not JointType.SPHERICAL:
+        inner = base.axes[-1].along
+        towards = towards - (towards @ inner) * inner
+    reach = within / CONCURRENT
+    if np.linalg.norm(towards) < 1e-3 * reach:
+        towards = cross(turns[0], turns[-1]) if len(turns) > 1 else normal_basis(
+            turns[0] if len(turns) else np.array([1.0, 0.0, 0.0])
+        )[0]  # fmt: skip
+    u = towards / np.linalg.norm(towards)
+    fixed = Pivot(JointType.FIXED, None, (), ())
+    return base, fixed, A, A + reach * u, u, 0
 
 
 def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> LegEnds:

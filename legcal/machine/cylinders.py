@@ -180,7 +180,7 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
             np.linalg.norm(cross(axis, u)) < PARALLEL
         )
 
-    for k in reversed(range(chain.n_lower)):
+    for k in reversed(range(min(chain.n_lower, len(chain.bodies)))):
         if not turns(k + 1, "base", chain.A, chain.steps[k]):
             break
     if chain.slider is None:

@@ -10,8 +10,10 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.solved_poses import project_pose
 from legcal.machine.ties import ties_in_words
+from legcal.machine.topology import level_rotation
 
 _AT_MIDDLE = 1e-6  # largest distance from mid-travel, relative to the travel
+_TURNED, _LEVEL = 0.02, 1e-3  # rotations of a link that seem turned, and of a level platform [rad]
 _MIN_SINGULARITY = 1e-4  # singularity measure below which it is the rounding of a file
 _GOOD_SINGULARITY = 0.05  # of a home that can be proposed
 _ALONG = np.radians(np.arange(2.0, 62.0, 2.0))  # of a free motion [rad, leg lengths]
@@ -42,6 +44,7 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
             f"{name} is at {reading} at home, outside its travel of {travel}; check the "
             f"limits, or {machine.urdf.wording.correct_home}."
         )
+    notes += _level_note(machine, q)
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]
     return (*notes, *_unseen_notes(machine), *_motor_notes(machine), *_spin_notes(machine))
@@ -127,6 +130,16 @@ def _good_home(machine: Machine, motion: Array) -> str:
                 )
                 return f" (the nearest good one is xyz [{xyz}], quat_xyzw [{quat}])"
     return ""
+
+
+def _level_note(machine: Machine, q: Array) -> list[str]:
+    """Return a note if the platform is level at home and the frame of its link is not."""
+    if not machine.spatial or machine.home.rotation.magnitude() < _TURNED:
+        return []
+    level = level_rotation(machine.A_at(q), machine.B_platform)
+    if (level.inv() * machine.home.rotation).magnitude() > _LEVEL:
+        return []
+    return ["at home the joints of the platform are level over those of the base, and not turned."]
 
 
 def _unseen_notes(machine: Machine) -> list[str]:

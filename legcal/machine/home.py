@@ -144,7 +144,7 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         R, t = mirror @ home.rotation.as_matrix() @ mirror, mirror @ (home.translation - centre)
         (other,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
         sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
-        if np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
+        if len(sides) == 2 and np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
             poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
             wording = machine.urdf.wording
             raise ModelError(

@@ -8,6 +8,7 @@ and R_e for :func:`legcal.machine.parameters.geometries`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -16,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from legcal.brief import brief
-from legcal.geometry.lines import distance_to_line
+from legcal.geometry.lines import cross, distance_to_line, normal_basis
 from legcal.geometry.motions import matrix_inverse
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
@@ -257,6 +258,11 @@ class LegChain:
         return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
 
     @property
+    def is_joint(self) -> bool:
+        """Whether it is one joint that holds the platform on the base."""
+        return self.n_lower == len(self.steps)
+
+    @property
     def n_upper(self) -> int:
         """The index of the body behind the slider, or of the rod."""
         return self.n_lower + (self.slider is not None)
@@ -384,6 +390,22 @@ class Leg:
         """Whether the leg does not turn relative to the platform."""
         return self.platform_joint is JointType.FIXED
 
+    @property
+    def is_platform_joint(self) -> bool:
+        """Whether it is one joint that holds the platform on the base: U, or S.
+
+        Its direction from A to B is a convention (:func:`with_platform_points`).
+        """
+        return self.is_fixed_to_platform and self.kind is LegKind.CONSTANT
+
+    @property
+    def inner_axis(self) -> Array | None:
+        """The axis (3,) in the platform of a joint that holds it there, None for an S joint."""
+        if self.twist is None or self.platform_axis is None or not self.is_platform_joint:
+            return None
+        e1, e2 = normal_basis(self.platform_axis)
+        return np.asarray(math.cos(self.twist) * e1 - math.sin(self.twist) * e2)
+
     def length_at(self, reading: float) -> float:
         """Return the length |AB| at a reading, L = sign q + q0 [m]."""
         return self.sign * reading + self.q0
@@ -502,6 +524,8 @@ def with_platform_points(
     frame of the legs [m], if given.
     """
     moved = []
+    if len(frame_legs) == 3:
+        legs = redirected(legs, frame_legs)
     for j, leg in enumerate(legs):
         point = frame_point(legs, frame_legs, j) if j in frame_legs else origin
         if leg.is_fixed_to_platform and leg.platform_axis is not None and point is not None:
@@ -519,6 +543,44 @@ def with_platform_points(
             )
         moved.append(leg)
     return tuple(moved)
+
+
+def redirected(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
+    """Return legs; joints that hold the platform get their conventional directions.
+
+    Such a direction is across the axis of the joint and the line of two other joints of the
+    platform, or towards their middle, so that all models of one machine share it.
+    """
+    others = [legs[j].B for j in frame_legs if not legs[j].is_fixed_to_platform]
+    return tuple(
+        _redirected(leg, others) if leg.is_platform_joint and len(others) > 1 else leg
+        for leg in legs
+    )
+
+
+def _redirected(held: Leg, others: Sequence[Array]) -> Leg:
+    """Return a joint that holds the platform in its direction from other joints there (n, 3)."""
+    if held.platform_axis is None:
+        return held
+    centre, inner = held.B - held.q0 * held.platform_axis, held.inner_axis
+    line = others[1] - others[0]
+    to_middle = np.mean(others, axis=0) - centre
+    across = to_middle - (to_middle @ line) / (line @ line) * line
+    if inner is not None:
+        across = to_middle - (to_middle @ inner) * inner
+        square = cross(inner, line)
+        if float(square @ square) > float(across @ across):
+            across = square if float(inner @ to_middle) >= 0.0 else -square
+    size = float(np.linalg.norm(across))
+    if size < 1e-6 * float(np.linalg.norm(line)):
+        return held
+    u = across / size  # whatever the sign of the inner axis is
+    twist = held.twist
+    if inner is not None:
+        e1 = normal_basis(u)[0]
+        angle = math.atan2(float(u @ cross(inner, e1)), float(inner @ e1))
+        twist = angle - math.pi * math.ceil(angle / math.pi - 0.5 - 1e-10)
+    return replace(held, B=centre + held.q0 * u, platform_axis=u, twist=twist)
 
 
 def radius_name(leg_name: str, part: str) -> str:

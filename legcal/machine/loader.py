@@ -51,6 +51,7 @@ from legcal.machine.leg import (
     EquationKind,
     JointType,
     LegChain,
+    redirected,
 )
 from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
@@ -146,14 +147,14 @@ def _load(source: Source) -> Machine:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
         block = file.legcal or proposed_block(source, file.name_mot)
+        if block.home is None and source.poses is not None:
+            T = source.poses[block.base].inv() * source.poses[block.platform]
+            drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
+            block = block.model_copy(update={"home": drawn_home})
+        machine = _assemble(source, block, closures)
     except OutOfClass:
         _check_plane_of_arms(urdf, source.path)
         raise
-    if block.home is None and source.poses is not None:
-        T = source.poses[block.base].inv() * source.poses[block.platform]
-        drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
-        block = block.model_copy(update={"home": drawn})
-    machine = _assemble(source, block, closures)
     drawn, round_parts = with_mesh_cylinders(machine, source.leg_radius)
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
@@ -245,6 +246,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     names = list(block.legs)
     base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
+    frame_legs = tuple(names.index(name) for name in base_frame)
+    legs = redirected(legs, frame_legs) if normals is None else legs
     legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
     solids = visual_solids(urdf)
     occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
@@ -256,7 +259,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         platform=block.platform,
         platform_joint=block.platform_joint,
         legs=with_covers(legs, occluders),
-        frame_legs=tuple(names.index(name) for name in base_frame),
+        frame_legs=frame_legs,
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
         home_configuration=chain.neutral(),
@@ -626,6 +629,17 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
                 f"{len(chains)} legs",
                 f"at most {MAX_LEGS}, since the work grows with their cube",
                 "leave out passive legs",
+                str(path),
+            )
+        )
+    holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
+    if len(holding) > 1:
+        raise OutOfClass(
+            Problem(
+                "this mechanism is not supported",
+                f"{len(holding)} joints directly between base and platform ({', '.join(holding)})",
+                "one at most, which holds the platform",
+                "check that each leg has its links between these joints",
                 str(path),
             )
         )

@@ -280,18 +280,21 @@ def _caster(mesh: Occluder) -> Any:
 
 
 def visual_solids(urdf: Urdf) -> list[VisualSolid]:
-    """Return the readable boxes, spheres, cylinders and meshes of a tree."""
+    """Return the readable boxes, spheres, cylinders and meshes of a tree.
+
+    The meshes of a link are one: a CAD export draws each of its screws.
+    """
     shown = [
         (link.get("name", ""), visual, shape)
         for link in parse_robot(urdf.path, urdf.content).findall("link")
         for visual in link.findall("visual")
         for shape in visual.findall("geometry/*")
     ]
-    solids = []
+    solids, meshes = list[VisualSolid](), dict[str, list[tuple[Array, IntArray]]]()
     for (link, visual, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
         if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
             with suppress(ValueError):  # it hides nothing; pictures state the reason
-                solids.append(VisualSolid(link, *read_mesh(urdf.path, visual)))
+                meshes.setdefault(link, []).append(read_mesh(urdf.path, visual))
         corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
             cylinder = None
@@ -299,6 +302,11 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
                 sizes = float(shape.get("radius", "")), float(shape.get("length", ""))
                 cylinder = VisualCylinder(link, T, *sizes)
             solids.append(VisualSolid(link, matrix_applied(T, corners), None, cylinder))
+    for link, parts in meshes.items():
+        first = np.cumsum([0, *(len(corners) for corners, _ in parts)])
+        triangles = [k + shift for (_, k), shift in zip(parts, first, strict=False)]
+        corners = np.concatenate([corners for corners, _ in parts])
+        solids.append(VisualSolid(link, corners, np.concatenate(triangles)))
     return solids
 
 

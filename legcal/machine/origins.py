@@ -53,9 +53,11 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         chain = leg.urdf_chain
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
+        if chain.is_joint:
+            at_platform = _of_joint(leg, wanted, at_platform, grown[1])
         if chain.slider is not None:
             move(*_at_slider(handles, leg, chain, grown))
-        elif any(grown):
+        elif any(grown) and not chain.is_joint:
             move(*_in_rod(handles, leg, chain, grown))
         first, last = chain.steps[chain.actuator is not None], chain.steps[-1]
         base, platform = machine.base, machine.platform
@@ -140,7 +142,7 @@ def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
         arm = handles.link(chain.actuator, chain.actuator.far)
         handles.of(chain.steps[1], chain.steps[1].near, arm, leg.name)
     handles.of(last, last.far, machine.platform, leg.name)
-    if chain.slider is None:
+    if chain.slider is None and not chain.is_joint:
         _in_rod(handles, leg, chain, (0.0, 0.0))
 
 
@@ -357,6 +359,18 @@ def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:
     twist = wanted.twist - carried
     twist -= np.pi * np.round(twist / np.pi)
     return float(twist) if abs(twist) > _ROUNDING else 0.0
+
+
+def _of_joint(leg: Leg, wanted: Leg, at_platform: Motion, twist: float) -> Motion:
+    """Return the motion in the platform of the joint that holds it: platform and leg are one."""
+    u, v = leg.platform_axis, wanted.platform_axis
+    if u is None or v is None:
+        raise ValueError("a leg that is fixed to the platform has a direction there")
+    centre, turn = leg.B - leg.q0 * u, at_platform.turn
+    if twist != 0.0:
+        back = Rotation.from_rotvec(-twist * v)
+        turn = back if turn is None else back * turn
+    return Motion(wanted.B - wanted.q0 * v - centre, centre, turn)
 
 
 def _screw(along: Array, point: Array, grown: tuple[float, float]) -> Motion:

@@ -87,6 +87,12 @@ def parametrize(
             free[j, ActuatorColumns.GAIN] = twists
             has_arm = twists and leg.actuator.arm is not None
             free[j, ActuatorColumns.ARM_AXIS] = free[j, ActuatorColumns.ARM_POINT] = has_arm
+        if leg.is_platform_joint and leg.platform_axis is not None:
+            # Its direction is a convention, but for what turns the axis of the joint.
+            held, inner = [0, 1], leg.inner_axis
+            if inner is not None:
+                held = [int(np.argmax(np.abs(normal_basis(leg.platform_axis) @ inner)))]
+            free[j, [columns.PLATFORM_AXIS.start + k for k in held]] = False
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is arbitrary on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False

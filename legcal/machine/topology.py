@@ -569,7 +569,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
                 str(urdf.path),
             )
         )
-    if set(connection.bodies) == {base, platform}:
+    if set(connection.bodies) == {base, platform} and connection.type == "prismatic":
         raise OutOfClass(
             Problem(
                 "this mechanism is not supported",
