@@ -59,7 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def examined(rendered: RepeatedImages, folder: Path) -> Examination:
     before = sorted(rendered.path.rglob("*"))
-    found = doctor(rendered.path, output=folder)
+    with pytest.MonkeyPatch.context() as patch:  # trying mistakes would take most of the time
+        patch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+        found = doctor(rendered.path, output=folder)
     assert sorted(rendered.path.rglob("*")) == before
     return found
 
