@@ -17,6 +17,7 @@ from hexapod_example import Run, copy_of_the_example
 from xdist.scheduler import LoadScopeScheduling
 
 from legcal import calibrate
+from legcal.calibration.four_steps import Steps
 from legcal.machine import loader
 from legcal.machine.files import find_model
 from legcal.machine.formats import read_source
@@ -125,6 +126,15 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
         patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
         patch.setattr(loader, "read_source", read_once)
         patch.setattr(loader, "_load", load_once)
+        yield
+
+
+@pytest.fixture(scope="module")
+def without_steps() -> Iterator[None]:
+    """Calibrate without the four steps: half of the time where the cameras are given."""
+    left_out = Steps(None, None, "They were left out.")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("legcal.calibration.estimate.four_steps", lambda *_: left_out)
         yield
 
 

@@ -39,6 +39,8 @@ from legcal.machine.parameters import (
     vector_of,
 )
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 MODEL = "3-rpr"
 
 

@@ -19,6 +19,8 @@ from legcal.calibration.result import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine.model import Machine
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]
 READINGS = np.random.default_rng(7).uniform(0.035, 0.12, (9, 3))

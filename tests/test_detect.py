@@ -59,7 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def examined(rendered: RepeatedImages, folder: Path) -> Examination:
     before = sorted(rendered.path.rglob("*"))
-    found = doctor(rendered.path, output=folder)
+    with pytest.MonkeyPatch.context() as patch:  # trying mistakes would take most of the time
+        patch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+        found = doctor(rendered.path, output=folder)
     assert sorted(rendered.path.rglob("*")) == before
     return found
 
@@ -115,7 +117,7 @@ def test_folder_json_and_summary_tell_the_same(
         assert picture is not None
         assert picture.shape[0] > 3 * SIZE[1]  # enlarged, with a legend
         assert f'href="{file}"' in page
-    assert "http:" not in page
+    assert "http:" not in page.replace("http://www.w3.org/2000/svg", "")  # a name, not an address
     assert "https:" not in page
     kept = json.loads((out / "detection.json").read_text())
     assert {key: kept[key] for key in document} == document

@@ -41,6 +41,7 @@ from legcal.machine.tolerance import TYPICAL, Tolerance
 from legcal.report.page.verdicts import next_steps
 from legcal.simulation.settings import Level
 
+pytestmark = pytest.mark.usefixtures("without_steps")
 RESULTS = Path(__file__).parents[1] / "docs/results.md"
 
 

@@ -21,6 +21,8 @@ from legcal.data.dataset import load_dataset
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 NAMES = intrinsic_names(LENS)
 SIGMA = np.array([3.0, 3.0, 1.5, 1.5, 0.004, 0.02, 3e-4, 3e-4, 0.0])  # k3 is held at zero
 FREE = tuple(f"c1.{name}" for name in NAMES[:-1])

@@ -23,6 +23,8 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import readings_at
 from legcal.machine.rods import ends_at_poses
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 KINDS = ["hexapod", "3-rpr", "delta", "linear-delta", "servo-hexapod", "orthoglide"]
 ROOT = Path(__file__).parents[1]
 

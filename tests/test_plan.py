@@ -47,6 +47,8 @@ from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 FEW = replace(default_setting(load_mechanism("3-rpr").size), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 

@@ -18,6 +18,8 @@ from legcal.perception.photographs import place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 SIZES = 0.03, 30.0  # of the usual one
 
 

@@ -26,6 +26,8 @@ from legcal.errors import UsageError
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 CHANGED_AT = 7  # of the 12 images of the second view
 SLIP, LAG, GAIN, BACKLASH, DRIFT, SCATTER = 3e-4, 4e-3, 2e-3, 2e-4, 4e-4, 1e-4
 TURN, ZOOM = 4e-4, 1e-3

@@ -35,6 +35,8 @@ from legcal.perception.photographs import (
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
+pytestmark = pytest.mark.usefixtures("without_steps")
+
 WITHOUT_GAMMA = "The gamma of "  # a note on the cameras of the example
 N = 8  # images of a view: with fewer good ones its rough pose gives way to a long search
 
