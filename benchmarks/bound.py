@@ -38,11 +38,11 @@ from outline_study import (
     printed,
     run,
 )
-from rich.console import RenderableType
 
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import NotIdentifiable
 from legcal.machine.parameters import vector_of
+from legcal.report.render import Report
 from legcal.simulation.study import Record
 
 ERRORS = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
@@ -68,7 +68,7 @@ class BoundStudy(OutlineStudy):
         bound = bound_of(self.design(machine), self.noise.sigma_q, self.noise.radius_sigma)
         return judged(machine, bound, records)
 
-    def table(self, machines: Sequence[Found]) -> RenderableType:
+    def table(self, machines: Sequence[Found]) -> Report:
         """Return one row a machine."""
         rows = [(found["machine"], *cells(found)) for found in machines]
         said = [line for found in machines for line in remarks(found)]

@@ -51,7 +51,6 @@ from outline_study import (
     printed,
     run,
 )
-from rich.console import RenderableType
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
@@ -63,7 +62,7 @@ from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameters import vector_of
 from legcal.paper.criteria import Criteria
-from legcal.report.render import report
+from legcal.report.render import Report, report
 from legcal.simulation.study import Record, failure_of
 
 NOMINAL, FIT = "nominal", "fit"
@@ -123,7 +122,7 @@ class ClassesStudy(OutlineStudy):
         """Return what estimators made of the sessions of a machine, and what the fit is worth."""
         return judged(machine, len(self.design(machine).parametrization), records)
 
-    def table(self, machines: Sequence[Found]) -> RenderableType:
+    def table(self, machines: Sequence[Found]) -> Report:
         """Return two rows a machine: what the fit is worth, and errors of the platform."""
         said = [line for found in machines for line in remarks(found)]
         worth = printed(WORTH, [(found["machine"], *worth_cells(found)) for found in machines])

@@ -30,11 +30,11 @@ from outline_study import (
     printed,
     run,
 )
-from rich.console import RenderableType
 
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import Leg
+from legcal.report.render import Report
 from legcal.simulation.study import Record
 
 FAR = 5.0  # standard deviations
@@ -84,7 +84,7 @@ class ConvergenceStudy(OutlineStudy):
             **figures,
         }
 
-    def table(self, machines: Sequence[Found]) -> RenderableType:
+    def table(self, machines: Sequence[Found]) -> Report:
         """Return one row a machine."""
         notes = [
             f"right: every parameter is within {FAR:g} of the standard deviations that the fit "

@@ -20,8 +20,8 @@ import numpy as np
 
 import legcal
 from legcal.calibration.identify.identifiability import identifiability
-from legcal.calibration.identify.predicted_observations import planned_observations
 from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import planned_session
 
 ROOT = Path(__file__).parents[1]
 WEAK = ["leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6"]
@@ -36,7 +36,7 @@ def main(runs: int = 5) -> None:
         report = identifiability(machine)
         seconds = time.perf_counter() - begin
         views = [[machine.leg_names.index(name) for name in view] for view in report.views]
-        session = planned_observations(machine, views)
+        session = planned_session(machine, views)
         singular = np.linalg.svd(Analysis(session).information, compute_uv=False)
         sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
         beyond = f"{sigma[sigma >= 1.0].min():8.0f}" if np.any(sigma >= 1.0) else f"{'none':>8}"

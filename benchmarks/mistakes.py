@@ -129,6 +129,28 @@ def rotated(session: Session, rng: np.random.Generator) -> Session:
     return _with_columns(session, [(j + k) % n for j in range(n)])
 
 
+def _renumbered(session: Session, k: int, ends: tuple[str, str]) -> Session:
+    """Give legs a joint of others of the model."""
+    machine = session.dataset.machine
+    legs, motors = list(machine.legs), _motors(machine)
+    for i, j in enumerate(motors):
+        other = machine.legs[motors[(i + k) % len(motors)]]
+        legs[j] = replace(legs[j], **{name: getattr(other, name) for name in ends})
+    return _with_legs(session, legs)
+
+
+def renumbered(session: Session, rng: np.random.Generator) -> Session:
+    """Number the platform joints of the model from another one on."""
+    k = int(rng.integers(1, len(_motors(session.dataset.machine))))
+    return _renumbered(session, k, ("B", "platform_axis"))
+
+
+def base_renumbered(session: Session, rng: np.random.Generator) -> Session:
+    """Number the base joints of the model from another one on."""
+    k = int(rng.integers(1, len(_motors(session.dataset.machine))))
+    return _renumbered(session, k, ("A", "base_axis"))
+
+
 def _turned(session: Session, which: list[int]) -> Session:
     q = session.dataset.measurements.q.copy()
     for j in which:
@@ -271,6 +293,8 @@ MISTAKES: dict[str, tuple[Make, str]] = {  # with the kinds of diagnosis that ar
     "exchanged": (exchanged, "columns exchanged"),
     "reversed": (reversed_columns, "columns reversed"),
     "rotated": (rotated, "columns rotated"),
+    "renumbered": (renumbered, "platform joints renumbered"),
+    "base renumbered": (base_renumbered, "base joints renumbered"),
     "direction": (direction, "direction of an encoder"),
     "directions": (directions, "direction of encoders"),
     "zero": (zero, "zero of an encoder"),

@@ -28,7 +28,7 @@ from legcal.machine.leg import Leg
 from legcal.machine.parameters import moved_legs
 from legcal.machine.rods import actuator_index, arms_at, joints_at
 from legcal.machine.ties import by_step, independent
-from legcal.simulation.visibility import silhouette
+from legcal.vision.cylinder import outlines_of_axis
 
 _STEP = 1e-6  # [m] or [rad] of differences
 _RANK = 1e-9  # of the largest singular value
@@ -212,7 +212,7 @@ def _offsets(design: Design, ends: Array, numbers: _Numbers) -> Array:
     turn = np.array([T.rotation.as_matrix().T for T in cameras])[view]
     centre = np.array([T.translation for T in cameras])[view]
     radius = [numbers.radii[key] for key in zip(leg.tolist(), shown.part, strict=True)]
-    h, _ = silhouette(
+    h = outlines_of_axis(
         np.einsum("nij,nj->ni", turn, u),
         np.einsum("nij,nj->ni", turn, A - centre),
         np.array(radius),

@@ -26,13 +26,13 @@ from outline_sessions import (
     design_of,
     draw_session,
 )
-from rich.console import Console, RenderableType
+from rich.console import Console
 from rich.text import Text
 
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.processors import processors
-from legcal.report.render import report, table
+from legcal.report.render import Report, report, table
 from legcal.simulation.study import Record, failure_of, run_study
 
 Found = dict[str, Any]
@@ -71,7 +71,7 @@ class OutlineStudy(ABC):
         """Return what the records of all sessions of a machine say together."""
 
     @abstractmethod
-    def table(self, machines: Sequence[Found]) -> RenderableType:
+    def table(self, machines: Sequence[Found]) -> Report:
         """Return what was found for people."""
 
     def files(self, machines: Sequence[Found]) -> dict[str, bytes]:
@@ -177,7 +177,7 @@ def failures_of(records: Iterable[Record]) -> dict[str, int]:
 
 def printed(
     columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Iterable[str] = ()
-) -> RenderableType:
+) -> Report:
     """Return a table of machines with notes below."""
     found = table("machine", *(f">{column}" for column in columns), rows=rows)
     return report(found, [Text(f"- {line}", style="dim") for line in notes])

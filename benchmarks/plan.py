@@ -29,6 +29,8 @@ from scipy.stats import spearmanr
 
 import legcal
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.predicted import Predictor
+from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry.lines import direction_above
@@ -37,7 +39,6 @@ from legcal.machine.feasibility import feasible_poses, poses_at
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.goals import workspace_of
-from legcal.planning.information import DEFAULT_NOISE, WHITE, Predictor
 from legcal.planning.places import Place, all_points, default_setting, places_along
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance

@@ -42,7 +42,8 @@ from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import TWO_POSES, place_views
 from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
-from legcal.simulation.visibility import field_of_view, silhouette
+from legcal.simulation.visibility import field_of_view
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.workers import worker_pool
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
@@ -121,7 +122,7 @@ def offsets(given: Given, truth: Truth, outlines: Outlines) -> Array:
         u = (B - A) / np.linalg.norm(B - A)
         main = [c for c in truth.cylinders[leg] if c.link == outlines.part[i]]
         radius = max(main, key=lambda c: c.end - c.start).radius
-        h = silhouette(u, A, np.array(radius))[0][outlines.edge[i] - 1]
+        h = outlines_of_axis(u, A, radius)[outlines.edge[i] - 1]
         ends = camera.undistort(outlines.ends[i])
         error[i] = np.abs(camera.line_offset(h[None], ends)).max()
     return error
@@ -287,8 +288,8 @@ def _true_outlines(
     A, B = T.apply(truth.A_base[row, leg]), T.apply(truth.B_base[row, leg])
     u = (B - A) / np.linalg.norm(B - A)
     for stretch in truth.shown[row][leg].stretches:
-        _, steps = silhouette(u, A, np.array(stretch.radius))
-        for step in steps:
+        h = outlines_of_axis(u, A, stretch.radius)
+        for step in steps_to_outlines(h, stretch.radius):
             ends = A + np.outer([stretch.start, stretch.end], u) + step
             _line(picture, camera.project(ends), colour, 1)
 

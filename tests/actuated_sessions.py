@@ -8,10 +8,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.identify.predicted_observations import (
-    PredictedObservations,
-    default_cameras,
-)
+from legcal.calibration.identify.session import Session, default_cameras
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorKind
@@ -144,7 +141,7 @@ def poses_at(name: str, q: Array, seed: int = 0) -> tuple[Array, Array, BoolArra
 @cache
 def session(
     name: str, *, views: tuple[tuple[int, ...], ...] | None = None, images: int = 8, seed: int = 0
-) -> PredictedObservations:
+) -> Session:
     """Return what views of all legs show of a machine at random readings in its travel."""
     (legs, R0, t0), rng = machine(name), np.random.default_rng(seed)
     views = views or (tuple(range(len(legs))),) * 3
@@ -159,12 +156,11 @@ def session(
         row[list(view)] = True
     A, B = np.array([leg.A for leg in legs]), np.array([R0 @ leg.B + t0 for leg in legs])
     names = tuple(leg.name for leg in legs)
-    return PredictedObservations(
+    return Session(
         leg_names=names,
         legs=legs,
         frame_legs=frame_legs(len(legs)),
         parametrization=parametrize(names, legs, frame_legs(len(legs))),
-        radius=np.full(len(legs), 0.02 * legs[0].q0),
         R=R,
         t=t,
         R_reached=R,
@@ -172,8 +168,8 @@ def session(
         view=np.repeat(np.arange(len(views)), images),
         pose=np.arange(n_poses),
         seen=seen,
-        camera=default_cameras(A, B, views, True, rng),
-        focal=np.full(len(views), 1290.0),
+        cameras=default_cameras(A, B, views, True, rng),
         sigma_q=2e-6,
+        unread=np.zeros((len(t), len(legs)), dtype=np.bool_),
         board=np.zeros(len(views), dtype=np.bool_),
     )

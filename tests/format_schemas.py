@@ -10,6 +10,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from legcal.calibration.camera_calibration.document import CameraDocument
+from legcal.calibration.camera_calibration.projection import CameraComparisonDocument
 from legcal.calibration.documents import (
     CheckDocument,
     DiagnosisBlock,
@@ -119,6 +120,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "evaluate": EvaluationDocument,
     "doctor": ExaminationDocument,
     "camera-calibration": CameraDocument,
+    "camera-comparison": CameraComparisonDocument,
 }
 
 

@@ -646,9 +646,9 @@ def _cameras() -> Iterable[Refusal]:
         return content(camera_matrix__data=data)
 
     rows: Rows = [
-        ("model", content(distortion_model="thin_prism"), ("distortion_model", "'thin_prism'")),
+        ("model", content(distortion_model="fov"), ("distortion_model", "'fov'")),
         ("equidistant", content(distortion_model="equidistant"), ("5", "4", "equidistant")),
-        ("rational", content(distortion_model="rational_polynomial"), ("5", "8")),
+        ("thin-prism", content(distortion_model="thin_prism"), ("5", "12")),
         ("height", content(image_height=-768), ("image_height", "-768")),
         ("no-width", content(image_width=GONE), ("image_width",)),
         ("few-numbers", content(camera_matrix__data=K[:6]), ("camera_matrix", "6", "9")),

@@ -5,20 +5,15 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from fit_sessions import PINHOLE, MachineSession, machine_session
+from fit_sessions import MachineSession, machine_session
 from hexapod_sessions import PaperSession, disturbed_hexapod, moved, paper_session
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.identify.predicted_observations import (
-    PredictedObservations,
-    at_base_joints,
-    at_platform_joints,
-)
+from legcal.calibration.identify.session import Session
 from legcal.data.axes import LegAxes, axes_from_outlines
-from legcal.data.measurements import Measurements, View
-from legcal.geometry.lines import normal_basis
+from legcal.data.measurements import Measurements
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.leg import KinematicParameters, Leg, LegKind
+from legcal.machine.leg import KinematicParameters, Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -30,7 +25,7 @@ from legcal.machine.parameters import (
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import NominalMachine
-from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.observe import OutlineNoise, TableNoise, noisy_outlines
 from legcal.simulation.paper import PAPER_VIEWS
 
 
@@ -101,62 +96,34 @@ def _observed(session: MachineSession) -> Observed:
     )
 
 
-def planned(session: PredictedObservations, *, noise: float = 0.0, seed: int = 0) -> Observed:
+def planned(session: Session, *, noise: float = 0.0, seed: int = 0) -> Observed:
     """Return what a planned session will show, nominal legs being 3 mm and 1 deg off.
 
-    The noise counts in the standard deviations of the session; without it all is exact.
+    The noise counts in standard deviations of 0.1 px at the ends of an outline, and in those of the
+    readings; without it all is exact.
     """
-    row, leg = np.nonzero(session.seen[session.view])
-    pose = session.pose[row]
-    u, length = session.u[pose, leg], session.length[pose, leg][:, None, None]
-    E = normal_basis(u)
-    at_A, at_B = (
-        across.gradient[row, leg] @ np.swapaxes(E, 1, 2)
-        for across in (at_base_joints(session), at_platform_joints(session))
-    )
-    rows = np.zeros((len(row), 4, 4))  # by alpha and beta at A
-    rows[:, :2, 2:], rows[:, 2:, 2:], rows[:, 2:, :2] = at_A, at_B, length * at_B
-    covariance = np.asarray(np.linalg.inv(np.swapaxes(rows, 1, 2) @ rows), dtype=np.float64)
-    M = session.A_at[pose, leg] - session.camera[session.view[row]]
-    actuated = np.array([leg.kind is LegKind.ACTUATED for leg in session.legs])
-    sign = [leg.sign for leg in session.legs]
-    q = np.where(actuated, sign * (session.length - [leg.q0 for leg in session.legs]), np.nan)
-    carried = session.carried_by >= 0
-    q[:, carried] = session.q[:, session.carried_by[carried]]
+    m, n = session.measurements, len(session.outlines)
+    covariance = np.tile((0.1 * (noise or 1.0)) ** 2 * np.eye(2), (n, 1, 1))
+    outlines = replace(session.outlines, covariance=covariance)
     if noise > 0.0:
         rng = np.random.default_rng(seed)
-        covariance *= noise**2
-        errors = np.einsum(
-            "nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((len(row), 4))
-        )
-        u, M = (
-            x + np.einsum("nia,ni->na", E, e) for x, e in ((u, errors[:, :2]), (M, errors[:, 2:]))
-        )
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        E = E - u[:, None] * np.einsum("nia,na->ni", E, u)[..., None]
-        E /= np.linalg.norm(E, axis=2, keepdims=True)
-        sigma = np.full(session.n_legs, session.sigma_q)
-        sigma[carried] = session.sigma_of_q[session.carried_by[carried]]
-        read = rng.standard_normal((len(q), session.n_legs))
-        same = session.carried_by[:, None] == session.carried_by
-        q = q + sigma * read[:, np.where(carried, same.argmax(axis=1), np.arange(len(same)))]
+        outlines = noisy_outlines(outlines, m.views[0].camera, rng)
+        read = rng.standard_normal(m.q.shape)
+        same = session.carried_by[:, None] == session.carried_by  # rods on one motor
+        carried = session.carried_by >= 0
+        of_motor = np.where(carried, same.argmax(axis=1), np.arange(len(same)))
+        m = replace(m, q=m.q + m.sigma_of(session.legs) * read[:, of_motor])
     units = np.array(session.parametrization.units)
     step = np.where(units == "m", 0.003, np.deg2rad(1.0) / np.sqrt(2.0))
     step *= np.random.default_rng(0).choice([-1.0, 1.0], len(step))
     away = moved_legs(session.legs, session.parametrization.place, step)
+    radii = {part: radius for (_, part), radius in session.fitted.radii.items()}
     return Observed(
         NominalMachine(session.leg_names, away, session.frame_legs),
-        LegAxes(row, leg, u, M, E, covariance),
-        Measurements(
-            tuple(View(f"c{v + 1}", PINHOLE) for v in range(session.n_views)),
-            ("",) * len(session.view),
-            session.view,
-            session.pose,
-            q[session.pose],
-            session.sigma_q,
-        ),
+        axes_from_outlines(outlines, m, radii),
+        m,
         session.legs,
-        tuple(RigidTransform.from_translation(-centre) for centre in session.camera),
+        tuple(T.inv() for T in session.places),
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from boards import (
     APRILGRID,
     BOARDS,
@@ -41,7 +42,7 @@ from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
 from legcal.vision.board import Board, charuco_board
-from legcal.vision.board_file import board_document, parse_board
+from legcal.vision.board_file import board_document, board_of, parse_board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, reduced, rescaled
 from legcal.workers import in_turn
@@ -104,6 +105,31 @@ def test_a_board_is_read_as_it_was_written(
     assert T is not None
     assert T.translation == pytest.approx([0.1, 0.2, 0.3])
     assert T.rotation.as_quat() == pytest.approx([0.0, 0.0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("target", "board"),
+    [
+        ("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.06\ntagSpacing: 0.3\n",
+         replace(APRILGRID, columns=6, rows=5)),
+        ('{"tagCols": 6, "tagRows": 5, "tagSize": 0.06, "tagSpacing": 0.3}',
+         replace(APRILGRID, columns=6, rows=5)),
+        ("target_type: checkerboard\ntargetCols: 8\ntargetRows: 6\nrowSpacingMeters: 0.03\n"
+         "colSpacingMeters: 0.03\n", Board("chessboard", 9, 7, 0.03)),
+    ],
+)  # fmt: skip
+def test_targets_of_kalibr_and_basalt_are_boards(tmp_path: Path, target: str, board: Board) -> None:
+    path = tmp_path / "target.yaml"
+    path.write_text(target)
+    assert vars(board_of(path)) == vars(board)
+    circles = {"target_type": "circlegrid", "targetCols": 6}
+    for wrong, named in (
+        (target.replace("0.06", "88").replace("colSpacingMeters: 0.03", ""), "needed"),
+        (yaml.safe_dump(circles), "'circlegrid'"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(DatasetError, match=named):
+            board_of(path)
 
 
 # What is printed.
@@ -305,6 +331,19 @@ def test_the_older_pattern_of_a_charuco_board_is_told_by_its_markers(legacy: boo
     shown, said = shown_board(replace(board, legacy=not legacy), [seen])
     assert shown is None
     assert ("without :legacy" if not legacy else "of the older pattern (:legacy)") in said
+
+
+@pytest.mark.parametrize("numbers", [[[0] * 6], [[0, 1, 2, 12, 13, 14], [60, 61, 62, 72, 73, 74]]])
+def test_tags_that_fit_no_layout_are_said(numbers: list[list[int]]) -> None:
+    board = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_APRILTAG_36h11")
+    x, y = np.meshgrid([60.0, 240.0, 420.0], [60.0, 240.0])
+    at, none = np.column_stack([x.ravel(), y.ravel()]), np.zeros((0, 2))
+    empty = replace(_shows(0, 0), kind="charuco", ij=none.astype(np.intp), px=none)
+    seen = [replace(empty, tags=np.array(of_image), tags_px=at) for of_image in numbers]
+    shown, said = shown_board(board, seen)
+    assert shown is None
+    expected = "the same marker (number 0) 6 times in an image"
+    assert said == expected if len(numbers) == 1 else "2 of its 2 images" in said
 
 
 def _measurements(per_view: tuple[int, ...], camera: Camera = LENS) -> Measurements:

@@ -14,9 +14,13 @@ from camera_sessions import (
     NOISE_PX,
     PINHOLE,
     SIZE,
+    WIDE_SIZE,
+    corners_at_the_edge,
     drawings,
+    projection_errors,
     seen_corners,
     together,
+    wide_camera,
 )
 from thinned import thinned
 
@@ -30,10 +34,11 @@ from legcal.calibration.camera_calibration.diagnostics import (
 from legcal.calibration.camera_calibration.document import CameraCalibration
 from legcal.calibration.camera_calibration.lens import chosen_lens, given_lens
 from legcal.calibration.camera_calibration.picture import write_picture
+from legcal.calibration.camera_calibration.projection import compare_cameras, projection_sigma
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages
-from legcal.vision.camera import intrinsic_values
+from legcal.vision.camera import intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
 from legcal.vision.distortion import DistortionModel
 
@@ -239,6 +244,29 @@ def test_images_choose_the_lens_model() -> None:
     assert residual_px < chosen.validated_px < 1.5 * residual_px
 
 
+@pytest.mark.parametrize(
+    "model", ["equidistant", pytest.param("rational_polynomial", marks=pytest.mark.slow)]
+)
+def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
+    model: DistortionModel,
+) -> None:
+    """The many in the middle suit plumb_bob, which leaves the others out."""
+    truth = wide_camera(model)
+    seen = corners_at_the_edge(truth, 19, 2, np.random.default_rng(3))
+    plain = robust_fit(seen, WIDE_SIZE, "plumb_bob")
+    assert plain is not None
+    assert {17, 18} <= set(plain.left_out)
+    chosen = chosen_lens(seen, WIDE_SIZE)
+    assert chosen is not None
+    assert chosen.fit.adjusted.camera.model == model
+    assert chosen.fit.left_out == {}
+    assert "19 images agree on it" in chosen.reason
+    fit = chosen.fit
+    errors = projection_errors(truth, fit.adjusted.camera, fit.covariance)
+    assert np.quantile(errors, 0.9) < 3.0  # corners of the image may be far from any board
+    assert sigmas(fit)[:4].max() < 0.3
+
+
 def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_of() -> None:
     seen = seen_corners(TRUTH, 8, 1)
     chosen = chosen_lens(seen, SIZE)
@@ -251,6 +279,32 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     assert given is not None
     assert "as given" in given.reason
     assert "leave out --model" in " ".join(given.warnings)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
+    model: DistortionModel,
+) -> None:
+    fit = fitted(seen_corners(CAMERAS[model], 12, 3), model)
+    camera, rng = fit.adjusted.camera, np.random.default_rng(0)
+    values, names = intrinsic_values(camera), intrinsic_names(camera)
+    off = []
+    for drawn in rng.multivariate_normal(values, fit.covariance, 200):
+        other = with_intrinsics(camera, dict(zip(names, drawn.tolist(), strict=True)))
+        comparison = compare_cameras(camera, other)
+        assert comparison.sigma_px is None
+        off.append(comparison.off_px)
+    spread = np.einsum("dni,dnj->nij", off, off) / len(off)
+    sigma = projection_sigma(camera, fit.covariance)
+    ratio = np.sqrt(np.linalg.eigvalsh(spread)[:, -1]) / sigma
+    assert 0.8 < ratio.min() < ratio.max() < 1.25
+    # A shift of the principal point is a turn, but for distortion and perspective.
+    shifted_camera = with_intrinsics(camera, {"cx": values[2] + 1.0})
+    turned = compare_cameras(camera, shifted_camera)
+    assert turned.turn == pytest.approx(1.0 / values[0], rel=0.3)
+    assert turned.px.max() < 1.0
+    with pytest.raises(UsageError, match="one size"):
+        compare_cameras(camera, PINHOLE)
 
 
 def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:

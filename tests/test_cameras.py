@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.geometry.lines import distance_to_line, moment
 from legcal.geometry.types import Array
 from legcal.vision.camera import (
@@ -22,21 +22,24 @@ from legcal.vision.camera import (
     undistort_with_derivatives,
     with_intrinsics,
 )
+from legcal.vision.camera_export import convert_camera
 from legcal.vision.camera_file import camera_info, read_camera
 from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis
-from legcal.vision.distortion import DistortionModel
+from legcal.vision.distortion import CameraProgram, DistortionModel
 
 FAST = settings(deadline=None, max_examples=40)
 SIZE = 1024, 768
 K = np.array([[1290.0, 2.5, 518.3], [0.0, 1310.0, 379.6], [0.0, 0.0, 1.0]])
 PLUMB_BOB = [-0.25, 0.08, 1e-3, -8e-4, 0.01]
 RATIONAL = [0.3, 0.1, 1e-3, -5e-4, 0.02, 0.4, 0.05, 0.01]
+PRISM = [*RATIONAL, 0.002, -0.0004, -0.0015, 0.0003]
 FISHEYE = [0.03, -0.01, 0.004, -0.002]
 LENSES: list[tuple[DistortionModel, list[float]]] = [
     ("plumb_bob", []),
     ("plumb_bob", PLUMB_BOB),
     ("plumb_bob", PLUMB_BOB[:4]),
     ("rational_polynomial", RATIONAL),
+    ("thin_prism", PRISM),
     ("equidistant", FISHEYE),
     ("equidistant", [0.0] * 4),
 ]
@@ -97,7 +100,7 @@ PLAIN, FIVE = Camera(STRAIGHT, *SIZE), Camera(STRAIGHT, *SIZE, np.array(PLUMB_BO
 
 @pytest.mark.parametrize(
     "camera",
-    [PLAIN, PINHOLE, *(Camera(STRAIGHT, *SIZE, np.array(D), model) for model, D in LENSES[1:5])],
+    [PLAIN, PINHOLE, *(Camera(STRAIGHT, *SIZE, np.array(D), model) for model, D in LENSES[1:6])],
     ids=lambda c: f"{c.model}-{len(c.distortion)}",
 )
 def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) -> None:
@@ -132,7 +135,8 @@ def test_intrinsics_are_those_of_the_model() -> None:
         (FIVE, plumb_bob),
         (CAMERAS[2], plumb_bob),
         (CAMERAS[3], (*plumb_bob, "k4", "k5", "k6")),
-        (CAMERAS[4], ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+        (CAMERAS[4], (*plumb_bob, "k4", "k5", "k6", "s1", "s2", "s3", "s4")),
+        (CAMERAS[5], ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
         (PINHOLE, ("fx", "fy", "cx", "cy")),  # it has skew, which OpenCV's distortion lacks
     ):
         assert intrinsic_names(camera) == names
@@ -186,7 +190,7 @@ def write(folder: Path, content: object) -> Path:
     return path
 
 
-def write_opencv(path: Path, D: list[float], matrix: object = K, **more: int) -> Path:
+def write_opencv(path: Path, D: list[float], matrix: object = K, **more: Any) -> Path:
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", SIZE[0])
     storage.write("image_height", SIZE[1])
@@ -231,12 +235,137 @@ def test_opencv_files_are_read(
     assert_camera(read_camera(path), model, D)
 
 
-def test_thin_prism_and_tilt_are_left_out_only_where_they_are_zero(tmp_path: Path) -> None:
-    path = write_opencv(tmp_path / "camera.yaml", [*RATIONAL, 0, 0, 0, 0, 0, 0])
-    assert_camera(read_camera(path), "rational_polynomial", RATIONAL)
-    path = write_opencv(tmp_path / "camera.yaml", [*RATIONAL, 0.01, 0, 0, 0])
-    with pytest.raises(DatasetError, match="found 12 coefficients, needed 8"):
-        read_camera(path)
+def test_richer_polynomials_are_read_as_the_simplest_that_has_their_numbers(
+    tmp_path: Path,
+) -> None:
+    path, zeros = tmp_path / "camera.yaml", [0.0] * 6
+    for D, model, kept in (
+        ([*RATIONAL, *zeros], "rational_polynomial", RATIONAL),
+        ([*PRISM, 0.0, 0.0], "thin_prism", PRISM),
+        (PRISM, "thin_prism", PRISM),
+    ):
+        assert_camera(read_camera(write_opencv(path, D)), model, kept)
+    for model, D, kept in (
+        ("rational_polynomial", PLUMB_BOB, PLUMB_BOB),
+        ("plumb_bob", [*PLUMB_BOB, 0.0, 0.0, 0.0], PLUMB_BOB),
+    ):
+        camera = read_camera(write(tmp_path, ros(distortion_model=model, D=D)))
+        assert_camera(camera, "plumb_bob", kept)
+
+
+def test_a_named_lens_counts_in_any_file_and_four_coefficients_need_a_name(tmp_path: Path) -> None:
+    path = write_opencv(tmp_path / "camera.yaml", FISHEYE, distortion_model="equidistant")
+    assert_camera(read_camera(path), "equidistant", FISHEYE)
+    write_opencv(path, PLUMB_BOB[:4], fisheye_model=0)
+    assert_camera(read_camera(path), "plumb_bob", PLUMB_BOB[:4])
+    kept = write_opencv(tmp_path / "four.yaml", FISHEYE)
+    for four in (kept, write(tmp_path, ros(distortion_model=..., D=FISHEYE))):
+        with pytest.raises(DatasetError, match="four coefficients without a lens model"):
+            read_camera(four)
+
+
+MESSAGE = {"width": SIZE[0], "height": SIZE[1], "distortion_model": "plumb_bob"}
+MRCAL = "# made by hand\n{{ 'lensmodel': '{}', 'intrinsics': {}, 'imagersize': [1024, 768], }}\n"
+FOUR = [1290.0, 1310.0, 518.3, 379.6]
+AT_CORNER = "1290 1310 518.8 380.1"
+MATLAB = {"RadialDistortion": [-0.25, 0.08, 0.01], "TangentialDistortion": [1e-3, -8e-4]} | {
+    "ImageSize": SIZE[::-1]
+}
+BY_ONE = [[1290.0, 2.5, 519.3], [0.0, 1310.0, 380.6], [0.0, 0.0, 1.0]]
+
+
+def basalt(lens: str, numbers: dict[str, float]) -> dict[str, Any]:
+    """The content of a calibration of Basalt of one camera."""
+    pinhole = dict(zip(("fx", "fy", "cx", "cy"), FOUR, strict=True))
+    camera = {"camera_type": lens, "intrinsics": pinhole | numbers}
+    return {"value0": {"intrinsics": [camera], "resolution": [list(SIZE)]}}
+
+
+def echoed(*messages: dict[str, Any]) -> str:
+    """The text of messages as ``ros2 topic echo`` prints them."""
+    return "".join(yaml.safe_dump(message) + "---\n" for message in messages)
+
+
+@pytest.mark.parametrize(
+    ("content", "model", "D", "skew"),
+    [
+        (echoed(*2 * [MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}]), "plumb_bob",
+         PLUMB_BOB, 2.5),
+        (echoed(MESSAGE | {"K": K.ravel().tolist(), "D": PLUMB_BOB}), "plumb_bob", PLUMB_BOB, 2.5),
+        (MRCAL.format("LENSMODEL_OPENCV8", FOUR + RATIONAL), "rational_polynomial", RATIONAL, 0.0),
+        (MRCAL.format("LENSMODEL_OPENCV12", FOUR + PRISM), "thin_prism", PRISM, 0.0),
+        (MRCAL.format("LENSMODEL_PINHOLE", FOUR), "plumb_bob", [0.0] * 5, 0.0),
+        (f"# Camera list\n1 OPENCV_FISHEYE 1024 768 {AT_CORNER} 0.03 -0.01 0.004 -0.002\n",
+         "equidistant", FISHEYE, 0.0),
+        (f"3 OPENCV 1024 768 {AT_CORNER} -0.25 0.08 0.001 -0.0008\n", "plumb_bob",
+         [*PLUMB_BOB[:4], 0.0], 0.0),
+        (basalt("kb4", dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True))), "equidistant",
+         FISHEYE, 0.0),
+        (MATLAB | {"K": BY_ONE}, "plumb_bob", PLUMB_BOB, 2.5),
+        (MATLAB | {"IntrinsicMatrix": np.transpose(BY_ONE).tolist()}, "plumb_bob", PLUMB_BOB, 2.5),
+        ("%YAML:1.0 # OpenCV's\n" + yaml.safe_dump(kalibr()), "plumb_bob", PLUMB_BOB[:4], 0.0),
+    ],
+)  # fmt: skip
+def test_files_of_other_programs_are_read(
+    tmp_path: Path, content: object, model: str, D: list[float], skew: float
+) -> None:
+    camera = read_camera(write(tmp_path, content))
+    assert (camera.model, camera.width, camera.height) == (model, *SIZE)
+    np.testing.assert_allclose(camera.K, [[1290.0, skew, 518.3], *K[1:]], atol=1e-9)
+    np.testing.assert_array_equal(camera.distortion, D)
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (MRCAL.format("LENSMODEL_SPLINED_STEREOGRAPHIC_order=3", FOUR),
+         ("SPLINED", "LENSMODEL_OPENCV8", "legcal camera")),
+        (MRCAL.format("LENSMODEL_OPENCV8", FOUR), ("4 parameters", "12")),
+        (basalt("ds", {}), ("'ds'", "kb4")),
+        (f"1 FOV 1024 768 {AT_CORNER} 0.9\n", ("'FOV'", "OPENCV_FISHEYE")),
+        (f"1 PINHOLE 1024 768 {AT_CORNER}\n2 PINHOLE 1024 768 {AT_CORNER}\n", ("2 cameras",)),
+        (kalibr(camera_model="omni", intrinsics=[0.8, *FOUR]), ("'omni'", "pinhole-radtan")),
+        (kalibr(distortion_model="fov", distortion_coeffs=[0.9]), ("'fov'", "equidistant")),
+        (ros(distortion_model="plumb_bob", D=RATIONAL), ("8 coefficients", "name the lens")),
+        (ros(distortion_model="rational_polynomial", D=[*PRISM, 0.1, 0.0]), ("tilt",)),
+        (echoed(MESSAGE | {"k": K.ravel().tolist(), "d": FISHEYE},
+                MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}), ("different cameras",)),
+    ],
+)  # fmt: skip
+def test_lenses_that_legcal_does_not_have_are_refused_in_one_sentence(
+    tmp_path: Path, content: object, named: tuple[str, ...]
+) -> None:
+    with pytest.raises(DatasetError) as refused:
+        read_camera(write(tmp_path, content))
+    assert [word for word in named if word not in str(refused.value)] == []
+    assert len(refused.value.problems) == 1
+
+
+@pytest.mark.parametrize(
+    ("program", "lacks"),
+    [
+        ("ros", ()),
+        ("opencv", ()),
+        ("kalibr", ("rational_polynomial", "thin_prism")),
+        ("mrcal", ("equidistant",)),
+    ],
+)
+def test_cameras_are_written_for_other_programs(
+    tmp_path: Path, program: CameraProgram, lacks: tuple[str, ...]
+) -> None:
+    source, output = tmp_path / "camera.yaml", tmp_path / f"{program}.txt"
+    for model, D in LENSES[2:]:
+        D = D[:4] if program == "kalibr" and model == "plumb_bob" else D
+        source.write_text(camera_info(Camera(STRAIGHT, *SIZE, np.array(D), model), "any"))
+        if model in lacks:
+            with pytest.raises(UsageError, match=f"found the lens {model}, needed"):
+                convert_camera(source, program, output)
+            continue
+        convert_camera(source, program, output)  # over the one before
+        camera = read_camera(output)
+        assert camera.model == model
+        np.testing.assert_array_equal(camera.K, STRAIGHT)
+        np.testing.assert_array_equal(camera.distortion[: len(D)], D)
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,12 @@ def _left_handed(d: Dataset) -> Dataset:
     return replace(d, machine=replace(d.machine, legs=legs))
 
 
+def _renumbered(d: Dataset) -> Dataset:
+    legs = d.machine.legs
+    legs = tuple(replace(leg, B=legs[(j + 2) % 6].B) for j, leg in enumerate(legs))
+    return replace(d, machine=replace(d.machine, legs=legs))
+
+
 def _thick(d: Dataset) -> Dataset:
     return replace(d, machine=d.machine.with_radii(lambda _, c: 2.0 * c.radius))
 
@@ -116,6 +122,7 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
             *(_left_handed, "the model appears mirrored", "the outlines appear to be mirrored"),
             marks=pytest.mark.system,
         ),
+        (_renumbered, "the platform joints of the model appear to be numbered", ""),
         (_thick, "the radii of the legs in the model appear to be diameters", ""),
     ],
 )
@@ -137,6 +144,29 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
+
+
+def test_arms_of_a_delta_that_are_turned_against_its_platform_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = simulate("delta", tmp_path / "set", settings(poses=6)).folder
+    d = load_dataset(folder)
+    of = [d.machine.legs[(j + 2) % 6] for j in range(6)]  # two rods an arm
+    legs = []
+    for leg, other in zip(d.machine.legs, of, strict=True):
+        assert leg.actuator is not None
+        assert other.actuator is not None
+        actuator = replace(other.actuator, joint=leg.actuator.joint)
+        legs.append(replace(leg, A=other.A, actuator=actuator))
+    turned = replace(d, machine=replace(d.machine, legs=tuple(legs)))
+    data = order_dataset(turned, in_turn, no_progress)
+    alike = ("the arms", "the platform", "the columns")
+    few = [one for one in mistakes(data) if one.what.startswith(alike)]
+    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    (found,) = diagnose(data)
+    assert found.what.startswith("the arms of the model appear to be turned against the platform")
+    assert found.images == 12
+    assert found.after >= 11 > found.before
 
 
 @pytest.mark.system

@@ -97,6 +97,10 @@ def _stretched(row: dict[str, str]) -> None:
             row[name] = repr(0.94 * float(row[name]))
 
 
+def _overrated(row: dict[str, str]) -> None:
+    row |= {name: repr(0.1 * float(row[name])) for name in ("s00", "s01", "s11")}
+
+
 def _moved_hint(found: dict[str, Any]) -> None:
     found["views"]["c2"]["T_base_camera"]["xyz"][0] += 0.3
 
@@ -104,7 +108,8 @@ def _moved_hint(found: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("code", "spoil", "said"),
     [
-        ("noise", _table("measurements.csv", _backlash), "all views scatter"),
+        ("noise", _table("observations.csv", _overrated), "all views scatter"),
+        ("reading_noise", _table("measurements.csv", _backlash), "leg1 scatter"),
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
         ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
         ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),

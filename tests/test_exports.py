@@ -480,8 +480,10 @@ def test_formats_that_a_class_does_not_have_are_refused_with_those_it_has(tmp_pa
         ("3-rps", "linuxcnc"): "six legs",
         ("hexapod-rod", "linuxcnc"): "leg6",
         ("hexapod", "correction"): "needed a result",
-        ("delta", "linuxcnc"): "'arm1' moves joints at A, .*rotarydeltakins .* the correction",
-        ("hexaglide", "linuxcnc"): r"'rail1' moves joints at A, .*\(genhexkins\); this machine",
+        ("hexaglide", "linuxcnc"): r"'rail1' moves joints at A, .*\(genhexkins\), or a Delta",
+        ("delta", "marlin"): "motors that turn, needed a Delta with three linear motors",
+        ("hexaglide", "klipper"): "6 motors that carry rods and 6 freedoms, needed a Delta",
+        ("delta", "flypt"): r"'arm1' moves joints at A, .*\(LinearHexapod\); this machine",
     }
     for (name, to), said in refused.items():
         with pytest.raises(OutOfClass, match=said) as error:

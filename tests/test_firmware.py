@@ -5,15 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.pipeline import calibrate
 from legcal.errors import LegcalError
 from legcal.exports.formats import export
 from legcal.geometry.types import Array
+from legcal.machine.configurations import random_poses
+from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
-from legcal.machine.firmware_files import read_delta
+from legcal.machine.firmware_files import firmware_table, read_delta
+from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 
 KLIPPER = """
 [stepper_a]
@@ -79,6 +87,28 @@ MARLIN_HEADER = """
   #define DELTA_DIAGONAL_ROD_TRIM_TOWER { 0.2, -0.3, 0.1 }
 #endif
 """
+LINUXCNC = """
+setp lineardeltakins.R 130.25
+setp lineardeltakins.L 269.5
+[JOINT_0]
+HOME_OFFSET = 412.5
+[JOINT_1]
+HOME_OFFSET = 413.0
+[JOINT_2]
+HOME_OFFSET = 411.75
+"""
+LINUXCNC_ARMS = """
+setp rotarydeltakins.platformradius 40.5
+setp rotarydeltakins.footradius 0
+setp rotarydeltakins.thighlength 160
+setp rotarydeltakins.shinlength 320.5
+[JOINT_0]
+HOME_OFFSET = -30
+[JOINT_1]
+HOME_OFFSET = -31
+[JOINT_2]
+HOME_OFFSET = -29.5
+"""
 CONFIGURATIONS = {
     "klipper": KLIPPER,
     "klipper-arms": KLIPPER_ARMS,
@@ -86,6 +116,8 @@ CONFIGURATIONS = {
     "reprapfirmware-arms": DUET_ARMS,
     "marlin": MARLIN,
     "marlin-header": MARLIN_HEADER,
+    "linuxcnc": LINUXCNC,
+    "linuxcnc-arms": LINUXCNC_ARMS,
 }
 
 
@@ -115,6 +147,113 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+DOCUMENTED = {
+    # angles of towers, radius, rods and the centred nozzle at each endstop, from the documentation
+    "klipper": ([209.6, 330, 90.45], 168.2, [330.25, 330.75, 330.25], [301.35, 300.9, 300.6]),
+    "reprapfirmware": ([209.6, 330.25, 90.1], 131.15, [289.1, 288.7, 289.4], [305.55, 305, 305.05]),
+    "marlin": ([210.12, 329.69, 90.05], 124.3, [250.6, 250.1, 250.5], [253.1, 252.7, 253.45]),
+    "linuxcnc": (
+        [90, 210, 330],
+        130.25,
+        [269.5] * 3,
+        (np.array([412.5, 413, 411.75]) - np.sqrt(269.5**2 - 130.25**2)).tolist(),
+    ),
+}
+ARMS = {
+    # and the arms, the heights of their shafts, the endstops as height or angle
+    "klipper-arms": (
+        [30, 150.8, 270], 35.4, [322, 321.25, 322], [168.5, 168.5, 169], [411.2] * 3,
+        [250, 250, 251.5],
+    ),
+    "reprapfirmware-arms": (
+        [210.3, 329.8, 90.15], 48.2, [221, 220.4, 220.7], [101.5, 101.2, 100.9],
+        [242, 242.5, 241.6], [62.2, 61.7, 62.1],
+    ),
+    "linuxcnc-arms": ([270, 30, 150], 40.5, [320.5] * 3, [160] * 3, [0] * 3, [30, 31, 29.5]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*DOCUMENTED, *ARMS])
+def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
+    name: str, tmp_path: Path
+) -> None:
+    machine = machine_of(CONFIGURATIONS[name], tmp_path)
+    nozzle = np.array([12.0, -34.0, -300.0 if name == "linuxcnc-arms" else 56.0])
+    pose = RigidTransform.from_translation(1e-3 * nozzle)
+    q = inverse_kinematics(machine, pose)[::2]
+    tops = np.array([actuator.travel[1] for actuator in machine.actuators])
+    if name == "linuxcnc-arms":  # counts downwards
+        q, tops = -q, -np.array([actuator.travel[0] for actuator in machine.actuators])
+    angles, radius, rods, *others = (DOCUMENTED | ARMS)[name]
+    towers = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.radians(angles)]
+    for i, (out, rod) in enumerate(zip(towers, rods, strict=True)):
+        if name in DOCUMENTED:
+            stop = others[0][i]
+            away = float(np.linalg.norm((nozzle - radius * out)[:2]))
+            assert 1e3 * q[i] == pytest.approx(nozzle[2] + np.sqrt(rod**2 - away**2), abs=1e-6)
+            assert 1e3 * tops[i] == pytest.approx(stop + np.sqrt(rod**2 - radius**2), abs=1e-6)
+            continue
+        arm, height, stop = (numbers[i] for numbers in others)
+
+        def elbow(angle: float, out: Array = out, arm: float = arm, z: float = height) -> Array:
+            return (radius + arm * np.cos(angle)) * out + [0, 0, z + arm * np.sin(angle)]
+
+        assert np.linalg.norm(elbow(q[i]) - nozzle) == pytest.approx(rod, abs=1e-6)
+        if name != "klipper-arms":
+            assert np.degrees(tops[i]) == pytest.approx(stop, abs=1e-6)
+        else:
+            assert np.linalg.norm(elbow(tops[i]) - [0, 0, stop]) == pytest.approx(rod, abs=1e-6)
+
+
+def printer_with_errors(folder: Path) -> Machine:
+    """Return a printer whose towers, rods and endstops are not those of its configuration."""
+    rng = np.random.default_rng(3)
+    table, _ = firmware_table(Path("printer"), KLIPPER) or ({}, ())
+    A = np.array(table["base_joints"]).reshape(3, 2, 3)
+    for tower in range(3):
+        turn = Rotation.from_euler("z", rng.normal(0.0, 0.3), degrees=True)
+        A[tower] = turn.apply(A[tower] + rng.normal(0.0, 1.0, 3))  # [mm], z of the endstop
+    rods = np.repeat(np.array(table["lengths"][::2]) + rng.normal(0.0, 0.3, 3), 2)
+    true = table | {"base_joints": A.reshape(6, 3).tolist(), "lengths": rods.tolist()}
+    return create_model(described_machine(true, Path("true")), folder).machine
+
+
+def off_by(text: str, true: Machine) -> float:
+    """Return the error of a firmware's kinematics over the bed of a printer [mm rms].
+
+    Where the bed stands, which probing tells, counts as known.
+    """
+    q, poses = random_poses(true, 400, 5)
+    nozzle = 1e3 * np.array([pose.translation for pose in poses])
+    tops = np.array([actuator.travel[1] for actuator in true.actuators])
+    ideal = read_delta(Path("text"), text)
+    motors = ideal.at_stops - 1e3 * (tops - q[:, ::2])
+    usual = ideal.is_usual(motors)
+    both = ideal.positions(motors)[usual], nozzle[usual]
+    there, nozzle = (points - points.mean(axis=0) for points in both)
+    _, distance = Rotation.align_vectors(nozzle, there)
+    return float(distance / np.sqrt(len(nozzle)))
+
+
+def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> None:
+    nominal, true = machine_of(KLIPPER, tmp_path), printer_with_errors(tmp_path / "true")
+    perfect = ParameterErrors()
+    made = SimulationSettings(Level.OUTLINES, perfect, poses=8, sampling="workspace", seed=4)
+    folder = tmp_path / "session"
+    simulate(true, folder, made)
+    dataset = folder / "dataset.yaml"
+    entries = yaml.safe_load(dataset.read_text()) | {"mechanism": str(nominal.yaml_path)}
+    dataset.write_text(yaml.safe_dump(entries))
+    calibrate(folder, output=tmp_path / "out")
+    exported = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg")
+    before, after = off_by(KLIPPER, true), off_by(exported.paths[0].read_text(), true)
+    assert before > 0.3
+    assert after < before / 5.0
+    assert exported.figures["nominal_mm"]["rms"] == pytest.approx(before, rel=0.3)
+    assert abs(exported.figures["remaining_mm"]["rms"] - after) < 0.01
+    assert b"<svg" in exported.paths[1].read_bytes()
 
 
 # --- hexapods -----------------------------------------------------------------------------------

@@ -25,10 +25,8 @@ from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
 )
-from legcal.calibration.identify.predicted_observations import (
-    recorded_observations,
-)
 from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
@@ -89,7 +87,7 @@ def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
         ("weak joint", 15, (30, 30), ()),
         ("halves", 15, (30, 30), ("eq12",)),
         ("paper", 15, (30, 30), ()),
-        ("paper", 1, (25, 30), ("two_directions", "full")),
+        ("paper", 1, (26, 30), ("two_directions", "full")),
     ],
 )
 def test_a_board_does_what_the_report_says(
@@ -199,11 +197,11 @@ def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     """Everywhere until somebody has looked for it, then in the views that show it."""
     board = Board("chessboard", 9, 6, 0.03)
     with_board = replace(example(), boards=(FixedBoard(board, "base"),))
-    assert not recorded_observations(example()).board.any()
-    assert recorded_observations(with_board).board.all()
+    assert not recorded_session(example()).board.any()
+    assert recorded_session(with_board).board.all()
     row = np.flatnonzero(example().measurements.view == 1)[:1]
     one = found_corners(row, np.array([0]), np.array([[10.0, 20.0]]), np.array([0.05]))
-    shown = recorded_observations(replace(with_board, corners=one)).board
+    shown = recorded_session(replace(with_board, corners=one)).board
     np.testing.assert_array_equal(shown, [False, True, False])
     found = identifiability_of_dataset(with_board)
     assert found.board.present
@@ -248,7 +246,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
 @pytest.mark.parametrize(("name", "noted"), [("3-rps", True), ("hexapod", False)])
 def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) -> None:
     machine = legcal.load_mechanism(name)
-    report = legcal.identifiability(machine, [machine.leg_names])
+    report = legcal.identifiability(machine, [machine.leg_names], 4)
     assert report.identifiable
     assert report.platform_sigma is not None
     assert (report.platform_sigma.dX_m > 0.02) == noted

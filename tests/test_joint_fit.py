@@ -35,8 +35,8 @@ from fit_sessions import (
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -206,28 +206,28 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
     assert largest < 2.0 * np.abs(change[is_length]).max()
 
 
-def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> PredictedObservations:
+def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Session:
     """Return what was measured as the analysis of identifiability takes it."""
     R, t = Frames.of(session.truth.T_Rb_Re)
-    cameras = session.truth.T_camera_Rb
-    radius = [max(r for (j, _), r in legs.radii.items() if j == k) for k in range(len(legs.names))]
-    return PredictedObservations(
+    m, cameras = session.measurements, session.truth.T_camera_Rb
+    return Session(
         leg_names=legs.names,
         legs=session.truth.legs,
         frame_legs=legs.frame_legs,
         parametrization=parametrize(legs.names, session.truth.legs, legs.frame_legs),
-        radius=np.array(radius),
         R=R,
         t=t,
         R_reached=R,
         t_reached=t,
-        view=session.measurements.view,
-        pose=session.measurements.pose,
+        view=m.view,
+        pose=m.pose,
         seen=np.ones((len(cameras), len(legs.names)), dtype=np.bool_),
         board=np.zeros(len(cameras), dtype=np.bool_),
-        camera=np.array([T.inv().translation for T in cameras]),
-        focal=np.full(len(cameras), session.measurements.views[0].camera.K[0, 0]),
-        sigma_q=session.measurements.sigma_q,
+        cameras=tuple(
+            replace(view, T_base_camera=T.inv()) for view, T in zip(m.views, cameras, strict=True)
+        ),
+        sigma_q=m.sigma_q,
+        unread=np.zeros((len(t), len(legs.names)), dtype=np.bool_),
     )
 
 

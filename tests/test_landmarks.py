@@ -81,6 +81,7 @@ def test_noise_of_clicks_leaves_a_rough_pose_that_wins(tmp_path: Path) -> None:
         }
         write_clicks(folder, clicks)
         far, turned = off(folder, true)
+        assert load_dataset(folder, check_images=False).measurements.views[0].is_placed
         assert 0.0 < far < 0.03
         assert turned < np.deg2rad(2.0)
         (folder / "landmarks.csv").unlink()

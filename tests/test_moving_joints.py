@@ -11,10 +11,10 @@ from staged_sessions import Observed, planned
 
 from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import check_identifiable
-from legcal.calibration.identify.predicted_observations import PredictedObservations
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.scale import is_scale_open, scale_sources
+from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable
 from legcal.machine.leg import Cylinder
@@ -100,15 +100,16 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         assert source.sigma is not None
         assert source.platform_sigma is not None
     if found:
-        assert found[3].sigma == pytest.approx(0.02, rel=0.01)
-        assert max(s.sigma or 1.0 for s in found[:3]) < 0.001
+        assert found[3].sigma is not None
+        assert 0.02 < found[3].sigma < 0.025  # edges err alike too, and rods look thinner
+        assert max(s.sigma or 1.0 for s in found[:3]) < 0.0012  # a print is known to 0.1 %
         known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
         assert not is_scale_open(Analysis(session(name), known))
         vague = Choices(priors={"leg1.length": Prior(0.4, 0.02)})  # radii would set the scale
         assert is_scale_open(Analysis(session(name), vague))
         rods = [
             replace(leg, cylinders=(Cylinder("rod", 0.008, "base", 0.0, leg.q0),))
-            for leg in analysis.predicted.legs
+            for leg in analysis.session.legs
         ]
         radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
         assert not is_scale_open(Analysis(replace(session(name), legs=tuple(rods)), radius))
@@ -129,11 +130,11 @@ def test_the_verdict_names_the_scale_as_the_largest_part_of_the_error() -> None:
     text = " ".join(str(line) for line in _verdict(report))
     assert "calibrate refuses this machine until a length or radii are stated" in text
     assert "leg1.length measured to 0.019 mm" in identify_verdict(report).reasons[0]
-    assert "With radii alone it is 3.1 mm: the scale is the largest part of it" in text
+    assert "With radii alone it is 3.3 mm: the scale is the largest part of it" in text
     assert "better is leg1.length measured to 0.019 mm, or a calibration board on the base" in text
 
 
-def gained(name: str) -> PredictedObservations:
+def gained(name: str) -> Session:
     found = session(name)
     names = parametrize(found.leg_names, found.legs, found.frame_legs, twists=True)
     return replace(found, parametrization=names)
@@ -152,7 +153,7 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        identifiability, "recorded_observations", lambda dataset, twists: session("6-rss")
+        identifiability, "recorded_session", lambda dataset, twists: session("6-rss")
     )
     known = SimpleNamespace(
         readings_carry_length=False,

@@ -10,16 +10,16 @@ import pytest
 import trimesh
 
 import legcal
-from legcal.geometry.motions import look_at
+from legcal.geometry.motions import components, look_at
 from legcal.machine.configurations import random_configurations
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.occluders import PlacedOccluders
 from legcal.machine.parameters import geometries
-from legcal.planning.sight import Bodies, visible_parts
 from legcal.simulation.solids import PosedMachine, pose_machine, solids_of
 from legcal.simulation.visibility import legs_in_image
 from legcal.vision.camera import sample_camera
+from legcal.vision.sight import Bodies, visible_parts
 from legcal.vision.visibility import visible_segments
 
 ROOT = Path(__file__).parents[1]
@@ -131,7 +131,13 @@ def test_plans_see_of_legs_what_the_simulation_shows_of_them(
     found = random_configurations(machine, n, 1)
     poses = pose_machine(machine, solids_of(machine), found)
     in_frames = [machine.T_base_Rb.inv() * T * machine.T_platform_Re for T in found.poses]
-    bodies = Bodies.at(machine, geometries(machine), in_frames)
+    bodies = Bodies.at(
+        geometries(machine),
+        *components(in_frames),
+        machine.size,
+        T_base_Rb=machine.T_base_Rb,
+        occluders=machine.occluders,
+    )
     np.testing.assert_allclose(bodies.A[0], poses[0].A, atol=1e-9)
     for place in ([1.0, 0.3, 0.3], [-0.5, 0.9, 0.2], [0.2, -1.0, 0.5]):
         T = look_at(np.array(place), np.array([0.0, 0.0, 0.2]))

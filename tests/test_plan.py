@@ -19,6 +19,12 @@ from fit_sessions import machine_session
 from scipy.spatial.transform import RigidTransform
 
 import legcal
+from legcal.calibration.joint_fit.predicted import (
+    Contributions,
+    Predictor,
+    predicted_outlines,
+)
+from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
@@ -31,7 +37,6 @@ from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
-from legcal.planning.information import DEFAULT_NOISE, WHITE, Contributions, Predictor
 from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
@@ -168,7 +173,7 @@ def test_the_command_writes_what_python_plans(
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -204,7 +209,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.planning.information.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
     assert json.loads(printed.out)["error"]["kind"] == "Interrupted"
@@ -285,7 +290,7 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
     lines = {key: (h, ends) for key, h, ends in both}
     row, agreeing, missing = 0, 0, 0
     for view in planned.views:
-        of_view = view.seen.outlines(0.1, row + np.arange(len(view.poses.poses)))
+        of_view = predicted_outlines(view.seen, row + np.arange(len(view.poses.poses)), WHITE)
         for key, h, ends in zip(of_view.row_keys(), of_view.h, of_view.ends, strict=True):
             if key not in lines:
                 missing += 1

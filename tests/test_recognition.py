@@ -561,6 +561,29 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
         assert lp.apart(T, placed)[1] < np.deg2rad(2.0)
 
 
+def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(1)
+    T, made, poses = lp.camera(rng), lp.machine(6), [lp.platform(rng) for _ in range(4)]
+    _Made.made[:] = lp.pictures(made, T, poses, rng, missing=1.1)
+    search = _search(_Made, made, np.array([made.posed(P) for P in poses]))
+    monkeypatch.setattr(
+        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
+    )
+    monkeypatch.setattr(recognition, "_by_edges", lambda search, task: task.by_pairs)
+    view = search.measurements.views[0]
+    for is_placed in (False, True):
+        views = (replace(view, is_placed=is_placed),)
+        search = replace(search, measurements=replace(search.measurements, views=views))
+        placement = recognition.place_views(search, np.arange(4), [T]).recognised()
+        assert (placement.T_base_camera[0] is not None) == is_placed
+        assert ("c1" in placement.unplaced) != is_placed
+    placed = placement.T_base_camera[0]
+    assert placed is not None
+    np.testing.assert_allclose(placed.as_matrix(), T.as_matrix(), atol=1e-12)
+
+
 # The fit of a view to outlines.
 
 N_LEGS, N_IMAGES = 6, 4

@@ -1,9 +1,11 @@
 """What changed in the course of a session is named with its moment and amount, and nothing else."""
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ from changed_rays import turned, with_rays, zoomed
 from csv_rows import read_rows, write_rows
 from simulated import simulated
 
-from legcal import calibrate, load_dataset, load_mechanism
+from legcal import calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.closeness import commanded
 from legcal.calibration.session_changes import Finding, session_tests
 from legcal.data.dataset import Dataset
+from legcal.data.holdout import dataset_at
 from legcal.data.image_order import image_sequences
+from legcal.errors import UsageError
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 
@@ -124,7 +128,11 @@ def test_a_stated_length_tells_a_pitch_that_all_motors_share(healthy: Dataset, p
     length = 1e3 * float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))
     stretched = _with_readings(lambda q: q * (1.0 + part))(healthy)
     result = calibrate(stretched, priors=[f"leg1.base:leg3.base={length:.3f}±0.05mm"])
-    assert [doubt.code for doubt in result.doubts] == ["pitch"] * (part > 0.0)
+    m = stretched.measurements
+    session = session_tests(result.solution.posterior, m, image_sequences(m, {}))
+    assert [one.kind for one in session.findings] == ["pitch"] * (part > 0.0)
+    assert all(abs(one.amount - part) < 4.0 * one.sigma < 0.6 * part for one in session.findings)
+    assert [doubt.code for doubt in result.doubts] == ["scale"] * (part > 0.0)
 
 
 def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
@@ -141,6 +149,54 @@ def test_a_result_with_a_slip_is_in_doubt_in_any_order_of_rows(
     assert not result.verdict.trustworthy
     assert [doubt.code for doubt in result.doubts] == ["encoder"]
     assert "leg2" in result.doubts[0].sentence
+
+
+def test_the_remedy_of_a_slip_gives_a_result_within_its_sigmas(
+    healthy: Dataset, tmp_path: Path
+) -> None:
+    slip = 5.0 * SLIP  # and the machine has the zero of later images
+    of_leg = np.arange(6) == 3
+    slipped = _with_readings(lambda q: q + slip * np.outer(~_later(len(q)), of_leg))(healthy)
+    remedy = calibrate(slipped).doubts[0].remedy
+    (option,) = re.findall(r"--split (\S+)\)", remedy)
+    assert option == "leg4@c1,c2:p13..p19"
+    result = calibrate(slipped, split=[option], output=tmp_path / "out")
+    assert result.verdict.trustworthy
+    assert result.platform is not None
+    truth = next((healthy.folder / "truth/models").glob("*.yaml"))
+    off = evaluate(tmp_path / "out/calibrated.yaml", truth, dataset=healthy.folder)
+    assert off.displacement.mean() < 3.0 * result.platform.sigma.mean_displacement
+    (note,) = [note for note in result.notes if "zero of the encoder of leg4" in note]
+    (value, sigma) = map(float, re.findall(r"is (\S+) ± (\S+) mm", note)[0])
+    assert abs(value - 1e3 * slip) < 4.0 * sigma < 0.05
+
+
+def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
+    bumped = _with_later_rays(turned(5.0 * TURN))(healthy)
+    (option,) = re.findall(r"--leave-out (\S+)\)", calibrate(bumped).doubts[0].remedy)
+    assert option == "c2:p20..p24"
+    without = calibrate(bumped, leave_out=option)
+    assert without.verdict.trustworthy
+    rows = np.flatnonzero(~_later(24))
+    expected = calibrate(dataset_at(healthy, rows)).solution.estimates
+    assert without.solution.estimates.values == pytest.approx(dict(expected.values), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"leave_out": "p77"}, "found no image 'p77'"),
+        ({"leave_out": "p03..p20"}, "found the range p03..p20"),
+        ({"leave_out": "c1,c2"}, "found all images"),
+        ({"split": ["leg7@p03"]}, "found no motor of that name"),
+        ({"split": ["leg1"]}, "needed MOTOR@IMAGES"),
+    ],
+)
+def test_images_that_cannot_be_chosen_are_refused_with_the_cause(
+    healthy: Dataset, arguments: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(UsageError, match=re.escape(sentence)):
+        calibrate(healthy, **arguments)
 
 
 def test_a_session_whose_images_have_no_order_says_that_changes_were_not_tested(

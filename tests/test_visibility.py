@@ -6,34 +6,36 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import SHIPPED_YAML
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 import legcal
 from legcal.errors import NotVisible
-from legcal.geometry.motions import look_at
+from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
 from legcal.simulation.visibility import (
     MIN_SHARE,
     LegView,
-    contact_offsets,
     legs_in_image,
-    silhouette,
     take_images,
 )
 from legcal.vision.camera import Camera, sample_camera
-from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
+from legcal.vision.sight import Bodies, visible_parts
 from legcal.vision.visibility import in_picture, pixels_inside
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
     "hexapod-strut", "nategh-agheli", "tricept",
 )  # fmt: skip
+MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
 
@@ -141,21 +143,24 @@ def test_cameras_around_any_machine_see_its_legs_and_all_of_it(name: str) -> Non
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2)))
 @settings(max_examples=100, deadline=None)
-def test_silhouettes_are_the_tangent_planes_of_eq_3(numbers: tuple[float, ...]) -> None:
-    """By tangents to a circle, which know nothing of moments."""
+def test_outlines_touch_the_cylinder_as_tangents_to_a_circle_do(numbers: tuple[float, ...]) -> None:
+    """From a distance d they touch R^2 / d before the axis, R sqrt(1 - R^2 / d^2) beside it."""
     u = np.array(numbers[:3]) + np.array([0.0, 1.5, 0.0])
     u /= np.linalg.norm(u)
-    A, R = np.array(numbers[3:6]), np.array(numbers[6])
-    if np.linalg.norm(np.cross(u, A)) < 1.01 * R:
+    A, R = np.array(numbers[3:6]), numbers[6]
+    d = float(np.linalg.norm(np.cross(u, A)))
+    if d < 1.01 * R:
         return
-    h, offsets = silhouette(u, A, R)
-    assert np.allclose(h, outlines_of_axis(u, A, R), rtol=0.0, atol=1e-12)
-    assert np.allclose(np.linalg.norm(offsets, axis=-1), R, rtol=1e-12)
-    assert np.allclose(offsets @ u, 0.0, atol=1e-14)
-    assert np.allclose(np.sum(h * (A + 0.3 * u + offsets), axis=-1), 0.0, atol=1e-12)
-    assert np.allclose(np.sum(h * offsets, axis=-1), [-R, R], atol=1e-12)  # epsilon +1, -1
-    with pytest.raises(NotVisible, match=r"5\.0 mm from its axis"):
-        contact_offsets(np.array([0.0, 1.0, 0.0]), np.array([0.005, 0.0, 0.0]), np.array(0.01))
+    away = (A - u * (u @ A)) / d
+    before, beside = -(R * R / d) * away, R * np.sqrt(1.0 - (R / d) ** 2) * np.cross(u, away)
+    h = outlines_of_axis(u, A, R)
+    steps = steps_to_outlines(h, R)
+    np.testing.assert_allclose(steps, [before - beside, before + beside], rtol=0.0, atol=1e-12)
+    moments = np.cross(u, A + steps)  # of the lines where they touch, eq (3)
+    moments /= np.linalg.norm(moments, axis=1)[:, None]
+    np.testing.assert_allclose(h, moments, rtol=0.0, atol=1e-12)
+    with pytest.raises(NotVisible, match=r"5\.0 mm from an axis"):
+        outlines_of_axis(np.array([0.0, 1.0, 0.0]), np.array([0.005, 0.0, 0.0]), 0.01)
 
 
 @pytest.mark.parametrize(
@@ -181,3 +186,42 @@ def test_points_that_a_lens_folds_back_are_not_in_the_picture(
         in_picture(camera, points, 0.1), pixels_inside(camera, pixels) & back
     )
     assert 0.1 < camera.unfolded < 2.0
+
+
+@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-rpr", "3-rps", "delta"]))
+def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str) -> None:
+    """Every part that is predicted is shown, hardly longer, and few that are shown are not."""
+    machine, n = posed_machine(name), 3
+    found = legcal.random_configurations(machine, n, 0)
+    here = pose_machine(machine, dressed(machine), found)
+    views, _ = cameras_around(machine, here, {"c1": sample_camera()}, np.random.default_rng(1))
+    bodies = Bodies.at(
+        geometries(machine),
+        *components([machine.T_base_Rb.inv() * T * machine.T_platform_Re for T in found.poses]),
+        machine.size,
+        T_base_Rb=machine.T_base_Rb,
+        occluders=machine.occluders,
+    )
+    beyond, missed = list[float](), 0
+    for view in views:
+        seen = visible_parts(view.camera, view.T_base_camera, bodies)
+        parts = zip(seen.image.tolist(), seen.leg.tolist(), seen.part, strict=True)
+        predicted = dict(zip(parts, seen.ends, strict=True))
+        for image, m in enumerate(here):
+            for leg in legs_in_image(machine.legs, m, view.camera, view.T_base_camera):
+                for s in (*leg.stretches, *([] if leg.arm is None else [leg.arm])):
+                    ends = predicted.pop((image, s.leg, s.part), None)
+                    if ends is None:
+                        missed += leg.is_seen
+                        continue
+                    is_arm = machine.legs[s.leg].is_arm(s.part)
+                    A, B = m.arms[s.leg] if is_arm else (m.A[s.leg], m.B[s.leg])
+                    u = (B - A) / np.linalg.norm(B - A)
+                    axis = A + np.array([[s.start], [s.end]]) * u
+                    first, last = view.camera.project(view.T_base_camera.inv().apply(axis))
+                    along = (ends.mean(axis=0) - first) @ (last - first)
+                    along /= np.sum((last - first) ** 2)
+                    beyond.append(max(-along.min(), along.max() - 1.0, 0.0))
+        assert not predicted
+    assert missed <= 0.15 * len(beyond)
+    assert np.median(beyond) < 0.02

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.joint_fit.platform import PlatformAccuracy
+from legcal.calibration.quantities import mm_deg
 from legcal.data.dataset import Dataset
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
@@ -48,9 +49,9 @@ def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) ->
     predicted = platform.workspace
     ratio = predicted.mean_displacement / dX
     sentence = (
-        f"Predicted error over the workspace: {1e3 * predicted.mean_displacement:.3f} mm / "
-        f"{np.degrees(predicted.mean_rotation):.4f} deg with {n_images} images, {ratio:.2f} times "
-        f"the plan ({1e3 * dX:.3f} mm / {np.degrees(dE):.4f} deg with {planned} images)."
+        "Predicted error over the workspace: "
+        f"{mm_deg(predicted.mean_displacement, predicted.mean_rotation)} with {n_images} images, "
+        f"{ratio:.2f} times the plan ({mm_deg(dX, dE)} with {planned} images)."
     )
     if ratio > AS_PLANNED:
         sentence += (

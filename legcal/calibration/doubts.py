@@ -51,6 +51,7 @@ from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
+READING_NOISE = "reading_noise"  # code of the doubt in readings that scatter
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
@@ -146,6 +147,10 @@ def doubts_of(
     motors = {one.subject for one in session.findings} if course else set[str]()
     is_of_motors = any(one.kind in OF_MOTORS for one in session.findings) and bool(course)
     legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
+    symptoms = [] if causes else _symptoms(dataset, solution, platform, changes, held_out, session)
+    if {one.code for one in causes} == {READING_NOISE}:
+        # A model that was led away scatters readings as well
+        symptoms = _left_out(solution, platform)
     return (
         *([] if is_of_motors else _readings(solution)),
         *_legs_left_out(solution, legs),
@@ -154,7 +159,8 @@ def doubts_of(
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
         *_nominal_lengths(dataset, solution, platform, changes),
-        *(causes or _symptoms(dataset, solution, platform, changes, held_out, session)),
+        *causes,
+        *symptoms,
     )
 
 
@@ -382,16 +388,18 @@ def _changes(
 ) -> list[Doubt]:
     """Return what changed in the course of the session, and readings that do not follow motors.
 
-    It counts where it displaces the platform by more than that is known to.
+    It counts where it displaces the platform by more than that is known to; scatter of readings
+    also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
     """
     doubts = []
+    scatters = READING_NOISE if _noise(solution, session) else ""
     for finding in session.findings:
         effect = None if platform is None else _effect_of(finding, dataset, solution)
         if platform is None or effect is None:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
-        elif effect[0] > platform.sigma.mean_displacement:
+        elif effect[0] > platform.sigma.mean_displacement or finding.kind == scatters:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
-    return doubts
+    return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
 
 
 def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[float, float]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 
 FRAMES: dict[str, str] = {"base": "R_b", "platform": "R_e"}
 DIGITS = {"mm": 4, "deg": 4, "px": 3, "": 6}  # decimals by unit
+
+
+def mm_deg(dX_m: float, dE_rad: float) -> str:
+    """Return an error of the platform in words."""
+    return f"{1e3 * dX_m:.3f} mm / {math.degrees(dE_rad):.4f} deg"
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from itertools import chain, combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
@@ -46,6 +47,7 @@ _UNSEEN = 1e-7  # part of the square of a column below which the fit absorbs it
 ALL_MOTORS = "all motors"
 
 _GOOD_PART = 0.2  # of a turn, beyond which errors once a turn are looked for
+_FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -792,7 +794,7 @@ def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatt
         _Scatter.of(subject, group, hypotheses, scores, len(groups))
         for subject, group in groups.items()
     ]
-    best = min(tests, key=lambda test: test.p_value, default=None)
+    best = max(tests, key=lambda test: test.gain, default=None)
     if best is None or best.p_value > SIGNIFICANCE or best.ratio < MOST_SCATTER:
         return None
     return best
@@ -803,14 +805,16 @@ class _Scatter:
     """How much the readings of some motors scatter, by the squares of their scores.
 
     With scores z of the errors of single readings and their covariance K under the stated scatter,
-    a further variance adds its multiple of K^2 to that of z. Blocks have the mean of their images.
+    a further variance adds its multiple of K^2 to that of z; the likeliest one is taken. Blocks
+    have the mean of their images.
     """
 
     subject: str
     group: Sequence[int]  # hypotheses of the zeros of encoders
     p_value: float  # times the number of tests
+    gain: float  # of the logarithm of the likelihood
     further: float  # standard deviation beside the stated one, over that
-    sigma_of_square: float  # of the square of that
+    spread: float  # standard deviation of the logarithm of its square
     sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block, by motor [m or rad]
     stated: float  # of a reading, in the median of motors
 
@@ -822,7 +826,7 @@ class _Scatter:
     @property
     def sigma_of_ratio(self) -> float:
         """Standard deviation of the ratio."""
-        return 0.5 * self.sigma_of_square / self.ratio
+        return 0.5 * self.spread * self.further**2 / self.ratio
 
     @classmethod
     def of(
@@ -844,17 +848,31 @@ class _Scatter:
         columns, sigma = scores.of_readings(group, sigmas)
         z = sigma * scores.score[columns]
         K = sigma[:, None] * scores.information[np.ix_(columns, columns)] * sigma
-        trace, of_square, squares = float(np.trace(K)), float(np.sum(K * K)), float(z @ z)
-        p_value, further, spread = 1.0, 0.0, 0.0
-        if trace > 0.0:
-            # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
-            dof = trace**2 / of_square
-            p_value = min(n_tests * float(chdtrc(dof, squares * dof / trace)), 1.0)
-            further = max(squares - trace, 0.0) / of_square
-            covariance = K + further * (K @ K)
-            spread = math.sqrt(2.0 * float(np.sum(covariance * covariance))) / of_square
-        typical = float(np.median(stated))
-        return cls(subject, group, p_value, math.sqrt(further), spread, sigmas, typical)
+        own, vector = np.linalg.eigh(K)
+        own, squares = np.maximum(own, 0.0), (vector.T @ z) ** 2
+        # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
+        total = max(float(own.sum()), np.finfo(np.float64).tiny)
+        dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
+        p_value = min(n_tests * float(chdtrc(dof, float(squares.sum()) * dof / total)), 1.0)
+
+        def loss(logarithm: float) -> float:
+            more = math.exp(logarithm) * own
+            return 0.5 * float(np.sum(np.log1p(more) - squares / own_or_one * more / (1.0 + more)))
+
+        own_or_one = np.where(own > 0.0, own, 1.0)
+        likeliest = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
+        more = math.exp(likeliest.x) * own
+        spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
+        return cls(
+            subject,
+            group,
+            p_value,
+            -float(likeliest.fun),
+            math.exp(0.5 * likeliest.x),
+            spread,
+            sigmas,
+            float(np.median(stated)),
+        )
 
 
 def _effect(

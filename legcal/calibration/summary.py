@@ -26,6 +26,7 @@ from legcal.calibration.quantities import (
     FRAMES,
     Quantity,
     joints_of,
+    mm_deg,
     parameters_of,
     turns_of,
 )
@@ -314,10 +315,6 @@ class Summarised:
         return summary_html(self.result)
 
 
-def _mm_deg(dX_m: float, dE_rad: float) -> str:
-    return f"{1e3 * dX_m:.3f} mm / {np.degrees(dE_rad):.4f} deg"
-
-
 def _doubt_lines(result: Result) -> list[str]:
     """Return what speaks against the result, each with its effect on the platform and its remedy.
 
@@ -327,7 +324,7 @@ def _doubt_lines(result: Result) -> list[str]:
     for doubt in result.doubts if len(result.doubts) > 1 else ():
         effect = ""
         if doubt.sigma_dX_m is not None and doubt.sigma_dE_rad is not None:
-            effect = f" ({_mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)} at the platform)"
+            effect = f" ({mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)} at the platform)"
         lines.append(f"Doubt: {doubt.what}{effect}; {doubt.remedy}.")
     return lines
 
@@ -455,8 +452,8 @@ def _platform_lines(found: PlatformBlock, *, verbose: bool) -> list[str]:
     return [
         f"Predicted error of the platform (1 sigma): {'; '.join(parts)}.",
         *(
-            f"{one.what.capitalize()} would move the platform by {_mm_deg(one.dX_m, one.dE_rad)}, "
-            f"at most {_mm_deg(one.dX_max_m, one.dE_max_rad)}."
+            f"{one.what.capitalize()} would move the platform by {mm_deg(one.dX_m, one.dE_rad)}, "
+            f"at most {mm_deg(one.dX_max_m, one.dE_max_rad)}."
             for one in found.sensitivities
             if verbose or 1e3 * one.dX_max_m > _NONE or np.degrees(one.dE_max_rad) > 0.1 * _NONE
         ),
@@ -465,7 +462,7 @@ def _platform_lines(found: PlatformBlock, *, verbose: bool) -> list[str]:
 
 def _predicted(at: PlatformBlock | WorkspaceAccuracy) -> str:
     mean, most = (at.sigma_dX_m, at.sigma_dE_rad), (at.sigma_dX_max_m, at.sigma_dE_max_rad)
-    return f"{_mm_deg(*mean)}, at most {_mm_deg(*most)}"
+    return f"{mm_deg(*mean)}, at most {mm_deg(*most)}"
 
 
 def _holdout_lines(found: Holdout) -> list[str]:
@@ -484,6 +481,6 @@ def _holdout_lines(found: Holdout) -> list[str]:
     return [
         *lines,
         f"At the platform, its pose by what {pair.poses} of {found.poses} poses show alone is "
-        f"{_mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
-        f"{_mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
+        f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
+        f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
     ]

@@ -25,6 +25,7 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_acc
 from legcal.calibration.joint_fit.scale import SCALE
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.notes import Note, Topic
+from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
@@ -88,7 +89,7 @@ def judge(
     doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
-        found += f"; what is in doubt may add {_mm_deg(displacement, rotation)}"
+        found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
     if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
         doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
@@ -159,16 +160,11 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
     """Return the change of the platform, its uncertainty, both displacements [m], and a clause."""
     change, sigma = platform.change, platform.sigma
     found = (
-        f"the platform moves by {_mm_deg(change.mean_displacement, change.mean_rotation)} against "
-        f"the nominal model, known to {_mm_deg(sigma.mean_displacement, sigma.mean_rotation)} "
+        f"the platform moves by {mm_deg(change.mean_displacement, change.mean_rotation)} against "
+        f"the nominal model, known to {mm_deg(sigma.mean_displacement, sigma.mean_rotation)} "
         "(1 sigma)"
     )
     return change.mean_displacement, sigma.mean_displacement, found
-
-
-def _mm_deg(displacement: float, rotation: float) -> str:
-    """Return an error of the platform in words."""
-    return f"{1e3 * displacement:.3f} mm / {np.degrees(rotation):.4f} deg"
 
 
 def _share_of_scale(platform: PlatformAccuracy) -> str:

@@ -33,6 +33,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
+from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result_folder import EarlierResult, load_result
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
@@ -94,15 +95,12 @@ class Check:
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
         test = f"p-value {p}, significance {100 * movement.significance:g} %"
-        uncertainty = (
-            f"{1e3 * pair.expected_displacement:.3f} mm / "
-            f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
-        )
+        uncertainty = f"{mm_deg(pair.expected_displacement, pair.expected_rotation)} (1 sigma)"
         if not movement.moved:
             return (
                 f"No change was detected ({test}); the platform pose is confirmed to {uncertainty}."
             )
-        change = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
+        change = mm_deg(pair.displacement, pair.rotation)
         return (
             f"Something has moved ({test}): the platform pose has changed by {change}, uncertainty "
             f"{uncertainty}; calibrate again."

@@ -23,7 +23,7 @@ from legcal.cli.options import (
     write_page,
 )
 from legcal.errors import UsageError, printable
-from legcal.vision.distortion import DistortionModel
+from legcal.vision.distortion import CameraProgram, DistortionModel
 
 if TYPE_CHECKING:
     from legcal.calibration.detection import Detection
@@ -34,21 +34,24 @@ def camera(
     images: Annotated[
         list[str],
         typer.Argument(
-            metavar="IMAGES...", help="Photographs of the board: files, folders, patterns."
+            metavar="IMAGES...",
+            help="Photographs of the board: files, folders, patterns; with --to a camera file, "
+            "with --compare two.",
         ),
     ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="The camera file to write."),
+    ] = None,
     board: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="SPEC",
             help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
             "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
-            "block board.",
+            "block board, or a target of Kalibr or Basalt.",
         ),
-    ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
-    ],
+    ] = None,
     model: Annotated[
         DistortionModel | None,
         typer.Option(help="Distortion model; by default chosen by the images."),
@@ -57,6 +60,13 @@ def camera(
         Path | None,
         typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
     ] = None,
+    to: Annotated[
+        CameraProgram | None,
+        typer.Option(help="Convert a camera file of any program into the form of this one."),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare two camera files over the image.")
+    ] = False,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     quiet: QuietOption = False,
@@ -64,8 +74,38 @@ def camera(
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
-    from legcal.report.images import camera_table
+    from legcal.calibration.camera_calibration.projection import compare_cameras
+    from legcal.report.images import camera_table, comparison_table
+    from legcal.vision.camera_export import convert_camera
+    from legcal.vision.camera_file import read_camera
 
+    if compare:
+        if len(images) != 2 or board is not None or output is not None:
+            raise UsageError(
+                "The cameras could not be compared: found other arguments than two camera files, "
+                "needed legcal camera A B --compare; leave out the others."
+            )
+        comparison = compare_cameras(*(read_camera(Path(image)) for image in images))
+        show(as_json, comparison.document, lambda: comparison_table(comparison))
+        return
+    if output is None:
+        raise UsageError(
+            "The camera could not be written: found no --output, needed the file to write; add -o "
+            "camera_info.yaml."
+        )
+    if to is not None:
+        if len(images) != 1 or board is not None or as_json:
+            raise UsageError(
+                "The camera could not be converted: found photographs, --board or --json with "
+                "--to, needed a single camera file; calibrate first, and convert the result."
+            )
+        convert_camera(Path(images[0]), to, output)
+        return
+    if board is None:
+        raise UsageError(
+            "The camera could not be calibrated: found no --board, needed the board in the "
+            "photographs; write --board chessboard:9x6:25mm for one of 9 x 6 squares of 25 mm."
+        )
     calibration = calibrate_camera(
         images,
         board,
@@ -229,6 +269,12 @@ def identify(
             help="Hand-held camera: a new pose for every image of a view; with --board and --view.",
         ),
     ] = False,
+    noise: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULT", help="Take the errors of outlines from this earlier result."
+        ),
+    ] = None,
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -240,7 +286,13 @@ def identify(
     check_page(page)
     views = [text.split(",") for text in view or []]
     identified = answer(
-        model, views, images, board=board, platform_board=platform_board, hand_held=hand_held
+        model,
+        views,
+        images,
+        board=board,
+        platform_board=platform_board,
+        hand_held=hand_held,
+        noise=noise,
     )
     verdict = identify_verdict(identified)
     write_page(page, f"Identifiability of {model}", identify_table(identified), verdict)

@@ -77,9 +77,10 @@ PageOption = Annotated[
 
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.text import Text
 
     from legcal.pages.document import Verdict
+    from legcal.report.render import Report
 
 
 def declared(request: type) -> Iterator[inspect.Parameter]:
@@ -122,7 +123,7 @@ def check_page(page: Path | None) -> None:
 def write_page(
     page: Path | None,
     title: str,
-    text: RenderableType,
+    report: Report,
     verdict: Verdict | None = None,
     figures: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
@@ -132,7 +133,7 @@ def write_page(
 
     if page is not None:
         blocks = [picture(path, caption) for caption, path in figures.items()]
-        document = text_page(title, text, verdict=verdict, blocks=blocks, command=command_line())
+        document = text_page(title, report, verdict=verdict, blocks=blocks, command=command_line())
         writing.write_page(document, page)
 
 
@@ -184,7 +185,7 @@ def chosen_workers(cluster: str | None, workers: int | None, by_default: int) ->
 
 
 def show(
-    as_json: bool, document: Callable[[], dict[str, Any]], table: Callable[[], RenderableType]
+    as_json: bool, document: Callable[[], dict[str, Any]], table: Callable[[], Report]
 ) -> None:
     """Print the document or the table."""
     if as_json:
@@ -193,17 +194,15 @@ def show(
         print_table(table())
 
 
-def print_table(renderable: RenderableType) -> None:
+def print_table(text: Report | Text | str) -> None:
     """Print text for people on stdout."""
     from rich.console import Console
 
-    if isinstance(renderable, str):
-        from legcal.report.render import report
+    from legcal.report.render import report
 
-        renderable = report(renderable)
     with _writing_to_stdout():
         # Paths to copy must not wrap: they may be wider than the terminal, and are not cut there.
-        Console(highlight=False).print(renderable, crop=False)
+        Console(highlight=False).print(report(text), crop=False)
         sys.stdout.flush()
 
 

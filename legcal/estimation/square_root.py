@@ -9,36 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from legcal.estimation.problem import EstimationProblem, S, linearize
 from legcal.geometry.types import Array, IntArray
 
 _UNKNOWN = 1e-3  # [1 / unit]: singular values up to here count as undetermined unknowns
-
-
-def information_rows(problem: EstimationProblem[S], state: S) -> Array:
-    """Return square-root information R (m, n_kept) of the kept unknowns, elements marginalised out.
-
-    R^T R is the reduced matrix of ``information`` for plain least squares.
-    """
-    linear = linearize(problem, state)
-    reduced, by_element = [linear.prior_J], []
-    for factor in problem.factors:
-        sparsity, rows = problem.sparsity[factor.name], linear[factor.name]
-        n, q, _ = rows.J.shape
-        J = np.zeros((n, q, problem.n_kept + 1))
-        measurement, row = np.arange(n)[:, None, None], np.arange(q)[None, :, None]
-        np.add.at(J, (measurement, row, sparsity.index[:, None, :]), rows.J)
-        J = J[..., :-1]
-        if sparsity.element is None:
-            reduced.append(J.reshape(n * q, problem.n_kept))
-        else:
-            element_first = np.concatenate([rows.J_element, J], axis=2)
-            by_element.append(stack_by_group(element_first, sparsity.element, problem.n_elements))
-    if by_element:
-        reduced.append(
-            reduced_rows(eliminate(np.concatenate(by_element, axis=1), problem.d_element))
-        )
-    return np.concatenate(reduced)
 
 
 def marginal_rows(rows: Array, which: IntArray) -> Array:
@@ -77,20 +50,3 @@ def compress(rows: Array) -> Array:
     n = rows.shape[1]
     upper = np.asarray(np.linalg.qr(rows, mode="r")) if len(rows) else np.zeros((0, n))
     return np.concatenate([upper, np.zeros((n - len(upper), n))])
-
-
-def reduced_rows(rows: Array) -> Array:
-    """Return rows of the same information, at most as many as unknowns."""
-    return rows if len(rows) < rows.shape[1] else compress(rows)
-
-
-def stack_by_group(rows: Array, group: IntArray, n_groups: int) -> Array:
-    """Stack rows (n, r, c) of members by group: (n_groups, largest * r, c), padded with zeros."""
-    count = np.bincount(group, minlength=n_groups)
-    slot = np.zeros(len(group), dtype=np.intp)
-    order = np.argsort(group, kind="stable")
-    slot[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
-    largest = int(count.max(initial=0))
-    stacked = np.zeros((n_groups, largest, *rows.shape[1:]))
-    stacked[group, slot] = rows
-    return stacked.reshape(n_groups, largest * rows.shape[1], rows.shape[2])

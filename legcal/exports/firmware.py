@@ -27,7 +27,7 @@ from legcal.machine.configurations import random_poses
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.machine.firmware_files import read_delta
 from legcal.machine.model import Machine, vectors_A_to_B
-from legcal.pages.svg import BLUE, DIM, GREY, Canvas, ticks
+from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
 
 DIGITS = 7  # decimals of a number [mm, deg]
@@ -82,11 +82,12 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
     readings, poses = _poses_to_print(mount)
     seen = _Seen(mount.steps(readings), mount.nozzle(poses))
     fit = _nearest(firmware, mount.start, seen)
-    names = [actuator.joint for actuator in mount.actuators]
     texts = {key: number_text(value) for key, value in firmware.values(fit).items()}
     texts["M669 A0"] = number_text(mount.lowest)
     lines = re.sub(r"\{(.+?)\}", lambda key: texts[key[1]], firmware.lines)
-    ideal = read_delta(path, f"; {firmware.title}\n{lines}" if "M66" in lines else lines)
+    mark = ";" if "M66" in lines else "#"
+    head = f"{mark} {firmware.title} of {comment(subject.name)}, written by legcal {__version__}.\n"
+    ideal = read_delta(path, f"{head}{lines}")
     after, frame = _placed(ideal, seen)
     before = None
     if subject.nominal is not None:
@@ -102,28 +103,21 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
             f"With the numbers of the nominal model it is off by {describe_errors(before)}."
         )
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
-    if mount.is_turned or moved > 1e-3 or turned > 1e-3:
-        sentences.append(
-            f"Its frame is {moved:.3g} mm and {turned:.3g} deg from "
-            + ("the base link turned so that its towers stand as in the firmware"
-               if mount.is_turned else "the base link")
-            + "."
-        )  # fmt: skip
-    letters = "ABC" if firmware.name == "klipper" else "XYZ"
-    sentences.append(
-        "Towers: "
-        + ", ".join(f"{a} is '{comment(b)}'" for a, b in zip(letters, names, strict=True))
-        + "; the endstops are where their travel ends at the top."
-    )
+    ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
+    ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
+    ways += [f"with z = 0 {mount.lift:g} mm below, where the bed may be"] * bool(mount.lift)
+    if ways:
+        sentences.append(f"Its frame is the base link, {', '.join(ways)}.")
+    motors = zip(firmware.motors, mount.actuators, strict=True)
+    named = ", ".join(f"{motor} is '{comment(actuator.joint)}'" for motor, actuator in motors)
+    sentences.append(f"Motors: {named}; the endstops are where their travel ends at the top.")
     if gains := other_gains(machine):
         sentences.append(
             f"Motors move by their steps times {gains}: divide the steps per mm (rotation_distance "
             "multiplied) by it first, these numbers assume it done."
         )
     sentences.append(f"To use it, {firmware.after}.")
-    mark = "#" if firmware.name == "klipper" else ";"
-    head = [f"{firmware.title} of {comment(subject.name)}, written by legcal {__version__}."]
-    text = "".join(f"{mark} {line}\n" for line in [*head, *sentences]) + f"\n{lines}"
+    text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
     picture = picture_of(firmware.title, seen.nozzle, after, before)
     return Rendered(
         (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
@@ -151,6 +145,7 @@ class _Mounted:
     tops: Array  # (3,) readings at the endstops [m or rad]
     signs: Array  # (3,) 1 where readings grow upwards
     start: IdealDelta
+    lift: float = 0.0  # of the origin of the base link over z = 0 [mm]
 
     @property
     def _columns(self) -> list[int]:
@@ -177,7 +172,20 @@ class _Mounted:
 
     def nozzle(self, poses: Array) -> Array:
         """Return the origin of the platform link (k, 3) at poses [mm]."""
-        return np.asarray(_MM * poses[:, :, 3] @ self.frame)
+        return np.asarray(_MM * poses[:, :, 3] @ self.frame + [0.0, 0.0, self.lift])
+
+    def over_bed(self) -> _Mounted:
+        """Return it with z = 0 under the whole workspace, where its motors are not above z = 0."""
+        start = self.start
+        if (start.height if start.turns else start.stop).min() > 0.0:
+            return self
+        lift = float(np.ceil(-start.positions(np.full((1, TOWERS), self.lowest))[0, 2]))
+        raised = replace(
+            start,
+            height=start.height + lift * start.turns,
+            stop=start.stop + lift * (not start.stops_are_motors),
+        )
+        return replace(self, start=raised, lift=lift)
 
 
 def _joint(actuator: Actuator | None) -> str | None:
@@ -226,21 +234,21 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     start = IdealDelta(
         firmware.turns,
         radius=np.array([np.linalg.norm(row.across) for row in rows]),
-        angle=nominal + off if "angle" in firmware.nominal else angles % 360.0,
+        angle=nominal + off if "angle" in firmware.nominal else np.round(angles, 9) % 360.0,
         rod=np.array([row.rod for row in rows]),
         arm=np.array([row.arm for row in rows]),
         height=np.array([row.height for row in rows]),
         stop=np.array([row.stop for row in rows]),
-        stops_at_angles=True,
+        stops_are_motors=True,
     )
-    if not firmware.stops_at_angles:  # the nozzle centred, under each tower's own endstop
+    if not firmware.stops_are_motors:  # the nozzle centred, under each tower's own endstop
         C = start.joints(start.stop[None])[0]
         across = np.linalg.norm(C[:, :2], axis=1)
         start = replace(
-            start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_at_angles=False
+            start, stop=C[:, 2] - np.sqrt(start.rod**2 - across**2), stops_are_motors=False
         )
     start = firmware.ideal(firmware.values(start))
-    return _Mounted(
+    mounted = _Mounted(
         machine,
         frame,
         is_turned,
@@ -249,6 +257,8 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         np.array([row.sign for row in rows]),
         start,
     )
+    has_height = any(p.field == "height" for p in firmware.parameters)
+    return mounted.over_bed() if has_height or not firmware.turns else mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,12 +297,12 @@ class _Row:
 
 
 def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
-    """Return readings (k, n_legs) and poses (k, 3, 4) within the reach of the firmware."""
+    """Return readings (k, n_legs) and poses (k, 3, 4) where a Delta is used."""
     readings, motions = random_poses(mount.machine, N_POSES, SEED)
-    poses = stacked(motions)
-    off = np.linalg.norm(mount.nozzle(poses)[:, :2], axis=1)
-    inside = off <= max(mount.start.reach, float(np.sort(off)[LEAST_POSES]))
-    return readings[inside], poses[inside]
+    usual = mount.start.is_usual(mount.start.at_stops - mount.steps(readings))
+    if usual.sum() < LEAST_POSES:
+        usual[:] = True
+    return readings[usual], stacked(motions)[usual]
 
 
 # --- least squares ------------------------------------------------------------------------------
@@ -369,8 +379,10 @@ def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) ->
     middle = 0.5 * (nozzle.min(axis=0) + nozzle.max(axis=0))
     scale = (side - 2.0 * edge) / max(float(np.ptp(nozzle[:, :2], axis=0).max()), 1e-6)
     most = max(float(np.linalg.norm(errors, axis=1).max()) for _, errors in panels)
-    longest = max(next(iter(ticks(0.0, max(most, 1e-6), 1)[::-1])), 1e-9)
-    magnified = 40.0 / longest
+    power = 10.0 ** np.floor(np.log10(max(most, 1e-6)))
+    lengths = power * np.array([1.0, 2.0, 5.0])
+    longest = float(lengths[lengths <= max(most, power)].max())
+    magnified = 30.0 / longest
     for k, (label, errors) in enumerate(panels):
         at = np.array([side * (k + 0.5), 0.5 * side])
         canvas.text(side * k + 12.0, 20.0, f"{label}: {describe_errors(errors)}")

@@ -22,7 +22,7 @@ from legcal.exports.firmware import (
     picture_of,
 )
 from legcal.exports.identifiers import comment
-from legcal.exports.linuxcnc import linuxcnc_refusal
+from legcal.exports.linuxcnc import hexapod_refusal
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
@@ -38,7 +38,7 @@ _N = len(SIDES) + 1 + 3  # unknowns of a rig: sides, length, centre of rotation
 
 def flypt_refusal(subject: Subject) -> str | None:
     """Return the reason for refusing a machine other than a hexapod, or None."""
-    refusal = linuxcnc_refusal(subject)
+    refusal = hexapod_refusal(subject)
     return (
         None if refusal is None else refusal.split("; ")[0].replace("genhexkins", "LinearHexapod")
     )

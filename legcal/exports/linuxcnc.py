@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.exports.firmware import firmware_files, firmware_refusal
 from legcal.exports.identifiers import comment
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.machine.leg import LegKind
@@ -21,24 +22,22 @@ from legcal.version import __version__
 
 N_STRUTS = 6
 _MM = 1e3
-_PARALLEL = 0.99  # least cosine between the rails of a linear Delta
 
 
 def linuxcnc_refusal(subject: Subject) -> str | None:
+    """Return the reason for refusing a machine that no kinematics of LinuxCNC are like, or None."""
+    refusal = hexapod_refusal(subject)
+    of_deltas = firmware_refusal("linuxcnc")(subject)
+    return None if of_deltas is None else refusal and f"{refusal}, or a Delta with three motors"
+
+
+def hexapod_refusal(subject: Subject) -> str | None:
     """Return the reason for refusing a machine unsupported by genhexkins, or None."""
     machine, legs = subject.machine, subject.machine.legs
     needed = "needed six legs with motors between universal and spherical joints (genhexkins)"
     if machine.actuators:
         motor = machine.actuators[0]
-        delta = "rotarydeltakins" if motor.turns else "lineardeltakins"
-        ideal = (
-            f"; {delta} has the dimensions of an ideal Delta and no others: leave the controller "
-            "those of the nominal model and take the correction"
-        )
-        upright = all(abs(actuator.axis @ motor.axis) > _PARALLEL for actuator in machine.actuators)
-        is_delta = machine.mobility == len(machine.actuators) == 3 and len(legs) == N_STRUTS
-        is_delta &= motor.turns or upright
-        return f"found that the motor '{motor.joint}' moves joints at A, {needed}{ideal * is_delta}"
+        return f"found that the motor '{motor.joint}' moves joints at A, {needed}"
     if len(legs) != N_STRUTS:
         return f"found {len(legs)} legs, {needed}"
     others = [
@@ -52,6 +51,8 @@ def linuxcnc_refusal(subject: Subject) -> str | None:
 def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
+    if machine.actuators:
+        return firmware_files("linuxcnc")(subject, options, path)
     home = readings_at(machine, machine.home)
     pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
     lines = [

@@ -86,6 +86,12 @@ def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
     return labels if len(set(labels.values())) == len(labels) else {name: name for name in labels}
 
 
+def legs_in_words(legs: Sequence[int], leg_names: Sequence[str]) -> str:
+    """Return legs as a sentence names them: ``legs 1, 2 and 5``."""
+    labels = leg_labels(leg_names)
+    return f"leg{'s' * (len(legs) > 1)} {list_in_words([labels[leg_names[j]] for j in legs])}"
+
+
 def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
     """Return the parameters of a direction in words: ``z of platform joints 2 and 4 together``.
 

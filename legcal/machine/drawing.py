@@ -24,6 +24,7 @@ AXIS_COLOURS = ("#c62828", "#2e7d32", "#1565c0")  # x, y, z
 _PANEL = (5.0, 5.0)  # size of a panel [inch]
 _ARM = 0.1  # length of the axes of a frame, relative to the machine
 _CARRIAGE = 0.06  # length of a carriage, relative to its travel
+_STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
 _RING = 140.0  # area of rings around joints that define R_b and R_e [pt^2]
 
 
@@ -89,10 +90,26 @@ def corners_of_base(A: Array, anchors: Array) -> Array:
     return anchors if len(anchors) > 2 else A
 
 
-def around(joints: Array) -> Array:
-    """Return joints (n, 2) ordered by angle about their centroid."""
-    away = joints - joints.mean(axis=0)
-    return np.asarray(joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))])
+def around(points: Array) -> list[int]:
+    """Return the rim of joints (n, 2 or 3), ordered about their centroid, the first twice.
+
+    Inner joints, such as of a leg in the middle, are left out.
+    """
+    away = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(away)
+    flat = away @ axes[:2].T
+    order = np.argsort(np.arctan2(flat[:, 1], flat[:, 0])).tolist()
+    least = -_STRAIGHT * np.ptp(flat, axis=0).max() ** 2
+    k = 0
+    while k < len(order) and len(order) > 3:
+        before, here, after = (flat[order[(k + i) % len(order)]] for i in (-1, 0, 1))
+        (a, b), (c, d) = here - before, after - here
+        if a * d - b * c < least:
+            del order[k]
+            k = 0
+        else:
+            k += 1
+    return [*order, order[0]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +174,7 @@ def _draw(sketch: Sketch, panel: Panel, ax: Axes) -> None:
     size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
     for joints, colour in ((1e3 * panel.rim, BASE_COLOUR), (B, PLATFORM_COLOUR)):
         if panel.is_plan:
-            ax.fill(*around(joints).T, facecolor=colour, edgecolor=colour, alpha=0.08)
+            ax.fill(*joints[around(joints)].T, facecolor=colour, edgecolor=colour, alpha=0.08)
     for lines, width in ((panel.standing, 1.5), (panel.moving, 4.0)):
         for ends in lines:
             ax.plot(*(1e3 * ends).T, color=MOTOR_COLOUR, linewidth=width, alpha=0.8)

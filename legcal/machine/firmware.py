@@ -17,6 +17,9 @@ that they add up to these numbers, which :data:`FIRMWARES` lists:
   arms) and M666, whose values raise endstops, of arms in degrees.
 - Marlin: ``module/delta.cpp``, ``M665.cpp``, ``M666.cpp``: after its endstop a carriage moves by
   the value of M666, which is negative or zero.
+- LinuxCNC: ``lineardeltakins`` and ``rotarydeltakins`` (``lineardeltakins-common.h``,
+  ``rotarydeltakins-common.h``), which know no towers but regular ones; arms have z = 0 at their
+  shafts and count downwards.
 """
 
 from __future__ import annotations
@@ -27,9 +30,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 
 TOWERS = 3
+FLATTEST = 20.0  # [deg] of a rod from the horizontal at the edge of the bed
 _ALL = (0, 1, 2)
 FIELDS = ("radius", "angle", "rod", "arm", "height", "stop")
 
@@ -44,8 +48,8 @@ class IdealDelta:
     rod: Array
     arm: Array
     height: Array  # of shoulders
-    stop: Array  # height of the centred nozzle at the endstop; of ``stops_at_angles`` the motor
-    stops_at_angles: bool = False
+    stop: Array  # height of the centred nozzle at the endstop; of ``stops_are_motors`` the motor
+    stops_are_motors: bool = False
 
     @property
     def out(self) -> Array:
@@ -56,17 +60,12 @@ class IdealDelta:
     @property
     def at_stops(self) -> Array:
         """The positions (3,) of the motors at their endstops."""
-        if self.stops_at_angles:
+        if self.stops_are_motors:
             return self.stop
         centred = np.zeros((TOWERS, 3))
         centred[:, 2] = self.stop
         # Firmwares take the radius without corrections of single towers for a centred nozzle.
         return np.asarray(np.diagonal(self.motors(centred)))
-
-    @property
-    def reach(self) -> float:
-        """The radius of the workspace, as Klipper limits it."""
-        return float(min(np.min(self.radius + self.arm), np.min(self.rod - self.radius)))
 
     def joints(self, motors: Array) -> Array:
         """Return the upper joints of the rods (k, 3, 3) with motors (k, 3)."""
@@ -97,6 +96,11 @@ class IdealDelta:
         y = (rod[0] ** 2 - rod[2] ** 2 + i**2 + j**2 - 2.0 * i * x) / (2.0 * j)
         z = np.sqrt(np.maximum(rod[0] ** 2 - x**2 - y**2, 0.0))
         return np.asarray(C[:, 0] + x[:, None] * ex + y[:, None] * ey - z[:, None] * ez)
+
+    def is_usual(self, motors: Array) -> BoolArray:
+        """Return where (k,) all rods hang as steeply as Deltas are built for."""
+        down = self.joints(motors)[:, :, 2] - self.positions(motors)[:, 2:]
+        return np.asarray((down >= np.sin(np.radians(FLATTEST)) * self.rod).all(axis=1))
 
     def motors(self, positions: Array) -> Array:
         """Return the motors (k, 3) at positions of the nozzle (k, 3), NaN out of reach."""
@@ -132,11 +136,12 @@ class Firmware:
     title: str
     parameters: tuple[Parameter, ...]
     nominal: Mapping[str, tuple[float, ...]]  # numbers that parameters are added to
-    motors: str  # the names of its motors
+    motors: tuple[str, ...]  # their names
     lines: str  # to paste, with parameters by key
     after: str  # what the owner does with them
     turns: bool = False
-    stops_at_angles: bool = False
+    stops_are_motors: bool = False
+    counts_down: bool = False  # its motors, unlike those of IdealDelta
     least: frozenset[str] = field(default_factory=frozenset)  # shared as the least of the towers
 
     def ideal(self, values: Mapping[str, float]) -> IdealDelta:
@@ -145,7 +150,7 @@ class Firmware:
         fields |= {name: np.array(start) for name, start in self.nominal.items()}
         for p in self.parameters:
             fields[p.field][list(p.towers)] += p.sign * values[p.key]
-        return IdealDelta(self.turns, **fields, stops_at_angles=self.stops_at_angles)
+        return IdealDelta(self.turns, **fields, stops_are_motors=self.stops_are_motors)
 
     def values(self, ideal: IdealDelta) -> dict[str, float]:
         """Return the values of the parameters of a Delta: shared ones first, as means."""
@@ -175,10 +180,13 @@ class Firmware:
         fields = {name: np.array(getattr(ideal, name)) for name in FIELDS}
         for (name, towers), change in zip(self.free(), step.tolist(), strict=True):
             fields[name][list(towers)] += change
-        return IdealDelta(ideal.turns, **fields, stops_at_angles=ideal.stops_at_angles)
+        return IdealDelta(ideal.turns, **fields, stops_are_motors=ideal.stops_are_motors)
 
 
 _KLIPPER = "abc"
+_STEPPERS = tuple(f"stepper_{letter}" for letter in _KLIPPER)
+_TOWERS = tuple(f"tower_{letter}" for letter in "xyz")
+_JOINTS = tuple(f"joint_{i}" for i in range(TOWERS))
 _LINEAR = {"angle": (210.0, 330.0, 90.0)}
 
 
@@ -229,14 +237,28 @@ def _list(code: str, of_field: str) -> tuple[Parameter, ...]:
     )
 
 
-_PROBE = (
-    "photographs do not see the bed: probe it once more (heights of the endstops alone, not radius "
-    "and rods)"
-)
+_BED = "photographs do not see the bed: "
 _KLIPPER_AFTER = (
     "replace the same lines of printer.cfg and those of its SAVE_CONFIG block, then RESTART and "
-    "G28; " + _PROBE
+    f"G28; {_BED}level it by a bed_mesh, because DELTA_CALIBRATE replaces radius and angles"
 )
+_DUET_AFTER = (
+    "replace the same values in config.g and delete those of config-override.g, then M999 and "
+    f"G28; {_BED}calibrate the endstops alone (G30 S3)"
+)
+
+_LINUXCNC_AFTER = (
+    "put the setp lines into the HAL file and HOME_OFFSET into the INI file, where joints home at "
+    f"the ends of the travel at the top; {_BED}set z = 0 by a G54 offset"
+)
+
+
+def _linuxcnc_lines(module: str, *pins: str) -> str:
+    pin_lines = [f"setp {module}.{pin} {{{module}.{pin}}}" for pin in pins]
+    joint_lines = [f"# [JOINT_{i}]\n# HOME_OFFSET = {{JOINT_{i}.HOME_OFFSET}}" for i in _ALL]
+    units = "\n# For the INI file:\n# [TRAJ]\n# LINEAR_UNITS = mm"
+    return "\n".join([*pin_lines, units, *joint_lines, ""])
+
 
 FIRMWARES = (
     Firmware(
@@ -247,7 +269,7 @@ FIRMWARES = (
             *_klipper(_TOWER_KEYS, _LINEAR["angle"]),
         ),
         {},
-        "stepper_{}",
+        _STEPPERS,
         _klipper_lines(_TOWER_KEYS, "kinematics: delta\ndelta_radius: {printer.delta_radius}\n"),
         _KLIPPER_AFTER,
     ),
@@ -260,7 +282,7 @@ FIRMWARES = (
             *_klipper(_ARM_KEYS, (30.0, 150.0, 270.0)),
         ),
         {},
-        "stepper_{}",
+        _STEPPERS,
         _klipper_lines(
             _ARM_KEYS,
             "kinematics: rotary_delta\nshoulder_radius: {printer.shoulder_radius}\n"
@@ -280,11 +302,10 @@ FIRMWARES = (
             *_by_tower("M666", "XYZ", "stop"),
         ),
         _LINEAR,
-        "tower_{}",
+        _TOWERS,
         "M665 L{M665 L0}:{M665 L1}:{M665 L2} R{M665 R} H{M665 H} X{M665 X} Y{M665 Y} Z{M665 Z}\n"
         "M666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "replace the same values in config.g and delete those of config-override.g, then M999 and "
-        "G28; " + _PROBE,
+        _DUET_AFTER,
     ),
     Firmware(
         "reprapfirmware",
@@ -299,14 +320,13 @@ FIRMWARES = (
             *_by_tower("M666", "XYZ", "stop"),
         ),
         _LINEAR,
-        "tower_{}",
+        _TOWERS,
         "M669 K10 R{M669 R} U{M669 U0}:{M669 U1}:{M669 U2} L{M669 L0}:{M669 L1}:{M669 L2} "
         "H{M669 H0}:{M669 H1}:{M669 H2} A{M669 A0}:{M669 A1} X{M669 X} Y{M669 Y} Z{M669 Z}\n"
         "M666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "replace the same values in config.g and delete those of config-override.g, then M999 and "
-        "G28; " + _PROBE,
+        _DUET_AFTER,
         turns=True,
-        stops_at_angles=True,
+        stops_are_motors=True,
     ),
     Firmware(
         "marlin",
@@ -324,11 +344,45 @@ FIRMWARES = (
             *_by_tower("M666", "XYZ", "stop", -1.0),
         ),
         _LINEAR,
-        "tower_{}",
+        _TOWERS,
         "M665 L{M665 L} R{M665 R} H{M665 H} A{M665 A} B{M665 B} C{M665 C} X{M665 X} Y{M665 Y} "
         "Z{M665 Z}\nM666 X{M666 X} Y{M666 Y} Z{M666 Z}\n",
-        "send these lines, then M500 and G28 (with DELTA_RADIUS_TRIM_TOWER in Configuration.h left "
-        "out or zero); " + _PROBE,
+        "send these lines, then M500 and G28 (DELTA_RADIUS_TRIM_TOWER in Configuration.h must be "
+        f"zero or left out); {_BED}set its height alone (G33 P1) and level it (G29)",
         least=frozenset({"M665 H"}),
+    ),
+    Firmware(
+        "linuxcnc",
+        "LinuxCNC",
+        (
+            Parameter("lineardeltakins.R", "radius"),
+            Parameter("lineardeltakins.L", "rod"),
+            *(Parameter(f"JOINT_{i}.HOME_OFFSET", "stop", (i,)) for i in _ALL),
+        ),
+        {"angle": (90.0, 210.0, 330.0)},
+        _JOINTS,
+        _linuxcnc_lines("lineardeltakins", "R", "L"),
+        _LINUXCNC_AFTER,
+        stops_are_motors=True,
+    ),
+    Firmware(
+        "linuxcnc",
+        "LinuxCNC",
+        (
+            Parameter("rotarydeltakins.platformradius", "radius"),
+            Parameter("rotarydeltakins.footradius", "radius", sign=-1.0, is_fitted=False),
+            Parameter("rotarydeltakins.thighlength", "arm"),
+            Parameter("rotarydeltakins.shinlength", "rod"),
+            *(Parameter(f"JOINT_{i}.HOME_OFFSET", "stop", (i,), sign=-1.0) for i in _ALL),
+        ),
+        {"angle": (270.0, 30.0, 150.0)},
+        _JOINTS,
+        _linuxcnc_lines(
+            "rotarydeltakins", "platformradius", "footradius", "thighlength", "shinlength"
+        ),
+        _LINUXCNC_AFTER,
+        turns=True,
+        stops_are_motors=True,
+        counts_down=True,
     ),
 )

@@ -23,7 +23,14 @@ import numpy as np
 from legcal.errors import ModelError
 from legcal.geometry.types import Array
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
-from legcal.machine.hexapod_files import NUMBER, Table, flypt_table, linuxcnc_table
+from legcal.machine.hexapod_files import (
+    LINEAR_UNITS,
+    NUMBER,
+    Table,
+    flypt_table,
+    ini_entries,
+    linuxcnc_table,
+)
 
 EFFECTOR = 0.25  # typical radius of the joints on an effector, in radii of towers, or in arms
 SPACING = 1.4  # typical distance of the two rods of a tower, in radii of the effector
@@ -31,7 +38,7 @@ ROD = 0.01  # typical radius of a rod, in its length
 PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers, or in arms
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
-HOME = 0.4  # height of home, relative to that of the endstops
+DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
 
 
@@ -253,6 +260,25 @@ def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
     )
 
 
+def _linuxcnc(path: Path, text: str) -> Configuration | None:
+    """Return the numbers of the kinematics of Deltas in a HAL file, or one with its INI lines."""
+    found = re.findall(rf"^\s*setp\s+((\w+)deltakins\.\w+)\s+({NUMBER})", text, re.MULTILINE)
+    if not found:
+        return None
+    values = {pin: float(number) for pin, _, number in found}
+    entries = ini_entries(text)
+    for key, words in entries.items():
+        if number := re.match(NUMBER, words):
+            values[key] = float(number[0])
+    return Configuration(
+        _named("linuxcnc", turns=found[0][1] == "rotary"),
+        values,
+        unit=LINEAR_UNITS.get(entries.get("TRAJ.LINEAR_UNITS", "mm").lower()),
+        effector=values.get("rotarydeltakins.footradius") or None,
+        lowest=-values.get("JOINT_0.MAX_LIMIT", DOWN) if found[0][1] == "rotary" else None,
+    )
+
+
 # --- Deltas -------------------------------------------------------------------------------------
 
 _WORDS = {
@@ -299,7 +325,7 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
 
 
 def _needed(firmware: Firmware, p: Parameter) -> str:
-    if p.field == "stop" and firmware.stops_at_angles:
+    if p.field == "stop" and firmware.stops_are_motors:
         return "the lowest and highest angle of the arms"
     return _WORDS[p.field]
 
@@ -326,29 +352,29 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
             "motors that move the nozzle from there to the bed; correct the numbers of the "
             "endstops, or the unit of lengths."
         )
-    travels = np.stack([low, at_stops], axis=1).tolist()
-    names = [firmware.motors.format(letter) for letter in "abc"]
+    sense = -1.0 if firmware.counts_down else 1.0
+    travels = np.sort(sense * np.stack([low, at_stops], axis=1), axis=1).tolist()
     motors: list[dict[str, Any]] = [{"direction": [0, 0, 1], "travel": q} for q in travels]
     if ideal.turns:
         shafts = ((ideal.radius + r)[:, None] * out + centre).tolist()
         motors = [
             {"point": point, "axis": axis, "travel_deg": q}
-            for point, axis, q in zip(shafts, (-along).tolist(), travels, strict=True)
+            for point, axis, q in zip(shafts, (-sense * along).tolist(), travels, strict=True)
         ]
-    top = _nozzle_at(ideal, at_stops)[2]
+    ends = ideal.positions(np.stack([np.asarray(low), at_stops]))[:, 2]
     thick = float(np.round(ROD * np.mean(ideal.rod), 2))
     table = {
         "legcal_table": 1,
         "name": path.stem,
         "unit": unit,
         "type": f"6-{'R' if ideal.turns else 'P'}SS",
-        "actuators": dict(zip(names, motors, strict=True)),
-        "hangs_on": [name for name in names for _ in range(2)],
+        "actuators": dict(zip(firmware.motors, motors, strict=True)),
+        "hangs_on": [name for name in firmware.motors for _ in range(2)],
         "base_joints": (A[:, None] + both).reshape(6, 3).tolist(),
         "platform_joints": (r * out[:, None] + both).reshape(6, 3).tolist(),
         "lengths": np.repeat(ideal.rod, 2).tolist(),
         "radius": thick,
-        "home": {"xyz": [0, 0, float(np.round(HOME * top, 3))], "rpy_deg": [0, 0, 0]},
+        "home": {"xyz": [0, 0, float(np.round(ends.mean(), 3))], "rpy_deg": [0, 0, 0]},
     }
     assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
     assumed += [f"the rods of a tower {2.0 * pair:g} {unit} apart"]
@@ -359,12 +385,9 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
         f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
         "depends on these, the numbers of the firmware do not.",
         f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
-        f"{firmware.title} counts it, the endstop the upper end of the travel.",
+        f"{firmware.title} counts it, the endstop the {'lower' if sense < 0.0 else 'upper'} end of "
+        "the travel.",
     )
-
-
-def _nozzle_at(ideal: IdealDelta, motors: Array) -> Array:
-    return np.asarray(ideal.positions(motors[None])[0])
 
 
 def _lowest(read: Configuration, ideal: IdealDelta, size: float) -> Array:
@@ -409,7 +432,7 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             "rods that are longer than the radius, as a rule twice as long; write both in one "
             "unit, or correct them."
         )
-    elif not ideal.stops_at_angles and not (0.05 * rod < ideal.stop).all():
+    elif not ideal.stops_are_motors and not (0.05 * rod < ideal.stop).all():
         problems.append(
             f"{start} endstops {ideal.stop.min():g} {unit} over the bed with rods of "
             f"{rod.max():g} {unit}, needed the height of the nozzle at the endstops; write it in "
@@ -429,4 +452,5 @@ _DELTAS: Sequence[Callable[[Path, str], Configuration | None]] = (
     _klipper,
     _marlin_header,
     _g_code,
+    _linuxcnc,
 )

@@ -28,7 +28,7 @@ STRUTS = 6
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 Table = tuple[dict[str, Any], tuple[str, ...]]
 _TRAVEL = (0.8, 1.2)  # of the length at home, where limits are not stated
-_UNITS = {"mm": "mm", "metric": "mm", "cm": "cm", "in": "in", "inch": "in", "imperial": "in"}
+LINEAR_UNITS = {"mm": "mm", "metric": "mm", "cm": "cm", "in": "in", "inch": "in", "imperial": "in"}
 _UNSEEN = "No radius of the legs is stated: give --leg-radius, without which legs are invisible."
 
 
@@ -36,13 +36,14 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     """Return the table of a HAL file, or of an INI file with the HAL files that it names."""
     if not re.search(r"^\s*#?\s*\[(KINS|TRAJ|JOINT_\d)\]|^\s*setp\s+genhex", text, re.MULTILINE):
         return None
-    entries = _entries(text)
+    entries = ini_entries(text)
     kinematics = entries.get("KINS.KINEMATICS", "genhexkins").split()[0]
     if kinematics != "genhexkins":
         raise ModelError(
             f"{path}: the LinuxCNC configuration could not be used: found KINEMATICS = "
-            f"{kinematics}, needed genhexkins; describe another machine in a table, for which "
-            "legcal new --template writes a start."
+            f"{kinematics}, needed genhexkins, or the HAL file with the setp lines of "
+            "lineardeltakins or rotarydeltakins; describe another machine in a table (legcal new "
+            "--template)."
         )
     pins = text
     for name in re.findall(r"^\s*HALFILE\s*=\s*(\S+)", text, re.MULTILINE):
@@ -67,7 +68,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
             "the HAL file with these lines, or add them."
         )
     unit_word = entries.get("TRAJ.LINEAR_UNITS", "").split()
-    unit = _UNITS.get(unit_word[0].lower()) if unit_word else None
+    unit = LINEAR_UNITS.get(unit_word[0].lower()) if unit_word else None
     if unit_word and unit is None:
         raise ModelError(
             f"{path}: the unit could not be read: found LINEAR_UNITS = {unit_word[0]}, needed mm "
@@ -106,7 +107,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     return table, tuple(notes)
 
 
-def _entries(text: str) -> dict[str, str]:
+def ini_entries(text: str) -> dict[str, str]:
     """Return the entries of an INI file, by section; of a HAL file of legcal those of comments."""
     is_own = "written by legcal" in text
     section, entries = "", dict[str, str]()

@@ -7,7 +7,6 @@ frame axes are red (x), green (y) and blue (z). Rails, carriages and arms are br
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from html import escape
 
 import numpy as np
@@ -26,6 +25,7 @@ from legcal.machine.drawing import (
     sketch_of,
 )
 from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.pages.svg import Canvas
 
 _SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # panel, margin, title, text line [px]
 _ARM = 34.0  # length of the axis of a frame [px]
@@ -53,15 +53,10 @@ def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
     across, down = (1, len(views)) if in_page else (len(views), 1)
     foot = _HEAD + _SIDE * down
     width, height = _SIDE * across, foot + _LINE * (2 + (machine.n_legs + 3) // 4)
-    lines = [
-        f'<svg viewBox="0 0 {width:g} {height:g}" font-family="sans-serif" font-size="12"'
-        + f' xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}"'
-        * (not in_page)
-        + ">",
-        *([] if in_page else [_MARK.decode()]),
-        '<rect width="100%" height="100%" fill="white"/>',
-        _text((12, 20), f"{machine.name} at home", size=15),
-    ]
+    title = f"{machine.name} at home"
+    canvas = Canvas(width, height, title)
+    canvas.box(0.0, 0.0, width, height, "white")
+    canvas.text(12.0, 20.0, title, size=15)
     for k, panel in enumerate(views):
         ends = (panel.standing.reshape(-1, 2), panel.moving.reshape(-1, 2))
         corners = np.concatenate([panel.A, panel.B, *ends])
@@ -73,55 +68,58 @@ def draw_machine(machine: Machine, *, in_page: bool = False) -> str:
             return np.asarray(at + scale * (points - middle) * [1.0, -1.0])
 
         A, B = on_paper(panel.A), on_paper(panel.B)
-        lines.append(_text((left + 12, top), panel.title))
+        canvas.text(left + 12.0, top, panel.title)
         if panel.is_plan:
-            lines += [*_outline(on_paper(panel.rim), BASE_COLOUR), *_outline(B, PLATFORM_COLOUR)]
+            canvas.parts.append(_outline(on_paper(panel.rim), BASE_COLOUR))
+            canvas.parts.append(_outline(B, PLATFORM_COLOUR))
         for parts, thick in ((panel.standing, 2.0), (panel.moving, 6.0)):
             for part in parts:
-                start, end = on_paper(part)
-                lines.append(_line(start, end, MOTOR_COLOUR, thick, opacity=0.8))
+                start, end_of_part = on_paper(part)
+                canvas.segment(start, end_of_part, MOTOR_COLOUR, thick, 0.8)
         for j, (a, b) in enumerate(zip(A, B, strict=True)):
             thick = 2.0 * scale * sketch.radii[j]
-            lines.append(_line(a, b, LEG_COLOUR, max(thick, 1.5), opacity=0.7))
+            canvas.segment(a, b, LEG_COLOUR, max(thick, 1.5), 0.7)
         for end, joints, colour in (("base", A, BASE_COLOUR), ("platform", B, PLATFORM_COLOUR)):
-            lines += _joints(machine, end, joints, colour, is_plan=panel.is_plan)
+            _joints(canvas, machine, end, joints, colour, is_plan=panel.is_plan)
         for frame, (origin, *arms) in panel.frames:
             tips = origin + _ARM / scale * np.array(arms)
-            lines += _frame(frame, on_paper(np.vstack([origin, tips])))
-    lines += _legend(machine, scale, foot)
-    return "\n".join([*lines, "</svg>"]) + "\n"
+            _frame(canvas, frame, on_paper(np.vstack([origin, tips])))
+    _legend(canvas, machine, scale, foot)
+    if not in_page:
+        canvas.parts.insert(0, _MARK.decode())
+    return canvas.markup()
 
 
-def _outline(joints: Array, colour: str) -> Iterator[str]:
-    """Yield the polygon of joints, in the order of their angles about their centroid."""
-    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in around(joints))
-    yield (
+def _outline(joints: Array, colour: str) -> str:
+    """Return the polygon around joints."""
+    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in joints[around(joints)])
+    return (
         f'<polygon points="{corners}" fill="{colour}" fill-opacity="0.06" stroke="{colour}" '
         'stroke-opacity="0.5" stroke-dasharray="4 3"/>'
     )
 
 
 def _joints(
-    machine: Machine, end: str, joints: Array, colour: str, *, is_plan: bool
-) -> Iterator[str]:
-    """Yield discs with numbers and names, with a ring if they define the frames."""
+    canvas: Canvas, machine: Machine, end: str, joints: Array, colour: str, *, is_plan: bool
+) -> None:
+    """Draw discs with numbers and names, with a ring if they define the frames."""
     middle = joints.mean(axis=0)
     sign = 1.0 if end == "base" else -1.0  # numbers of the base outside or below
     for j, (x, y) in enumerate(joints):
         name = escape(printable(f"{machine.leg_names[j]}.{end}"))
-        yield (
+        canvas.parts.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}" data-joint="{name}">'
             f"<title>{name}</title></circle>"
         )
         if j in machine.frame_legs:
-            yield (
+            canvas.parts.append(
                 f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="none" stroke="{colour}" '
                 'stroke-width="1.5"/>'
             )
         away = np.array([x, y]) - middle if is_plan else np.array([0.0, 1.0])
         away = away / max(float(np.linalg.norm(away)), 1e-9) * sign
         at = (x + 17.0 * away[0], y + 17.0 * away[1] + 4.0)
-        yield _text(at, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
+        canvas.text(*at, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
 
 
 def joint_letter(end: str) -> str:
@@ -129,63 +127,33 @@ def joint_letter(end: str) -> str:
     return "A" if end == "base" else "B"
 
 
-def _frame(name: str, points: Array) -> Iterator[str]:
-    """Yield the axes of a frame: its origin and the ends of x, y and z."""
+def _frame(canvas: Canvas, name: str, points: Array) -> None:
+    """Draw the axes of a frame: its origin and the ends of x, y and z."""
     for axis, (end, colour) in enumerate(zip(points[1:], AXIS_COLOURS, strict=True)):
         if np.linalg.norm(end - points[0]) < 3.0:  # towards the viewer
             continue
-        yield _line(points[0], end, colour, 2.0)
-        at = points[0] + 1.2 * (end - points[0])
+        canvas.segment(points[0], end, colour, 2.0)
+        x, y = points[0] + 1.2 * (end - points[0])
         letter = f"{name} {'xyz'[axis]}" if axis == 0 else "xyz"[axis]
-        yield _text((at[0], at[1] - 2.0), letter, colour=colour, anchor="middle", size=11)
+        canvas.text(x, y - 2.0, letter, colour=colour, anchor="middle", size=11)
 
 
-def _legend(machine: Machine, scale: float, y: float) -> Iterator[str]:
-    """Yield a scale bar, and the numbers of the legs."""
+def _legend(canvas: Canvas, machine: Machine, scale: float, y: float) -> None:
+    """Draw a scale bar, and write the numbers of the legs."""
     step = _round_length(100.0 / scale)
-    yield _line((12, y), (12 + step * scale, y), BASE_COLOUR, 2.0)
-    yield _text((18 + step * scale, y + 4), f"{1e3 * step:g} mm")
+    canvas.line(12.0, y, 12.0 + step * scale, y, BASE_COLOUR, 2.0)
+    canvas.text(18.0 + step * scale, y + 4.0, f"{1e3 * step:g} mm")
     frame = ", ".join(str(j + 1) for j in machine.frame_legs)
     y += _LINE
-    yield _text(
-        (12, y + 6),
-        f"Rings: the joints of legs {frame} define R_b (base{machine.at_zero}) and R_e (platform).",
-    )
+    rings = f"legs {frame} define R_b (base{machine.at_zero}) and R_e (platform)."
+    canvas.text(12.0, y + 6.0, f"Rings: the joints of {rings}")
     for k in range(0, machine.n_legs, 4):
         y += _LINE
         names = [f"{j + 1} {machine.leg_names[j]}" for j in range(k, min(k + 4, machine.n_legs))]
-        yield _text((12, y + 8), ",  ".join(names))
+        canvas.text(12.0, y + 8.0, ",  ".join(names))
 
 
 def _round_length(length: float) -> float:
     """Return the largest length of 1, 2 or 5 times a power of ten that is not longer."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
-
-
-def _line(
-    start: Sequence[float] | Array,
-    end: Sequence[float] | Array,
-    colour: str,
-    thick: float,
-    opacity: float = 1.0,
-) -> str:
-    return (
-        f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}" '
-        f'stroke="{colour}" stroke-width="{thick:.1f}" stroke-opacity="{opacity:g}" '
-        'stroke-linecap="butt"/>'
-    )
-
-
-def _text(
-    at: Sequence[float],
-    text: str,
-    *,
-    colour: str = "#222222",
-    anchor: str = "start",
-    size: int = 12,
-) -> str:
-    return (
-        f'<text x="{at[0]:.1f}" y="{at[1]:.1f}" fill="{colour}" font-size="{size}" '
-        f'text-anchor="{anchor}">{escape(printable(text))}</text>'
-    )

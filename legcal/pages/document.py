@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import gzip
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -76,6 +76,7 @@ class Table:
     first: str = "first"  # adjective for the shown rows of too many: "worst"
     folded: bool = False
     sortable: bool = True
+    least: Mapping[int, int] = field(default_factory=dict)  # widths of columns of a narrow terminal
 
     @property
     def shown(self) -> Sequence[Sequence[Cell]]:

@@ -41,9 +41,21 @@ class Canvas:
         self, x1: float, y1: float, x2: float, y2: float, colour: str = RULE, width: float = 1.0
     ) -> None:
         """Draw a line."""
+        self.segment((x1, y1), (x2, y2), colour, width)
+
+    def segment(
+        self,
+        start: Sequence[float] | Array,
+        end: Sequence[float] | Array,
+        colour: str,
+        width: float,
+        opacity: float = 1.0,
+    ) -> None:
+        """Draw a line between two points."""
+        shown = f' stroke-opacity="{opacity:g}"' * (opacity < 1.0)
         self.parts.append(
-            f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{colour}" '
-            f'stroke-width="{width:g}"/>'
+            f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" y2="{end[1]:.1f}" '
+            f'stroke="{colour}" stroke-width="{width:.3g}"{shown}/>'
         )
 
     def box(
@@ -80,7 +92,7 @@ class Canvas:
         """Return the drawing."""
         label = escape(printable(self.title))
         return Markup(
-            f'<svg viewBox="0 0 {self.width:g} {self.height:g}" '
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
             f'width="{self.width:g}" height="{self.height:g}" role="img" aria-label="{label}" '
             f"{_FONT}>" + "".join(self.parts) + "</svg>"
         )

@@ -33,9 +33,9 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import (
     DISTORTION_MODELS,
     Camera,
-    distort_derivatives,
     intrinsic_names,
     intrinsic_values,
+    project_with_derivatives,
     with_intrinsics,
 )
 
@@ -250,11 +250,12 @@ def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residual
     if P[:, 2].min() <= 1e-9 or not (camera.K[0, 0] > 1.0 and camera.K[1, 1] > 1.0):
         nothing = np.full(shape, np.nan)
         return Residuals.of(nothing, np.zeros((*shape, n_kept)), np.zeros((*shape, 6)))
-    predicted, by_point = camera.project_with_derivative(P)
+    if names:
+        predicted, by_point, by_intrinsics = project_with_derivatives(camera, P, names)
+    else:
+        predicted, by_point = camera.project_with_derivative(P)
+        by_intrinsics = np.zeros((*shape, 0))
     by_turn = cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
     by_pose = np.concatenate([by_turn, by_point], axis=-1)
-    by_kept = by_point @ (R @ by_sheet)
-    if names:
-        by_intrinsics = distort_derivatives(camera, P[:, :2] / P[:, 2:], names)
-        by_kept = np.concatenate([by_intrinsics, by_kept], axis=-1)
+    by_kept = np.concatenate([by_intrinsics, by_point @ (R @ by_sheet)], axis=-1)
     return Residuals.of(predicted - seen.px, by_kept, by_pose)

@@ -511,14 +511,15 @@ def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | Non
 
     Arguments and result are those of :func:`shown_board`.
     """
-    telling = [one for one in seen if len(one.tags) >= _MIN_TAGS]
+    telling = [one for one in seen if len(np.unique(one.tags)) >= _MIN_TAGS]
     if not telling:
-        return board, ""
+        return _repeated_tag(board, seen)
     # Markers of a ChArUco board are on white squares; in the older pattern the first may be one.
     usual = 0 if board.kind == "charuco" and board.legacy and board.rows % 2 == 0 else 1
     stated = np.array([_mislaid(board, board.columns, usual, one) for one in telling])
     number, times = np.unique(np.concatenate([one.tags for one in telling]), return_counts=True)
-    last = int(number[times >= min(2, len(telling))].max(initial=0))
+    is_common = times >= min(2, len(telling))
+    last = int((number[is_common] if is_common.any() else number).max())
     n_agree, columns, parity = len(telling), board.columns, usual
     if 2 * np.count_nonzero(stated > _MISLAID) > len(telling):
         patterns = (1, 0) if board.kind == "charuco" else (1,)
@@ -539,6 +540,16 @@ def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | Non
     if (columns, parity) != (board.columns, usual) or rows > board.rows:
         return None, f"{what} in {in_all}"
     return board, _smaller(board, what, in_all) if rows < board.rows else ""
+
+
+def _repeated_tag(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
+    """Return no board if one tag fills an image, which is described; else the board."""
+    for one in seen:
+        number, times = np.unique(one.tags, return_counts=True)
+        if len(number) and times.max() >= _MIN_TAGS:
+            thing, k = _things(board)[:-1], number[int(np.argmax(times))]
+            return None, f"the same {thing} (number {k}) {times.max()} times in an image"
+    return board, ""
 
 
 def _n_tags(board: Board) -> int:

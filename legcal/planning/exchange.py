@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from legcal.calibration.joint_fit.predicted import KINEMATIC, Contributions
 from legcal.geometry.types import Array, IntArray
-from legcal.planning.information import KINEMATIC, Contributions
 from legcal.progress import Report, no_progress
 
 Criterion = Callable[

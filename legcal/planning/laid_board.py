@@ -15,9 +15,9 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.model import Machine
-from legcal.planning.sight import Bodies, behind_plate
 from legcal.vision.board import Board, dictionary, facing_board
 from legcal.vision.camera import Camera
+from legcal.vision.sight import Bodies, behind_plate
 from legcal.vision.visibility import in_picture, rays_past_axes
 
 _SIDES = 4  # directions beside the machine

@@ -13,17 +13,18 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.platform import PlatformError
+from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
+from legcal.calibration.quantities import mm_deg
 from legcal.files.motions import Pose
 from legcal.files.schema import Document, Number, Version
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
-from legcal.planning.information import PredictedNoise
 from legcal.planning.laid_board import LaidBoard
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, Setting
-from legcal.planning.sight import Seen
 from legcal.version import __version__
 from legcal.vision.camera import Camera
+from legcal.vision.sight import Seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +120,8 @@ class Plan:
         beside = f" beside those of {self.given}" if self.given else ""
         return (
             f"Expected of {self.n_images} photographs{beside}: predicted error "
-            f"{1e3 * self.error.mean_displacement:.3f} mm / "
-            f"{np.degrees(self.error.mean_rotation):.4f} deg (1 sigma) over the workspace, "
+            f"{mm_deg(self.error.mean_displacement, self.error.mean_rotation)} (1 sigma) over the "
+            "workspace, "
             f"the mean of {self.setting.draws} sessions with tripods up to "
             f"{1e2 * self.setting.shift:.2g} cm and {np.degrees(self.setting.turn):g} deg off and "
             f"the machine {1e3 * self.setting.length:.2g} mm."

@@ -13,12 +13,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.platform import poses_at_readings
+from legcal.calibration.joint_fit.predicted import (
+    Contributions,
+    Predictor,
+    predicted_outlines,
+)
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.geometry.motions import look_at
+from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import platforms_in_base
@@ -26,7 +30,6 @@ from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
 from legcal.planning.goals import Workspace, criterion_of, workspace_of
-from legcal.planning.information import Contributions, Predictor
 from legcal.planning.laid_board import LaidBoard, lying
 from legcal.planning.order import shortest_order, ways
 from legcal.planning.places import (
@@ -38,9 +41,9 @@ from legcal.planning.places import (
 )
 from legcal.planning.planned_session import Plan, PlannedView, pose_labels
 from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
-from legcal.planning.sight import Bodies, Seen, visible_parts
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
+from legcal.vision.sight import Bodies, Seen, visible_parts
 from legcal.vision.visibility import in_picture, least_length
 from legcal.workers import Run, in_turn
 
@@ -113,9 +116,21 @@ class Scene:
         """Draw a machine within tolerance."""
         return cls(task, drawn_legs(task.predictor.legs, task.setting, rng))
 
+    def bodies(self, poses: Sequence[RigidTransform]) -> Bodies:
+        """Place legs and arms at poses T_Rb_Re."""
+        machine, (R, t) = self.task.machine, components(poses)
+        return Bodies.at(
+            self.legs,
+            R,
+            t,
+            machine.size,
+            T_base_Rb=machine.T_base_Rb,
+            occluders=machine.occluders,
+        )
+
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return the parts visible at poses T_Rb_Re; *surely*: for all tripods in tolerance."""
-        bodies = Bodies.at(self.task.machine, self.legs, poses)
+        bodies = self.bodies(poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
         return visible_parts(self.task.predictor.camera, T, bodies, margin)
@@ -132,7 +147,7 @@ class Scene:
         laid, camera = self.task.laid, self.task.predictor.camera
         if laid is None:
             return np.ones(len(poses), dtype=np.bool_)
-        bodies = Bodies.at(self.task.machine, self.legs, poses)
+        bodies = self.bodies(poses)
         margin = self._margin(T, laid.corners) if surely else 0.0
         return laid.is_shown(camera, T, bodies, margin, is_read=is_read)
 
@@ -166,13 +181,14 @@ class Scene:
         with_board = is_shot or self.board_is_shown(T, poses, surely=surely)
         if not len(seen.leg) or not np.any(with_board):
             return None
-        outlines = seen.outlines(1.0, np.arange(n, dtype=np.intp))
+        predictor = self.task.predictor
+        outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp), predictor.noise)
         view = np.zeros(n, dtype=np.intp)
-        added = self.task.predictor.contributions(
+        added = predictor.contributions(
             {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit
         )
         if self.task.board is not None:
-            added = _tied_by_board(added, T)
+            added = added.tied_by_board({"here": T})
             added = replace(added, rows=added.rows * np.reshape(with_board, (-1, 1, 1)))
         if self.task.hand_held:  # one series of images of one camera
             added = replace(added, names=tuple(n.replace("here: ", "hand ") for n in added.names))
@@ -182,29 +198,6 @@ class Scene:
         """Return the information of the images of candidates."""
         poses = platforms_in_base(self.task.machine, candidates.poses.poses)
         return self.contributions(candidates.place.T_base_camera, poses, is_shot=is_shot)
-
-
-def _tied_by_board(contributions: Contributions, T_base_camera: RigidTransform) -> Contributions:
-    """Replace the camera pose of a view by the pose of a board on the base.
-
-    Camera poses relative to the board count as exact, so that all cameras share the six unknowns
-    of the board.
-    """
-    R = T_base_camera.rotation.as_matrix().T
-    camera_columns = [contributions.names.index(f"here: pose {k}") for k in range(6)]
-    rotation = block_diag(R, R)
-    rows, prior, names = (
-        contributions.rows.copy(),
-        contributions.prior.copy(),
-        list(contributions.names),
-    )
-    rows[..., camera_columns] = rows[..., camera_columns] @ rotation
-    prior[np.ix_(camera_columns, camera_columns)] = (
-        rotation.T @ prior[np.ix_(camera_columns, camera_columns)] @ rotation
-    )
-    for k, i in enumerate(camera_columns):
-        names[i] = f"board {k}"
-    return replace(contributions, rows=rows, prior=prior, names=tuple(names))
 
 
 def plan_session(
@@ -380,7 +373,7 @@ def _cause_of_invisibility(scene: Scene, T: RigidTransform, poses: Sequence[Rigi
     if len(scene.seen(T, poses, surely=True).leg):  # the board alone is missing
         is_in_view = scene.board_is_shown(T, poses, surely=True, is_read=False).any()
         return "small" if is_in_view else "board"
-    bodies = Bodies.at(scene.task.machine, scene.legs, poses).before(T)
+    bodies = scene.bodies(poses).before(T)
     points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
     if not in_picture(camera, points, bodies.nearest).any():
         return "elsewhere"

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.predicted import Predictor
+from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise, read_noise
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
@@ -18,8 +20,6 @@ from legcal.machine.kinematics import follow_each
 from legcal.machine.leg import SIGMA_LENGTH, SIGMA_READING
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.planning.information import DEFAULT_NOISE, PredictedNoise, Predictor
-from legcal.planning.noise import read_noise
 from legcal.planning.places import (
     MAX_ANGLE,
     MAX_DRAWS,

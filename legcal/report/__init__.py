@@ -1,5 +1,5 @@
 """Results of the jobs as text and as pages.
 
-Results of :mod:`legcal.calibration` or their documents become rich renderables with the tables of
-``render``, or HTML files (``page``).
+Results of :mod:`legcal.calibration` or their documents become reports of tables and lines
+(``render``), which a terminal and a page (``page.text_page``) show, or a page of their own.
 """

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
@@ -21,7 +20,8 @@ from legcal.calibration.summary import (
 )
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.parameter_id import ParameterId
-from legcal.report.render import report, table
+from legcal.pages.document import Table
+from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
     from legcal.calibration.change_detection import Explanation
@@ -34,7 +34,7 @@ _LARGEST = 5  # largest changes of parameters shown
 _EXPLANATIONS = 3  # alternative explanations shown
 
 
-def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> RenderableType:
+def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> Report:
     """Return one screen: verdict, platform, largest changes, weakest direction, notes.
 
     *verbose* adds all parameters in mm, degrees and pixels, and the quality of the fit.
@@ -63,7 +63,7 @@ def summary(calibration: Calibration, output: Path, *, verbose: bool = False) ->
     return report(*tables_of_result, [*sentences(result, verbose=True), written, verdict])
 
 
-def _platform(platform: PlatformBlock) -> RenderableType:
+def _platform(platform: PlatformBlock) -> Table:
     """Return the platform error before the calibration, and the predicted error after it."""
     after: PlatformBlock | WorkspaceAccuracy = platform.workspace or platform
     scope = "poses" if platform.workspace is None else "workspace"
@@ -80,7 +80,7 @@ def _platform(platform: PlatformBlock) -> RenderableType:
     )
 
 
-def _largest_changes(result: Result) -> RenderableType | None:
+def _largest_changes(result: Result) -> Table | None:
     """Return the lengths and coordinates that changed most, joints in the links."""
     others = [q for q in parameters_of(result) if not q.parameter.is_joint_coordinate]
     changes = [
@@ -99,7 +99,7 @@ def _largest_changes(result: Result) -> RenderableType | None:
     )
 
 
-def check_summary(check: Check) -> RenderableType:
+def check_summary(check: Check) -> Report:
     """Return the result of a check: movement, test and explanations."""
     movement, images = check.movement, check.dataset.measurements.n_rows
     lines = [
@@ -138,7 +138,7 @@ def _amount(explanation: Explanation) -> str:
     return ", ".join(parts)
 
 
-def accuracy_table(evaluation: Evaluation) -> RenderableType:
+def accuracy_table(evaluation: Evaluation) -> Report:
     """Return the platform errors and the parameters of two models, in mm and degrees."""
     dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
     headline = "Parameters only: the motors of a model do not determine its pose."
@@ -168,9 +168,9 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
     )
 
 
-def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
+def _joint_tables(evaluation: Evaluation) -> list[Text | Table]:
     """Return the joints of two models in the links of the first, and the distance of the frames."""
-    blocks: list[RenderableType] = []
+    blocks: list[Text | Table] = []
     for side, block in evaluation.links.items():
         rows = [
             (
@@ -197,7 +197,7 @@ def _joint_tables(evaluation: Evaluation) -> list[RenderableType]:
     return blocks
 
 
-def _left_out(evaluation: Evaluation) -> list[RenderableType]:
+def _left_out(evaluation: Evaluation) -> list[Text | Table]:
     """Return a table of the rows left out, if any."""
     n, rows = evaluation.n_left_out, evaluation.unreached
     if not n:

@@ -5,21 +5,20 @@ from __future__ import annotations
 from itertools import groupby
 from math import degrees
 
-from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
-from legcal.calibration.identify.predicted_observations import legs_in_words, views_in_words
 from legcal.calibration.identify.report import (
     BoardReport,
     CameraIntrinsics,
     Identifiability,
     Ranks,
     WeakDirection,
+    views_in_words,
 )
-from legcal.machine.directions import leg_labels, list_in_words
+from legcal.machine.directions import leg_labels, legs_in_words, list_in_words
+from legcal.pages.document import Table
+from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks
-from legcal.report.render import table
 from legcal.vision.board import Link
 
 CONDITIONS = {
@@ -38,7 +37,7 @@ _MAX_MENDED = 3
 _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
-def identify_table(report: Identifiability) -> RenderableType:
+def identify_table(report: Identifiability) -> Report:
     """Return an identifiability report as text, 80 columns wide."""
     return blocks(
         _heading(report),
@@ -76,7 +75,7 @@ def _heading(report: Identifiability) -> list[str]:
     return lines
 
 
-def _recommendation(report: Identifiability) -> list[str | RenderableType]:
+def _recommendation(report: Identifiability) -> list[Part]:
     """Return the sufficient sets of views."""
     if not report.recommendation:
         return ["No sufficient set of views was found; the report is for all legs in one view."]
@@ -133,7 +132,7 @@ def _two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
-def _scale(report: Identifiability) -> list[str | RenderableType]:
+def _scale(report: Identifiability) -> list[Part]:
     """Return the possible sources of scale with their precision."""
     rows = []
     for source in report.scale:
@@ -203,11 +202,11 @@ def _remedies(report: Identifiability) -> Table:
     return table("remedy", ">rank", "", rows=rows)
 
 
-def _verdict(report: Identifiability) -> list[str | RenderableType]:
+def _verdict(report: Identifiability) -> list[Part]:
     """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in report.full.weak)
     determined = f"the joint fit determines {report.full.rank} of {report.full.of} parameters"
-    lines: list[str | RenderableType] = []
+    lines: list[Part] = []
     if report.identifiable:
         undetermined = (
             f"; {harmless} undetermined directions do not move the platform" if harmless else ""
@@ -224,8 +223,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
         sigma = report.platform_sigma
         expected = (
             f"Predicted error of the platform (1 sigma): {_two_digits(1e3 * sigma.dX_m)} mm, "
-            f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
-            "at both ends of a leg."
+            f"{_two_digits(degrees(sigma.dE_rad))} deg."
         )
         lines.append(Text(expected, style="dim"))
         ways = [s.assumed for s in report.scale if s.sigma is not None and s.source != "radii"]

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
-from legcal.report.render import heading, report, table
+from legcal.calibration.camera_calibration.projection import CameraComparison
+from legcal.report.render import Report, heading, report, table
 from legcal.vision.camera import intrinsic_unit
 
 _OFTEN = 0.5  # smallest share of images with a leg without a remark
 
 
-def camera_table(calibration: CameraCalibration, output: Path) -> RenderableType:
+def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     """Return a calibrated camera and its file."""
     used = [image for image in calibration.images if image.rms_px is not None]
     camera = calibration.camera
@@ -54,6 +54,38 @@ def camera_table(calibration: CameraCalibration, output: Path) -> RenderableType
     )
 
 
+_PARTS = (("top left", "top", "top right"), ("left", "middle", "right"),
+          ("bottom left", "bottom", "bottom right"))  # fmt: skip
+
+
+def comparison_table(comparison: CameraComparison) -> RenderableType:
+    """Return the difference of two cameras in the nine parts of the image."""
+    px, pixels = comparison.px, comparison.pixels
+    worst = int(np.argmax(px))
+    cell = np.minimum((3.0 * pixels / (pixels.max(axis=0) + 1.0)).astype(np.intp), 2)
+    rows = []
+    for y, names in enumerate(_PARTS):
+        for x, name in enumerate(names):
+            inside = (cell[:, 0] == x) & (cell[:, 1] == y)
+            if not inside.any():
+                continue
+            rms = float(np.sqrt(np.mean(px[inside] ** 2)))
+            sigma = "" if comparison.sigma_px is None else (
+                f"{np.sqrt(np.mean(comparison.sigma_px[inside] ** 2)):.3f} px"
+            )  # fmt: skip
+            rows.append((name, f"{rms:.3f} px", sigma))
+    u, v = pixels[worst]
+    return report(
+        heading("difference", f": {np.sqrt(np.mean(px**2)):.3f} px (rms) over the image"),
+        table("part of the image", ">difference", ">sigma", rows=rows),
+        [
+            f"At most {px[worst]:.3f} px, at ({u:.0f}, {v:.0f}); {1e3 * comparison.off.max():.2g} "
+            f"mm at 1 m. A turn of {np.degrees(comparison.turn):.3f} deg is taken out, as the pose "
+            "of a camera takes it up."
+        ],
+    )
+
+
 def _model_and_sheet(calibration: CameraCalibration) -> str:
     """Return the lens model with its reason, and the shape of the board, in sentences."""
     cross_validation = (
@@ -64,13 +96,17 @@ def _model_and_sheet(calibration: CameraCalibration) -> str:
     k = int(np.argmax(np.abs(calibration.sheet[:3])))
     bend, sigma = 1e3 * abs(calibration.sheet[k]), 1e3 * calibration.sheet_sigma[k]
     wider, wider_sigma = 100.0 * calibration.sheet[3], 100.0 * calibration.sheet_sigma[3]
+    sigma_px = calibration.projection_sigma
+    middle, worst = sigma_px[6, 8], sigma_px[np.isfinite(sigma_px)].max()
     return (
-        f"Lens model {calibration.lens}{cross_validation}. The board is bent by {bend:.2g} +- "
-        f"{sigma:.2g} mm, and printed {wider:+.2g} +- {wider_sigma:.2g} % wider than high."
+        f"Lens model {calibration.lens}{cross_validation}. Pixels are known to {middle:.2g} px (1 "
+        f"sigma) in the middle of the image, {worst:.2g} px at worst. The board is bent by "
+        f"{bend:.2g} +- {sigma:.2g} mm, and printed {wider:+.2g} +- {wider_sigma:.2g} % wider than "
+        "high."
     )
 
 
-def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> RenderableType:
+def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Report:
     """Return the document of ``simulate``: the number of images of each view with each leg.
 
     *to_measure* is the distance that would fix the scale, if nothing in the dataset does.

@@ -7,7 +7,6 @@ from math import degrees
 from typing import Any
 
 import numpy as np
-from rich.console import RenderableType
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +14,8 @@ from legcal.calibration.location.document import Location
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
-from legcal.report.render import heading, report, table
+from legcal.pages.document import Table
+from legcal.report.render import Report, heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
@@ -28,7 +28,7 @@ def scale_option(machine: Machine, *, board: bool) -> str:
     return "" if rod is None else f" {machine.length_option}"
 
 
-def inspect_table(description: dict[str, Any]) -> RenderableType:
+def inspect_table(description: dict[str, Any]) -> Report:
     """Return the document of ``inspect`` as text, lengths in millimetres."""
     motors, mobility, legs = description["motors"], description["mobility"], description["legs"]
     verdict = "the motors determine the pose"
@@ -113,7 +113,7 @@ def _travel(limits: Sequence[float], turns: bool) -> str:
     return f"{scale * limits[0]:z.2f} to {scale * limits[1]:z.2f} {unit}"
 
 
-def _motors(description: dict[str, Any]) -> RenderableType:
+def _motors(description: dict[str, Any]) -> Table:
     """Return the motors that move joints of rods, with axis and travel."""
     rows = []
     for joint, motor in description["actuators"].items():
@@ -186,7 +186,7 @@ def _length(leg: dict[str, Any]) -> str:
     return q0 if leg["kind"] == "constant" else f"{q0} {'+' if leg['sign'] > 0 else '-'} q"
 
 
-def location_table(location: Location, written: Sequence[str]) -> RenderableType:
+def location_table(location: Location, written: Sequence[str]) -> Report:
     """Return base and tool with their residuals, in mm and degrees."""
     frames, sigma = [], location.sigma.reshape(2, 6)
     for i, (name, T) in enumerate(

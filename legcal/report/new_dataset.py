@@ -6,21 +6,21 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import RenderableType
 from rich.text import Text
 
 from legcal.data.new_dataset import NewDataset
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
+from legcal.pages.document import Table
 from legcal.recordings.importing import Import
 from legcal.report.machine import scale_option
-from legcal.report.render import heading, report, table
+from legcal.report.render import Report, heading, report, table
 
 _MOST = 200  # largest number of rows shown
 
 
-def matching_table(new: NewDataset) -> RenderableType:
+def matching_table(new: NewDataset) -> Report:
     """Return the interpretation of a folder and a table: columns, units, matched photographs."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
     joints = new.joints
@@ -72,7 +72,7 @@ def matching_table(new: NewDataset) -> RenderableType:
     )
 
 
-def written_lines(destination: Path, written: Sequence[Path], machine: Machine) -> RenderableType:
+def written_lines(destination: Path, written: Sequence[Path], machine: Machine) -> Report:
     """Return the written files and the next command."""
     names = ", ".join(path.name for path in written)
     folder, length = shlex.quote(str(destination)), scale_option(machine, board=False)
@@ -84,9 +84,9 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
     )
 
 
-def import_table(recording_import: Import) -> RenderableType:
+def import_table(recording_import: Import) -> Report:
     """Return the used frames of recordings, and the reasons for leaving out others."""
-    blocks: list[RenderableType | list[str] | list[Text]] = []
+    blocks: list[Text | Table | list[str] | list[Text]] = []
     for view in recording_import.views:
         stills = view.stills
         unused = [still for still in stills if still.why_not]

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
-from rich.console import RenderableType
 
 from legcal.errors import printable
 from legcal.figures import new_figure, plain
@@ -25,7 +24,7 @@ from legcal.planning.laid_board import LaidBoard
 from legcal.planning.planned_session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.page.text_page import text_page
-from legcal.report.render import heading, report, table
+from legcal.report.render import Report, heading, report, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +41,7 @@ _MOST_NAMES = 4  # largest number of names in one label
 _ROOM = 0.1  # margin around the drawing, relative to its width
 
 
-def plan_table(plan: Plan, output: Path | None) -> RenderableType:
+def plan_table(plan: Plan, output: Path | None) -> Report:
     """Return the views, distances and expected accuracy of a plan, and the written folder."""
     names = plan.machine.leg_names
     views = [

@@ -1,17 +1,76 @@
-"""The renderer of text tables and reports."""
+"""Reports: groups of tables and lines, shown on a terminal or, by ``page.text_page``, on a page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
-from rich.console import Group, RenderableType
-from rich.table import Table
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.table import Table as RichTable
 from rich.text import Text
 
-from legcal.errors import escaped, printable
-from legcal.pages import document
+from legcal.errors import escaped
+from legcal.pages.document import Cell, Number, Table
 
-Cells = Sequence[str | Text]
+Part = str | Text | Table
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report, which rich prints with an empty line between groups."""
+
+    groups: Sequence[Sequence[Text | Table]]
+
+    def __rich_console__(self, _: Console, __: ConsoleOptions) -> Iterator[RenderableType]:
+        for k, group in enumerate(self.groups):
+            if k:
+                yield Text()
+            for part in group:
+                yield _on_terminal(part) if isinstance(part, Table) else part
+
+
+def report(*blocks: Part | Report | Sequence[Part] | None) -> Report:
+    """Return a report of groups: single parts, several ones, or those of another report."""
+    groups: list[Sequence[Text | Table]] = []
+    for block in blocks:
+        if isinstance(block, Report):
+            groups += block.groups
+            continue
+        parts = [block] if isinstance(block, str | Text | Table) else block or ()
+        group = [p if isinstance(p, Table) else safe_text(p) for p in parts if p]
+        if group:
+            groups.append(group)
+    return Report(groups)
+
+
+def table(
+    *columns: str,
+    rows: Iterable[Sequence[str]],
+    title: str = "",
+    least: Mapping[int, int] | None = None,
+) -> Table:
+    """Return a table; a column whose name begins with ">" holds numbers, flush right.
+
+    ``least`` is the minimum width of columns on a narrow terminal.
+    """
+    words = [list(row) for row in rows]
+    cells = [
+        [
+            _number(word) if column.startswith(">") else word
+            for column, word in zip(columns, row, strict=True)
+        ]
+        for row in words
+    ]
+    # Sorting would separate continuation rows and headings from their rows.
+    is_flat = all(row[0] and any(row[1:]) for row in words)
+    return Table(columns, cells, title, sortable=is_flat, least=least or {})
+
+
+def heading(name: str, rest: str) -> Text:
+    """Return the heading of a report, the name in bold."""
+    return Text.assemble((escaped(name), "bold"), escaped(rest))
 
 
 def safe_text(text: str | Text) -> Text:
@@ -23,62 +82,29 @@ def safe_text(text: str | Text) -> Text:
     return Text(escaped(text))
 
 
-def table(
-    *columns: str,
-    rows: Iterable[Cells],
-    title: str = "",
-    least: Mapping[int, int] | None = None,
-) -> Table:
-    """Return a plain table; a column whose name begins with ">" holds numbers, flush right.
+def _number(word: str) -> Cell:
+    match = _NUMBER.match(word)
+    return Number(float(match[0]) if match else None, word)
 
-    ``least`` is the minimum width of columns on a narrow terminal.
-    """
-    text = Table(
-        title=safe_text(title) if title else None,
+
+def _on_terminal(table: Table) -> RichTable:
+    """Return a table without lines."""
+    text = RichTable(
+        title=safe_text(table.title) if table.title else None,
         title_justify="left",
         box=None,
         pad_edge=False,
         padding=(0, 2, 0, 0),
     )
-    for k, column in enumerate(columns):
+    for k, column in enumerate(table.columns):
         is_number = column.startswith(">")
         text.add_column(
             safe_text(column.removeprefix(">")),
             justify="right" if is_number else "left",
             overflow="fold",
             no_wrap=is_number,
-            min_width=(least or {}).get(k),
+            min_width=table.least.get(k),
         )
-    for row in rows:
-        text.add_row(*map(safe_text, row))
+    for row in table.rows:
+        text.add_row(*(safe_text(cell if isinstance(cell, str) else cell.text) for cell in row))
     return text
-
-
-def text_table(page_table: document.Table) -> Table:
-    """Return a table of a page as text; empty cells become dashes."""
-    rows = [
-        [cell if isinstance(cell, str) else cell.text for cell in row] for row in page_table.rows
-    ]
-    return table(
-        *page_table.columns,
-        rows=[[printable(text) or "-" for text in row] for row in rows],
-        title=page_table.title,
-    )
-
-
-def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None) -> Group:
-    """Return blocks one below the other, an empty line between; a block may have several lines."""
-    parts: list[RenderableType] = []
-    for block in blocks:
-        lines = [block] if isinstance(block, str) or not isinstance(block, Sequence) else [*block]
-        parts_of_block = [
-            safe_text(line) if isinstance(line, str | Text) else line for line in lines if line
-        ]
-        if parts_of_block:
-            parts += [Text(), *parts_of_block] if parts else parts_of_block
-    return Group(*parts)
-
-
-def heading(name: str, rest: str) -> Text:
-    """Return the heading of a report, the name in bold."""
-    return Text.assemble((escaped(name), "bold"), escaped(rest))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import RenderableType
 from rich.text import Text
 
-from legcal.report.render import report, table
+from legcal.report.render import Report, report, table
 
 _LABELS = {
     "initial": "before",
@@ -21,7 +20,7 @@ _COLUMNS = ("joints", ">dX [mm]", ">dE [deg]", ">parameters [mm]", ">of bound", 
 _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 
 
-def study_table(document: Mapping[str, Any]) -> RenderableType:
+def study_table(document: Mapping[str, Any]) -> Report:
     """Return the document of ``study paper`` as text, with the printed figures."""
     printed = document["as_printed"]
     rows, failures = [], []

@@ -1,4 +1,4 @@
-"""Shapes beside the legs: rims of base and platform, ellipsoids at joints, pyramids of cameras."""
+"""Shapes beside the legs: ellipsoids at joints, pyramids of cameras."""
 
 from __future__ import annotations
 
@@ -13,30 +13,6 @@ from legcal.geometry.types import Array
 if TYPE_CHECKING:
     from legcal.calibration.documents import Result
     from legcal.vision.camera import Camera
-
-_STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
-
-
-def around(points: Array) -> list[int]:
-    """Return the rim of joints (n, 3), ordered about their centroid, the first twice.
-
-    Inner joints, such as of a leg in the middle, are left out.
-    """
-    away = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(away)
-    flat = away @ axes[:2].T
-    order = np.argsort(np.arctan2(flat[:, 1], flat[:, 0])).tolist()
-    least = -_STRAIGHT * np.ptp(flat, axis=0).max() ** 2
-    k = 0
-    while k < len(order) and len(order) > 3:
-        before, here, after = (flat[order[(k + i) % len(order)]] for i in (-1, 0, 1))
-        (a, b), (c, d) = here - before, after - here
-        if a * d - b * c < least:
-            del order[k]
-            k = 0
-        else:
-            k += 1
-    return [*order, order[0]]
 
 
 def ellipsoids(result: Result) -> dict[str, Array]:

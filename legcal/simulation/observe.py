@@ -20,8 +20,9 @@ from legcal.errors import NotVisible
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, IntArray
 from legcal.simulation.solids import PosedMachine
-from legcal.simulation.visibility import Images, Viewpoint, silhouette
+from legcal.simulation.visibility import Images, Viewpoint
 from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 
 EXACT_PX = 1e-3  # stated standard deviation of outlines and corners without noise
 _MIN_UPRIGHT_AXIS = 1e-3  # component along the image y axis below which a leg has no point M_LS
@@ -94,10 +95,9 @@ def outlines_of(
                 )
                 u = (B - A) / np.linalg.norm(B - A)
                 axis = T.apply(A + np.array([[stretch.start], [stretch.end]]) * u)
-                line, offsets = silhouette(
-                    T.as_matrix()[:3, :3] @ u, axis[0], np.asarray(stretch.radius)
-                )
-                pixels = view.camera.project(axis[None] + offsets[:, None])
+                line = outlines_of_axis(T.as_matrix()[:3, :3] @ u, axis[0], stretch.radius)
+                steps = steps_to_outlines(line, stretch.radius)
+                pixels = view.camera.project(axis[None] + steps[:, None])
                 length = float(np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1).mean())
                 covariance = claimed.covariance(length)
                 if rng is not None and noise.sigma_px > 0.0:

@@ -1,4 +1,8 @@
-"""The visible parts of legs: silhouettes of cylinders, and unhidden stretches."""
+"""The visible parts of simulated legs: their stretches that no solid hides, by rays.
+
+This is what photographs show. The method predicts it from a model, in another way
+(:mod:`legcal.vision.sight`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,8 @@ from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
 from legcal.vision.camera import Camera
-from legcal.vision.visibility import least_length
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
+from legcal.vision.visibility import least_length, longest_runs
 
 MIN_SHARE = 0.4  # minimum share of a leg's length in one stretch
 SAMPLES = 96  # points along a leg
@@ -27,39 +32,6 @@ _RADIUS_TOLERANCE = 0.01  # maximum relative difference of radii without a visib
 _BESIDE = 0.01  # distance of tested points outside the outline, in radii
 _END_ON = 1.01  # distance of a camera from the axis, in radii, up to which a leg has no outline
 _IN_FRONT = 0.1  # minimum distance in front of an outline, in radii, of a hit that hides it
-
-
-def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
-    """Return the steps from an axis to the generating lines of its outlines.
-
-    The tangents to a circle of radius R with its centre at a distance d touch it R^2 / d in front
-    of the centre and R sqrt(1 - R^2 / d^2) beside it, whatever the point of the axis.
-    """
-    centre = A - u * np.sum(u * A, axis=-1, keepdims=True)
-    d = np.linalg.norm(centre, axis=-1, keepdims=True)
-    R = np.broadcast_to(np.asarray(radius, dtype=np.float64), d.shape[:-1])[..., None]
-    if not np.all(d > R):
-        raise NotVisible(
-            "A simulated leg could not be seen: found the camera centre "
-            f"{1e3 * float(d.min()):.1f} mm from its axis, inside the leg, needed one outside; "
-            "move the camera."
-        )
-    away = centre / d
-    aside = cross(u, away)
-    before = -(R * R / d) * away
-    beside = R * np.sqrt(1.0 - (R / d) ** 2) * aside
-    return np.stack([before - beside, before + beside], axis=-2)
-
-
-def silhouette(u: Array, A: Array, radius: Array) -> tuple[Array, Array]:
-    """Return outlines (..., 2, 3) of cylinders and offsets (..., 2, 3) of their generating lines.
-
-    An outline is the unit normal of the plane through the camera centre and the generating line,
-    signed as the moment u x P of a point P of that line, eq (3).
-    """
-    offsets = contact_offsets(u, A, radius)
-    moments = cross(u[..., None, :], A[..., None, :] + offsets)
-    return moments / np.linalg.norm(moments, axis=-1, keepdims=True), offsets
 
 
 @dataclass(frozen=True)
@@ -176,7 +148,8 @@ def _sampled(
     axis = A_camera[..., None, :] + s[..., None] * u_camera[..., None, :]
     from_axis = np.linalg.norm(cross(u_camera, A_camera), axis=-1)
     radius = np.where(from_axis[..., None] > _END_ON * radius, radius, 0.0)
-    offsets = contact_offsets(u_camera[..., None, :], axis, radius)
+    h = outlines_of_axis(u_camera[..., None, :], axis, radius)
+    offsets = steps_to_outlines(h, radius)
     pixels, inside = pixels_in_image(camera, axis[..., None, :] + offsets)
     return axis, offsets, radius, pixels, inside & (radius > 0.0)[..., None]
 
@@ -192,30 +165,20 @@ def _leg_view(
 ) -> LegView:
     """Return the visible part of a leg from the mask of its free samples."""
     middle, width = pixels.mean(axis=1), np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)
-    first, last = _longest(free)
+    first, last = map(int, longest_runs(free))
     if last <= first:
         return LegView(0.0, 0.0, ())
     share = round(float(s[last] - s[first]) / length, 9)  # 38 of 95 steps are MIN_SHARE, no less
     stretches = []
     for name in dict.fromkeys(names):
         chosen = free & np.array([sample_name == name for sample_name in names])
-        start, end = _longest(chosen)
+        start, end = map(int, longest_runs(chosen))
         least = least_length(width[[start, end]].mean())
         if name and end > start and np.linalg.norm(middle[end] - middle[start]) >= least:
             piece = float(radius[start]), float(s[start]), float(s[end])
             stretches.append(Stretch(leg, name, *piece))
     length_px = float(np.linalg.norm(middle[last] - middle[first]))
     return LegView(share, length_px, tuple(stretches))
-
-
-def _longest(chosen: BoolArray) -> tuple[int, int]:
-    """Return the first and the last index of the longest run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
-    if len(edges) == 0:
-        return 0, 0
-    starts, ends = edges[::2], edges[1::2] - 1
-    longest = int(np.argmax(ends - starts))
-    return int(starts[longest]), int(ends[longest])
 
 
 @lru_cache(maxsize=4096)  # many cameras look at one machine

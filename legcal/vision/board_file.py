@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, Strict, field_validator, model_validator
 
 from legcal.errors import DatasetError, UsageError
 from legcal.files.motions import MotionEntry
@@ -202,6 +202,29 @@ class AprilgridEntry(_BoardEntry):
         )
 
 
+class _ForeignTarget(FileSchema):
+    model_config = ConfigDict(extra="ignore")
+
+
+class KalibrAprilgrid(_ForeignTarget):
+    """An AprilGrid in the target file of Kalibr or Basalt."""
+
+    tagCols: Count
+    tagRows: Count
+    tagSize: Side
+    tagSpacing: Number
+
+
+class KalibrCheckerboard(_ForeignTarget):
+    """A chessboard in the target file of Kalibr, which counts inner corners."""
+
+    targetCols: Annotated[Count, Field(ge=3)]
+    targetRows: Annotated[Count, Field(ge=3)]
+    colSpacingMeters: Side
+    rowSpacingMeters: Side
+
+
+_SAME_SIDE = 1e-3  # largest relative difference of the sides of squares
 _KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
     "chessboard": ChessboardEntry,
     "charuco": CharucoEntry,
@@ -358,13 +381,39 @@ def read_board_file(path: Path) -> Board:
     if not os.path.isfile(path):
         kinds = "; ".join(FORMS.values())
         raise _refused(str(path), describe(str(path)), f"a YAML file or one of: {kinds}")
-    block = read_yaml(path, "board file").get("board")
-    if not isinstance(block, dict):
+    document = read_yaml(path, "board file")
+    block = document.get("board")
+    if isinstance(block, dict):
+        return parse_board(block, path).board
+    if "target_type" in document or "tagCols" in document:
+        return _kalibr_target(document, path)
+    raise DatasetError(
+        f"{path}: the board could not be read: found no block board, needed one as in "
+        "dataset.yaml, or a target of Kalibr or Basalt; add it."
+    )
+
+
+def _kalibr_target(document: Mapping[str, Any], path: Path) -> Board:
+    """Return the board of a target file of Kalibr, or of Basalt, which has AprilGrids only."""
+    kind = document.get("target_type", "aprilgrid")
+    if kind == "aprilgrid":
+        grid = validate(KalibrAprilgrid, document, path)
+        sides = {"tag_size": grid.tagSize, "tag_spacing": grid.tagSpacing}
+        numbers = {"tags_x": grid.tagCols, "tags_y": grid.tagRows, **sides}
+        return parse_board({"kind": kind, **numbers}, path).board
+    if kind != "checkerboard":
         raise DatasetError(
-            f"{path}: the board could not be read: found no block board, needed one as in "
-            "dataset.yaml; add it."
+            f"{path}: target_type could not be used: found {describe(kind)}, needed aprilgrid or "
+            "checkerboard; photograph such a board."
         )
-    return parse_board(block, path).board
+    inner = validate(KalibrCheckerboard, document, path)
+    x, y = inner.colSpacingMeters, inner.rowSpacingMeters
+    if abs(x / y - 1.0) > _SAME_SIDE:
+        raise DatasetError(
+            f"{path}: the board could not be used: found fields of {1e3 * x:g} x {1e3 * y:g} mm, "
+            "needed squares; photograph such a board."
+        )
+    return Board("chessboard", inner.targetCols + 1, inner.targetRows + 1, x)
 
 
 def _refused(spec: str, actual: str, needed: str) -> UsageError:

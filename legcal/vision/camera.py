@@ -41,7 +41,7 @@ class Distortion:
     undistort: Callable[[Array, Array, Array], Array]  # pixels to (x, y)
     # pixels (n, 1, 2), and their derivatives (2 n, 2 + 4 + m) by x and y, then by intrinsics
     with_derivatives: Callable[[Array, Array, Array], tuple[Array, Array]]
-    kalibr: tuple[str, ...] = ()  # its names in a camchain; these list four coefficients
+    aliases: tuple[str, ...] = ()  # its names in the files of other programs
     is_fisheye: bool = False  # distorts with all coefficients zero
 
 
@@ -88,14 +88,20 @@ _POLYNOMIAL = _polynomial_distort, _polynomial_undistort, _polynomial_derivative
 _FISHEYE = _fisheye_distort, _fisheye_undistort, _fisheye_derivatives
 DISTORTION_MODELS: Mapping[DistortionModel, Distortion] = {
     "plumb_bob": Distortion(
-        ("k1", "k2", "p1", "p2", "k3"), (0, 4, 5), 100.0, *_POLYNOMIAL, kalibr=("radtan", "none")
+        ("k1", "k2", "p1", "p2", "k3"), (0, 4, 5), 100.0, *_POLYNOMIAL, aliases=("radtan", "none")
     ),
     # The coefficients of numerator and denominator may cancel each other.
     "rational_polynomial": Distortion(
         ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), (8,), 1.0, *_POLYNOMIAL
     ),
+    "thin_prism": Distortion(
+        ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+        (12,),
+        1.0,
+        *_POLYNOMIAL,
+    ),
     "equidistant": Distortion(
-        ("k1", "k2", "k3", "k4"), (4,), 100.0, *_FISHEYE, kalibr=("equidistant",), is_fisheye=True
+        ("k1", "k2", "k3", "k4"), (4,), 100.0, *_FISHEYE, aliases=("fisheye",), is_fisheye=True
     ),
 }
 
@@ -328,9 +334,17 @@ def _padded(camera: Camera) -> Array:
     return distortion
 
 
-def distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
-    """Return the derivative of pixels of points (n, 2) by intrinsics, (n, 2, n_names)."""
-    return _with_derivatives(camera, xy, names)[2]
+def project_with_derivatives(
+    camera: Camera, P_camera: Array, names: Sequence[str]
+) -> tuple[Array, Array, Array]:
+    """Return pixels (n, 2) of points (n, 3), and their derivatives by points and by intrinsics.
+
+    The derivatives are (n, 2, 3) [px/m] and (n, 2, n_names). The camera must have no skew.
+    """
+    xy = P_camera[:, :2] / P_camera[:, 2:]
+    pixels, by_xy, by_intrinsics = _with_derivatives(camera, xy, names)
+    by_point = np.concatenate([by_xy, -by_xy @ xy[:, :, None]], axis=2)
+    return pixels, by_point / P_camera[:, 2, None, None], by_intrinsics
 
 
 def _with_derivatives(

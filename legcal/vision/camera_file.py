@@ -1,7 +1,12 @@
-"""Camera files: ROS camera_info, OpenCV and Kalibr read, ROS written."""
+"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB read; ROS written.
 
+``_FORMATS`` lists the forms of mappings, ``PARAMETERS`` the lens models of programs that list all
+numbers of a camera in one row.
+"""
+
+import ast
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,11 +14,11 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 import yaml
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
-from legcal.errors import DatasetError
+from legcal.errors import BadValue, DatasetError
 from legcal.files.published import with_schema
-from legcal.files.schema import FileSchema, content_of, parse_yaml, validate
+from legcal.files.schema import FileSchema, content_of, describe, parse_yaml, validate
 from legcal.geometry.types import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
@@ -60,6 +65,24 @@ def _is_3x3(matrix: MatrixEntry) -> MatrixEntry:
 CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
 
 
+def _lens_of_name(name: object) -> object:
+    """Return the lens model of a name; None for an empty one."""
+    if name in (None, ""):
+        return None
+    for model, lens in DISTORTION_MODELS.items():
+        if name in (model, *lens.aliases):
+            return model
+    raise BadValue(
+        f"the lens model {describe(name)}",
+        f"one that legcal reads ({', '.join(DISTORTION_MODELS)})",
+        _CALIBRATE,
+    )
+
+
+_CALIBRATE = "calibrate the camera with legcal camera, or with such a lens in its program"
+LensName = Annotated[DistortionModel | None, BeforeValidator(_lens_of_name)]
+Size = tuple[_PixelCount, _PixelCount]
+
 _Text = Annotated[str, Field(max_length=200)]
 _Positive = Annotated[float, Field(gt=0.0)]
 
@@ -94,29 +117,59 @@ class RosEntry(_OpenSchema):
     image_width: _PixelCount
     image_height: _PixelCount
     camera_matrix: CameraMatrix
-    distortion_model: DistortionModel = "plumb_bob"
+    distortion_model: LensName = None
     distortion_coefficients: MatrixEntry
     legcal_camera: CalibratedEntry | None = None
 
 
-class OpenCVEntry(_OpenSchema):
-    """An OpenCV FileStorage, as its calibration sample writes it."""
+class MessageEntry(_OpenSchema):
+    """A ROS message of a camera, as ``ros2 topic echo`` prints it."""
 
-    image_width: _PixelCount
-    image_height: _PixelCount
-    camera_matrix: CameraMatrix
-    distortion_coefficients: MatrixEntry
-    fisheye_model: int = 0
+    width: _PixelCount
+    height: _PixelCount
+    distortion_model: LensName
+    d: list[float]
+    k: Annotated[list[float], Field(min_length=9, max_length=9)]
 
 
 class KalibrEntry(_OpenSchema):
     """One camera of a Kalibr camchain."""
 
-    camera_model: Literal["pinhole"]
-    distortion_model: Literal["radtan", "equidistant", "none"]
+    distortion_model: LensName
     intrinsics: tuple[float, float, float, float]
     distortion_coeffs: list[float] = Field(default_factory=list)
-    resolution: tuple[_PixelCount, _PixelCount]
+    resolution: Size
+
+
+class MrcalEntry(_OpenSchema):
+    """A .cameramodel of mrcal."""
+
+    lensmodel: str
+    intrinsics: list[float]
+    imagersize: Size
+
+
+class BasaltCamera(_OpenSchema):
+    """One camera of a calibration of Basalt."""
+
+    camera_type: str
+    intrinsics: dict[str, float]
+
+
+class BasaltEntry(_OpenSchema):
+    """The cameras of a calibration of Basalt."""
+
+    intrinsics: Annotated[list[BasaltCamera], Field(min_length=1)]
+    resolution: Annotated[list[Size], Field(min_length=1)]
+
+
+class MatlabEntry(_OpenSchema):
+    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+
+    K: Annotated[list[list[float]], Field(min_length=3, max_length=3)]
+    ImageSize: Size  # rows, columns
+    RadialDistortion: Annotated[list[float], Field(min_length=2, max_length=3)]
+    TangentialDistortion: Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
@@ -124,8 +177,40 @@ _OPENCV_KEYS = {
     "image_width": ("image_width", "image_Width"),
     "image_height": ("image_height", "image_Height"),
     "camera_matrix": ("camera_matrix", "Camera_Matrix"),
+    "distortion_model": ("distortion_model",),
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
     "fisheye_model": ("fisheye_model",),
+}
+_YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
+_SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
+_LAST_SEPARATOR = re.compile(rb"(?<=\n)---\s*\Z")
+_COLMAP = re.compile(rb"^[ \t]*(\d+)[ \t]+([A-Z][A-Z_]+)[ \t]+([\d.eE+\- \t]+)$", re.MULTILINE)
+_PINHOLE = "fx fy cx cy"
+_OPENCV4, _FISHEYE = f"{_PINHOLE} k1 k2 p1 p2", f"{_PINHOLE} k1 k2 k3 k4"
+PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
+    "mrcal": {
+        "LENSMODEL_PINHOLE": ("plumb_bob", _PINHOLE),
+        "LENSMODEL_OPENCV4": ("plumb_bob", _OPENCV4),
+        "LENSMODEL_OPENCV5": ("plumb_bob", f"{_OPENCV4} k3"),
+        "LENSMODEL_OPENCV8": ("rational_polynomial", f"{_OPENCV4} k3 k4 k5 k6"),
+        "LENSMODEL_OPENCV12": ("thin_prism", f"{_OPENCV4} k3 k4 k5 k6 s1 s2 s3 s4"),
+    },
+    "COLMAP": {
+        "SIMPLE_PINHOLE": ("plumb_bob", "f cx cy"),
+        "PINHOLE": ("plumb_bob", _PINHOLE),
+        "SIMPLE_RADIAL": ("plumb_bob", "f cx cy k1"),
+        "RADIAL": ("plumb_bob", "f cx cy k1 k2"),
+        "OPENCV": ("plumb_bob", _OPENCV4),
+        "FULL_OPENCV": ("rational_polynomial", f"{_OPENCV4} k3 k4 k5 k6"),
+        "OPENCV_FISHEYE": ("equidistant", _FISHEYE),
+        "SIMPLE_RADIAL_FISHEYE": ("equidistant", "f cx cy k1"),
+        "RADIAL_FISHEYE": ("equidistant", "f cx cy k1 k2"),
+    },
+    "Basalt": {
+        "pinhole": ("plumb_bob", _PINHOLE),
+        "pinhole-radtan8": ("rational_polynomial", f"{_OPENCV4} k3 k4 k5 k6"),
+        "kb4": ("equidistant", _FISHEYE),
+    },
 }
 _SIGMAS = (1e-12, 1e6)  # plausible standard deviations of an intrinsic [px, or none]
 _ROUNDING = 1e-9  # rounding of correlations
@@ -134,22 +219,54 @@ _SINGULAR = 1e-9  # minimum focal length, in units of the image size
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera file of any of the three kinds."""
-    content = content_of(path, "camera file")
-    if _OPENCV_MARKS.search(content):
-        return _from_opencv(_read_storage(content, path), path)
-    document = parse_yaml(content, path, "camera file")
-    cameras = [key for key, value in document.items() if _is_kalibr(value)]
-    if cameras or _is_kalibr(document):
-        return _from_kalibr(document, cameras, path)
-    if "camera_matrix" in document:
-        return _from_ros(document, path)
+    """Read a camera file of any program in ``_FORMATS``."""
+    document = _document(content_of(path, "camera file"), path)
+    for _, is_in, read in _FORMATS:
+        if is_in(document):
+            return read(document, path)
     raise DatasetError(
         f"{path}: the camera file could not be read: found the keys "
-        f"{', '.join(list(document)[:8]) or 'none'}, needed those of a ROS camera_info "
-        "(camera_matrix, distortion_model, ...), of an OpenCV FileStorage or of a Kalibr camchain "
-        "(cam0: camera_model, intrinsics, ...); write the calibration in one of these forms."
+        f"{', '.join(list(document)[:8]) or 'none'}, needed those of "
+        f"{', '.join(name for name, _, _ in _FORMATS)}; write the calibration in one of these "
+        "forms."
     )
+
+
+def _document(content: bytes, path: Path) -> Mapping[str, Any]:
+    """Return the mapping in a camera file of any syntax."""
+    if b"LENSMODEL_" in content and (literal := _literal(content)):
+        return literal
+    if rows := _COLMAP.findall(content):
+        return {"colmap": rows}
+    bare = _YAML_HEADER.sub(b"", content)
+    if _OPENCV_MARKS.search(content):
+        is_camchain = b"opencv-matrix" not in content and re.search(
+            rb"^cam\d+:", bare, re.MULTILINE
+        )
+        return (
+            parse_yaml(bare, path, "camera file") if is_camchain else _read_storage(content, path)
+        )
+    content = _LAST_SEPARATOR.sub(b"", content)
+    messages = [text for text in _SEPARATOR.split(content) if text.strip()]
+    if len(messages) < 2:
+        return parse_yaml(content, path, "camera file")
+    first, *others = (parse_yaml(text, path, "camera file") for text in messages)
+    numbers = set(first) - {"header"}
+    if any(other.get(key) != first[key] for other in others for key in numbers):
+        raise DatasetError(
+            f"{path}: the camera file could not be used: found messages of different cameras, "
+            "needed one camera; copy one message into a file of its own."
+        )
+    return first
+
+
+def _literal(content: bytes) -> dict[str, Any]:
+    """Return the mapping that mrcal writes, a literal of Python; empty if it is none."""
+    try:
+        document = ast.literal_eval(content.decode())
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def _is_kalibr(value: object) -> bool:
@@ -158,7 +275,7 @@ def _is_kalibr(value: object) -> bool:
 
 
 def _from_ros(document: Mapping[str, Any], path: Path) -> Camera:
-    """Return the camera of a ROS camera_info file."""
+    """Return the camera of a ROS camera_info file or an OpenCV FileStorage."""
     entry = validate(RosEntry, document, path)
     camera = _checked(
         path,
@@ -243,39 +360,117 @@ def _covariance_problem(
     return ""
 
 
-def _from_opencv(document: Mapping[str, Any], path: Path) -> Camera:
-    """Return the camera of an OpenCV FileStorage, with the model by the number of coefficients."""
-    entry = validate(OpenCVEntry, document, path)
-    coefficients = entry.distortion_coefficients.data
-    model: DistortionModel = "plumb_bob"
-    if entry.fisheye_model:
-        model = "equidistant"
-    elif len(coefficients) > 5:
-        model = "rational_polynomial"
-    K = _matrix(entry.camera_matrix)
-    return _checked(path, K, (entry.image_width, entry.image_height), model, coefficients)
+def _from_message(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of a ROS message; ROS 1 has capital letters."""
+    small = {"d": document.get("D", []), "k": document.get("K"), "distortion_model": ""}
+    entry = validate(MessageEntry, {**small, **document}, path)
+    K = np.reshape(entry.k, (3, 3))
+    return _checked(path, K, (entry.width, entry.height), entry.distortion_model, entry.d)
 
 
-def _from_kalibr(document: Mapping[str, Any], cameras: Sequence[str], path: Path) -> Camera:
+def _from_kalibr(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the only camera of a Kalibr camchain."""
+    cameras = [key for key, value in document.items() if _is_kalibr(value)]
+    prefix = _only(cameras, path)
+    block = document[prefix] if prefix else document
+    if block.get("camera_model") != "pinhole":
+        raise DatasetError(
+            f"{path}: {prefix}{'.' * bool(prefix)}camera_model could not be used: found "
+            f"{describe(block.get('camera_model'))}, needed pinhole; calibrate the camera with "
+            "pinhole-radtan or pinhole-equi, or with legcal camera."
+        )
+    entry = validate(KalibrEntry, block, path, prefix)
+    K = _pinhole(*entry.intrinsics)
+    coefficients, problems = entry.distortion_coeffs, []
+    needed = 0 if block["distortion_model"] == "none" else 4
+    if len(coefficients) != needed and (needed or any(coefficients)):
+        n = len(coefficients)
+        problems.append(_wrong_count(path, str(block["distortion_model"]), n, str(needed)))
+    coefficients = (coefficients + 4 * [0.0])[:needed]
+    return _checked(path, K, entry.resolution, entry.distortion_model, coefficients, problems)
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Return a camera matrix (3, 3)."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _only(cameras: Sequence[str], path: Path) -> str:
+    """Return the name of the only camera of a file, "" without a name."""
     if len(cameras) > 1:
         raise DatasetError(
             f"{path}: the camera file could not be used: found {len(cameras)} cameras "
             f"({', '.join(cameras)}), needed one camera a file; copy each camera into a file of "
             "its own and name that file in its view."
         )
-    prefix = cameras[0] if cameras else ""
-    entry = validate(KalibrEntry, document[prefix] if cameras else document, path, prefix)
-    fx, fy, cx, cy = entry.intrinsics
-    model = next(m for m, d in DISTORTION_MODELS.items() if entry.distortion_model in d.kalibr)
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    coefficients = entry.distortion_coeffs
-    problems = []
-    needed = 0 if entry.distortion_model == "none" else 4
-    if len(coefficients) != needed and (needed or any(coefficients)):
-        problems.append(_wrong_count(path, entry.distortion_model, len(coefficients), str(needed)))
-        coefficients = [0.0] * needed
-    return _checked(path, K, entry.resolution, model, coefficients if needed else [], problems)
+    return cameras[0] if cameras else ""
+
+
+def _from_mrcal(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of a .cameramodel of mrcal."""
+    entry = validate(MrcalEntry, document, path)
+    return _of_parameters(path, "mrcal", entry.lensmodel, entry.intrinsics, entry.imagersize)
+
+
+def _from_colmap(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the only camera of a cameras.txt of COLMAP: the corner of the image is its origin."""
+    rows = [[part.decode() for part in row] for row in document["colmap"]]
+    _only([f"camera {number}" for number, _, _ in rows], path)
+    _, lens, numbers = rows[0]
+    width, height, *parameters = (float(number) for number in numbers.split())
+    return _of_parameters(
+        path, "COLMAP", lens, parameters, (int(width), int(height)), first_pixel=0.5
+    )
+
+
+def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the only camera of a calibration of Basalt."""
+    entry = validate(BasaltEntry, document["value0"], path, "value0")
+    _only([f"camera {k}" for k in range(len(entry.intrinsics))], path)
+    camera = entry.intrinsics[0]
+    names = PARAMETERS["Basalt"].get(camera.camera_type, ("", ""))[1].split()
+    parameters = [camera.intrinsics[name] for name in names if name in camera.intrinsics]
+    return _of_parameters(path, "Basalt", camera.camera_type, parameters, entry.resolution[0])
+
+
+def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of MATLAB's struct: its first pixel is (1, 1)."""
+    transposed = document.get("IntrinsicMatrix")
+    by_rows = [list(row) for row in zip(*transposed, strict=True)] if transposed else None
+    entry = validate(MatlabEntry, {"K": by_rows, **document}, path)
+    K = np.array(entry.K) - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    height, width = entry.ImageSize
+    k1, k2, *k3 = entry.RadialDistortion
+    coefficients = [k1, k2, *entry.TangentialDistortion, *(k3 or [0.0])]
+    return _checked(path, K, (width, height), "plumb_bob", coefficients)
+
+
+def _of_parameters(
+    path: Path,
+    program: str,
+    lens: str,
+    parameters: Sequence[float],
+    size: tuple[int, int],
+    first_pixel: float = 0.0,  # coordinates of its centre
+) -> Camera:
+    """Return the camera of a lens in ``PARAMETERS``."""
+    if lens not in PARAMETERS[program]:
+        raise DatasetError(
+            f"{path}: the lens model could not be used: found {describe(lens)}, needed one of "
+            f"{program} that legcal reads ({', '.join(PARAMETERS[program])}); {_CALIBRATE}."
+        )
+    model, listed = PARAMETERS[program][lens]
+    names = listed.split()
+    if len(parameters) != len(names):
+        raise DatasetError(
+            f"{path}: the lens model {lens} could not be used: found {len(parameters)} parameters, "
+            f"needed {len(names)} ({', '.join(names)}); copy all of them from the calibration."
+        )
+    value = dict(zip(names, parameters, strict=True))
+    fx, fy = (value.get(name, value.get("f", 0.0)) for name in ("fx", "fy"))
+    K = _pinhole(fx, fy, value["cx"] - first_pixel, value["cy"] - first_pixel)
+    coefficients = [value.get(name, 0.0) for name in DISTORTION_MODELS[model].coefficients]
+    return _checked(path, K, size, model, coefficients)
 
 
 def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
@@ -292,7 +487,15 @@ def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
                 for node in [next((n for n in map(storage.getNode, names) if not n.empty()), None)]
                 if node is not None
             }
-            return {name: _node_value(node) for name, node in nodes.items()}
+            document = {name: _node_value(node) for name, node in nodes.items()}
+            fisheye, D = (
+                document.pop("fisheye_model", None),
+                document.get("distortion_coefficients"),
+            )
+            if fisheye is not None and isinstance(D, dict):
+                lens = "equidistant" if fisheye else _counted(D["data"])
+                document.setdefault("distortion_model", lens)
+            return document
     except UnicodeDecodeError:
         reason = "bytes that are not UTF-8 text"
     except (cv2.error, SystemError):
@@ -322,27 +525,68 @@ def _matrix(entry: MatrixEntry) -> Array:
 
 def _wrong_count(path: Path, model: str, n_coefficients: int, needed: str) -> str:
     """Return the problem of a wrong number of distortion coefficients."""
+    remedy = "copy all of them from the calibration"
+    if n_coefficients > 5:
+        remedy = "name the lens model that has so many, or " + _CALIBRATE
     return (
         f"{path}: the distortion could not be used: found {n_coefficients} coefficients, needed "
-        f"{needed} for {model}; copy all of them from the calibration."
+        f"{needed} for {model}; {remedy}."
     )
+
+
+def _counted(coefficients: Sequence[float]) -> DistortionModel:
+    """Return the polynomial lens of OpenCV with so many coefficients."""
+    return "rational_polynomial" if len(coefficients) > 5 else "plumb_bob"
+
+
+def _without_padding(model: DistortionModel, distortion: Array) -> tuple[DistortionModel, Array]:
+    """Return a polynomial lens of OpenCV without trailing zeros of richer ones.
+
+    Of rational_polynomial five coefficients are those of plumb_bob, and twelve a thin prism.
+    """
+    if model == "equidistant":
+        return model, distortion
+    if len(distortion) == 14 and not distortion[12:].any():
+        distortion = distortion[:12]
+    if model == "rational_polynomial" and len(distortion) == 12 and distortion[8:].any():
+        model = "thin_prism"
+    n = {"plumb_bob": 5, "rational_polynomial": 8, "thin_prism": 12}[model]
+    if len(distortion) in (8, 12) and not distortion[n:].any():
+        distortion = distortion[:n]
+    is_plain = model == "rational_polynomial" and len(distortion) in (4, 5)
+    return "plumb_bob" if is_plain else model, distortion
 
 
 def _checked(
     path: Path,
     K: Array,
     size: tuple[int, int],
-    model: DistortionModel,
+    model: DistortionModel | None,
     coefficients: Sequence[float],
     problems: Sequence[str] = (),
 ) -> Camera:
-    """Return a camera; refuse numbers that no camera has."""
+    """Return a camera; refuse numbers that no camera has.
+
+    Without a model the number of coefficients says which it is, unless it may be two.
+    """
     problems = list(problems)
-    distortion = np.array(coefficients, dtype=np.float64)
-    if model == "rational_polynomial" and len(distortion) in (12, 14) and not distortion[8:].any():
-        distortion = distortion[:8]  # OpenCV pads with the thin prism and tilt that it did not fit
+    if model is None and len(coefficients) == 4 and any(coefficients):
+        problems.append(
+            f"{path}: the distortion could not be used: found four coefficients without a lens "
+            "model, which may be those of plumb_bob (k1, k2, p1, p2) or of a fisheye (k1, k2, k3, "
+            "k4), needed its name; add 'distortion_model: plumb_bob' or 'distortion_model: "
+            "equidistant' to the file."
+        )
+    model, distortion = _without_padding(
+        model or _counted(coefficients), np.array(coefficients, dtype=np.float64)
+    )
     counts = DISTORTION_MODELS[model].counts
-    if len(distortion) not in counts:
+    if len(distortion) == 14:
+        problems.append(
+            f"{path}: the distortion could not be used: found 14 coefficients with the tilt of a "
+            f"sensor, needed at most 12; {_CALIBRATE}."
+        )
+    elif len(distortion) not in counts:
         needed = " or ".join(str(n) for n in counts)
         problems.append(_wrong_count(path, model, len(distortion), needed))
     if problem := size_problem(*size):
@@ -392,6 +636,30 @@ def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
     return problems
 
 
+_Reader = Callable[[Mapping[str, Any], Path], Camera]
+_FORMATS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], _Reader], ...] = (
+    ("COLMAP's cameras.txt", lambda d: "colmap" in d, _from_colmap),
+    ("mrcal's .cameramodel", lambda d: "lensmodel" in d, _from_mrcal),
+    ("a calibration of Basalt", lambda d: isinstance(d.get("value0"), dict), _from_basalt),
+    (
+        "a Kalibr camchain (cam0: camera_model, ...)",
+        lambda d: _is_kalibr(d) or any(map(_is_kalibr, d.values())),
+        _from_kalibr,
+    ),
+    (
+        "a ROS message (width, k, d, ...)",
+        lambda d: "k" in d or ("K" in d and "D" in d),
+        _from_message,
+    ),
+    ("MATLAB's struct as JSON", lambda d: "RadialDistortion" in d, _from_matlab),
+    (
+        "a ROS camera_info or an OpenCV FileStorage (camera_matrix, ...)",
+        lambda d: "camera_matrix" in d or "image_width" in d,
+        _from_ros,
+    ),
+)
+
+
 def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
     """Return the text of a ROS camera_info file that reads back as the same camera."""
     distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
@@ -401,7 +669,10 @@ def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None
         "image_height": camera.height,
         "camera_name": name,
         "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
-        "distortion_model": camera.model,
+        # ROS passes on any number of coefficients of this name to OpenCV.
+        "distortion_model": (
+            "rational_polynomial" if camera.model == "thin_prism" else camera.model
+        ),
         "distortion_coefficients": {
             "rows": 1,
             "cols": len(distortion),

@@ -42,6 +42,17 @@ def outlines_of_axis(
     )
 
 
+def steps_to_outlines(
+    h: Array,  # (..., 2, 3) both outlines
+    radius: Array | float,  # (...) radii [m]
+) -> Array:
+    """Return the steps (..., 2, 3) from an axis to the lines where outlines touch the cylinder.
+
+    By (5), h . M = epsilon R on the axis, and zero where the cylinder touches the plane of h.
+    """
+    return -EPSILON[:, None] * np.asarray(radius)[..., None, None] * h
+
+
 def axis_of_outlines(
     h1: Array,  # (..., 3)
     h2: Array,  # (..., 3)

@@ -1,5 +1,6 @@
-"""Names of distortion models for options of commands, without heavy imports."""
+"""Names of distortion models and camera files for options of commands, without heavy imports."""
 
 from typing import Literal
 
-DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
+DistortionModel = Literal["plumb_bob", "rational_polynomial", "thin_prism", "equidistant"]
+CameraProgram = Literal["ros", "opencv", "kalibr", "mrcal"]

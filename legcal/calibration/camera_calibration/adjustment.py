@@ -53,12 +53,16 @@ class RobustFit:
         return np.zeros(len(SHEET)) if self.adjusted.sheet is None else self.adjusted.sheet.numbers
 
 
-def robust_fit(corners: BoardImages, size: ImageSize, model: DistortionModel) -> RobustFit | None:
+def robust_fit(
+    corners: BoardImages,
+    size: ImageSize,
+    model: DistortionModel,
+    first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
+) -> RobustFit | None:
     """Return the fit of the camera without outliers; None if no adjustment succeeds."""
     n_images = int(corners.image[-1]) + 1
-    claimed = corners.sigma_px
-    corners = replace(corners, sigma_px=np.hypot(claimed, float(np.median(claimed))))
-    agreed = agreeing_images(corners, size, model)
+    claimed, corners = corners.sigma_px, evened(corners)
+    agreed = agreeing_images(corners, size, model, first)
     if agreed is None:
         return None
     adjusted, left_out = agreed.adjusted, dict(agreed.left_out)
@@ -107,6 +111,12 @@ def robust_fit(corners: BoardImages, size: ImageSize, model: DistortionModel) ->
         ratio,
         adjusted.clusters.covariance(ratio),
     )
+
+
+def evened(corners: BoardImages) -> BoardImages:
+    """Return corners of which none claims to be far better than the others."""
+    claimed = corners.sigma_px
+    return replace(corners, sigma_px=np.hypot(claimed, float(np.median(claimed))))
 
 
 def _scattered(claimed: Array, is_kept: BoolArray, residual: Array) -> Array:

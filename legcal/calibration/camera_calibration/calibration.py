@@ -85,9 +85,9 @@ def calibrate_camera(
     board : str, Path or Board
         Such as ``chessboard:9x6:25mm`` (squares), or a YAML file with the block ``board`` of a
         dataset. Its size does not matter here, its proportions do.
-    model : {"plumb_bob", "rational_polynomial", "equidistant"}, optional
-        The distortion model of the lens. Chosen by default: plumb_bob unless its residuals show a
-        radial trend and a richer model predicts other images better.
+    model : {"plumb_bob", "rational_polynomial", "thin_prism", "equidistant"}, optional
+        The distortion model of the lens. Chosen by default: plumb_bob unless a richer model
+        explains images that contradict it, or predicts the images better.
     output : path, optional
         Write a ROS camera_info file there, with the covariance of all intrinsics, which
         :func:`legcal.calibrate` takes as their prior.

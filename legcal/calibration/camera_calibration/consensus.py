@@ -60,11 +60,14 @@ class Agreement:
 
 
 def agreeing_images(
-    corners: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages,
+    size: ImageSize,
+    model: DistortionModel,
+    first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
 ) -> Agreement | None:
     """Return the largest group of images that agree on a camera; None if no fit succeeds."""
     n = int(corners.image[-1]) + 1
-    largest = _largest(corners, size, model)
+    largest = _largest(corners, size, model, first)
     if largest is None:
         return None
     adjusted, group = largest
@@ -81,13 +84,16 @@ def agreeing_images(
 
 
 def _largest(
-    corners: BoardImages, size: ImageSize, model: DistortionModel
+    corners: BoardImages,
+    size: ImageSize,
+    model: DistortionModel,
+    first: AdjustedBoard | None = None,
 ) -> tuple[AdjustedBoard, BoolArray] | None:
     """Return the adjustment to the largest group of agreeing images, and the group."""
     n = int(corners.image[-1]) + 1
     rng = np.random.default_rng(0)
     best: tuple[AdjustedBoard, BoolArray] | None = None
-    first = from_scratch(corners, size, model)
+    first = first or from_scratch(corners, size, model)
     if first is not None:
         all_images = np.ones(n, dtype=np.bool_)
         if n < _FEW:

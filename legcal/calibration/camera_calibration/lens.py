@@ -1,8 +1,8 @@
-"""The choice of the lens model by residuals over the field and by cross-validation.
+"""The choice of the lens model: images that agree on it, then cross-validation image by image.
 
-The simplest model is taken unless its residuals have a radial trend (mean radial residual of a ring
-of the field). Then richer models are fitted too, and one of them is taken if it predicts held-out
-images better, or if far more images agree on it.
+Every model is fitted to all images before any is left out. A richer model is taken where it
+explains images that contradict the simpler one, and others no worse, where it predicts held-out
+images better by a signed-rank test over images, or where all images together make it likelier.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.special import chdtri, ndtr, stdtr
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
-from legcal.calibration.camera_calibration.starts import part_of, readjust
+from legcal.calibration.camera_calibration.adjustment import RobustFit, evened, robust_fit
+from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
 from legcal.geometry.types import Array
-from legcal.perception.board_adjustment import BoardImages, adjust_board
+from legcal.perception.board_adjustment import AdjustedBoard, BoardImages, adjust_board
 from legcal.vision.camera import intrinsic_names
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize
 
 SIMPLEST: DistortionModel = "plumb_bob"
-_RICHER: tuple[DistortionModel, ...] = ("equidistant", "rational_polynomial")
+_RICHER: tuple[DistortionModel, ...] = ("equidistant", "rational_polynomial", "thin_prism")
 _FOLDS = 5
 _RINGS = 6  # rings about the principal point with equal numbers of corners
 _OF_RING = 3  # smallest number of corners of an image in a ring
 _SIGNIFICANCE = 1e-3  # significance level of a radial trend
 _TREND_OF_SCATTER = 0.3  # radial trend worth a warning, relative to the scatter of corners
-_LEAD = 3.0  # smallest improvement of the prediction by a richer model, in standard errors
-_MORE_IMAGES = 1.25  # ratio of agreeing images that decides for a model,
-_MUCH_WORSE = 1.5  # unless residuals of common images grow by this factor
+_BETTER = 0.01  # significance level of a better prediction, and of a likelihood ratio
+_MIN_RANKED = 4  # smallest number of images that decide
+_LARGE_GAIN = np.log(2.0)  # ratio of mean squares that decides if every image has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,58 +122,95 @@ def given_lens(corners: BoardImages, size: ImageSize, model: DistortionModel) ->
 
 def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
     """Return the fit of the simplest adequate lens model; None if no adjustment succeeds."""
-    plain, best = robust_fit(corners, size, SIMPLEST), None
-    if plain is not None:
-        if not radial_trend(plain) and not plain.left_out:
-            return ChosenLens(plain, f"{SIMPLEST}: its residuals do not lean anywhere in the field")
-        best = ChosenLens(plain, f"{SIMPLEST}: no richer model predicts images better")
-    for model in _RICHER:
-        fit = robust_fit(corners, size, model)
+    best: ChosenLens | None = None
+    first_of_best: AdjustedBoard | None = None
+    even = evened(corners)
+    for model in (SIMPLEST, *_RICHER):
+        first = from_scratch(even, size, model)
+        if first is None:
+            continue
+        if best is not None and first_of_best is not None and not best.fit.left_out:
+            gain = np.log(
+                _mean_squares(first_of_best.residual, even) / _mean_squares(first.residual, even)
+            )
+            if not _is_positive(gain) and not _is_likelier(first, first_of_best, even):
+                continue
+        fit = robust_fit(corners, size, model, first)
         if fit is None:
             continue
-        rich = ChosenLens(fit, f"{model}: no simpler model fits")
-        reason = _lead(best, rich) if best is not None else rich.reason
+        if best is None or first_of_best is None:
+            alone = "no richer model predicts images better"
+            if model != SIMPLEST:
+                alone = "no simpler model fits"
+            best, first_of_best = ChosenLens(fit, f"{model}: {alone}"), first
+            continue
+        rich = ChosenLens(fit, "")
+        reason = _lead(best, rich, is_likelier=_is_likelier(first, first_of_best, even))
         if reason:
-            best = replace(rich, reason=reason)
-            if not radial_trend(fit) and not fit.left_out:
-                break
+            best, first_of_best = replace(rich, reason=reason), first
     return best
 
 
-def _lead(simple: ChosenLens, rich: ChosenLens) -> str:
+def _is_likelier(rich: AdjustedBoard, simple: AdjustedBoard, corners: BoardImages) -> bool:
+    """Return whether a richer model is likelier with all images, by the likelihood ratio.
+
+    Errors are scaled by the larger of their scatter and of the disagreement of images.
+    """
+    k, k_simple = (len(intrinsic_names(adjusted.camera)) for adjusted in (rich, simple))
+    dof = max(2 * len(corners.px) - 6 * len(rich.T_camera_board) - k, 1)
+    ratio = max(rich.clusters.ratio(), 2.0 * rich.cost / dof, 1e-30)
+    gain = 2.0 * (simple.cost - rich.cost) / ratio
+    return bool(gain > chdtri(max(k - k_simple, 1), _BETTER))
+
+
+def _lead(simple: ChosenLens, rich: ChosenLens, *, is_likelier: bool) -> str:
     """Return the reason for a richer model; "" without one."""
     model, other = rich.fit.adjusted.camera.model, simple.fit.adjusted.camera.model
     n, n_other = len(rich.fit.images), len(simple.fit.images)
-    if n_other >= _MORE_IMAGES * n:
-        return ""
     simple_squares, rich_squares = _squares(simple), _squares(rich)
     common = sorted(simple_squares.keys() & rich_squares.keys())
-    difference = np.array([simple_squares[k] - rich_squares[k] for k in common])
-    if n >= _MORE_IMAGES * n_other:
-        # With large enough residuals all images agree with any model.
-        worse = len(common) >= 4 and np.sum(
-            [rich_squares[k] for k in common]
-        ) > _MUCH_WORSE**2 * np.sum([simple_squares[k] for k in common])
-        return "" if worse else f"{model}: {n} images agree on it, {n_other} on {other}"
-    if len(common) < 4:
+    simple_px2, rich_px2 = (
+        np.array([squares[k] for k in common]) for squares in (simple_squares, rich_squares)
+    )
+    gain = np.log(simple_px2 / rich_px2)
+    if n < n_other or _is_positive(-gain):
         return ""
-    error = float(difference.std(ddof=1)) / np.sqrt(len(common))
-    if difference.mean() <= _LEAD * error:
-        return ""
-    rms = [
-        float(np.sqrt(np.mean([square[k] for k in common])))
-        for square in (rich_squares, simple_squares)
-    ]
+    if n > n_other:
+        return f"{model}: {n} images agree on it, {n_other} on {other}"
+    if not _is_positive(gain):
+        if simple.fit.left_out or not is_likelier:
+            return ""
+        return f"{model}: all {n} images together fit it better than {other}, beyond chance"
+    rms = [float(np.sqrt(np.mean(px2))) for px2 in (rich_px2, simple_px2)]
     return (
         f"{model}: it predicts images that it has not seen to {rms[0]:.3f} px (rms), {other} to "
         f"{rms[1]:.3f} px"
     )
 
 
+def _is_positive(gain: Array) -> bool:
+    """Return whether the log gains of images are positive: all large, or by signed ranks.
+
+    The signed-rank sum is compared with its normal approximation.
+    """
+    n = len(gain)
+    if n < _MIN_RANKED:
+        return False
+    rank_sum = float(np.sum(1.0 + np.flatnonzero(gain[np.argsort(np.abs(gain))] > 0.0)))
+    sigma = np.sqrt(n * (n + 1.0) * (2.0 * n + 1.0) / 24.0)
+    z = (rank_sum - 0.25 * n * (n + 1.0) - 0.5) / sigma
+    return bool(gain.min() > _LARGE_GAIN or ndtr(-z) < _BETTER)
+
+
+def _mean_squares(residual: Array, corners: BoardImages) -> Array:
+    """Return the mean squared residual of each image, (n_images,) [px^2]."""
+    square = np.bincount(corners.image, np.sum(residual**2, axis=1))
+    return np.asarray(np.maximum(square / np.bincount(corners.image), 1e-12))
+
+
 def _squares(lens: ChosenLens) -> dict[int, float]:
     """Return the mean squared residual of each held-out image [px^2]."""
     if lens.validated is None:
         return {}
-    square = np.sum(lens.validated**2, axis=1)
-    mean = np.bincount(lens.fit.corners.image, square) / np.bincount(lens.fit.corners.image)
+    mean = _mean_squares(lens.validated, lens.fit.corners)
     return dict(zip(lens.fit.images, mean.tolist(), strict=True))

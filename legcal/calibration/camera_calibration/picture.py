@@ -1,4 +1,4 @@
-"""A picture of a calibration: the corners and their mean residuals over the field."""
+"""A picture of a calibration: corners, mean residuals and the projection error over the field."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.calibration.camera_calibration.document import CameraCalibration
+from legcal.calibration.camera_calibration.projection import GRID, grid
 from legcal.files.folder import OutputFile
 
 _LONGER = 1280  # side of the picture [px]
@@ -17,6 +18,7 @@ _CELLS = 16  # cells along the longer side
 _ARROW = 0.45  # length of the longest arrow, relative to a cell
 _LEAST_ARROW = 3  # smallest number of corners of a cell with an arrow
 _LETTER = 0.55  # scale of letters
+_LABELLED = 4  # every fourth place of the grid has its standard deviation written
 _DARK, _WHITE, _EMPTY = (32, 32, 32), (255, 255, 255), (60, 60, 140)
 _SEEN, _RESIDUAL, _CENTRE = (90, 120, 60), (0, 225, 255), (255, 170, 40)  # blue, green, red
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -84,6 +86,17 @@ def picture(calibration: CameraCalibration) -> Canvas:
             for p in (middle - scale * mean[drawn], middle + scale * mean[drawn])
         )
         cv2.arrowedLine(canvas, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
+    places = grid(camera).reshape(*GRID[::-1], 2)[::_LABELLED, ::_LABELLED].reshape(-1, 2)
+    sigmas = calibration.projection_sigma[::_LABELLED, ::_LABELLED].ravel()
+    for place, sigma in zip(places, sigmas.tolist(), strict=True):
+        label = f"{sigma:.2g}"
+        (w, h), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _LETTER, 1)
+        at = np.rint(place * factor - [0.5 * w, -0.5 * h]).astype(int)
+        left, bottom = np.clip(at, [12, 12 + h], [width - w - 12, height - 12]).tolist()
+        origin = left, bottom
+        cv2.putText(
+            canvas, label, origin, cv2.FONT_HERSHEY_SIMPLEX, _LETTER, _WHITE, 1, cv2.LINE_AA
+        )
     centre = tuple(np.rint((camera.K[:2, 2] + 0.5) * factor).astype(int).tolist())
     cv2.drawMarker(canvas, centre, _CENTRE, cv2.MARKER_CROSS, 24, 2, cv2.LINE_AA)
     validated_px = calibration.validated_px
@@ -91,7 +104,7 @@ def picture(calibration: CameraCalibration) -> Canvas:
         f"{camera.model}, {len(points)} corners, {calibration.rms_px:.3f} px off (rms)"
         + ("" if validated_px is None else f", {validated_px:.3f} px in images left out"),
         f"arrows: mean residual of a cell, the longest {longest:.3f} px; green: corners, brighter "
-        "where more; red: none; cross: principal point",
+        "where more; red: none; cross: principal point; numbers: projection, 1 sigma [px]",
     )
     legend = np.full((62, width, 3), _DARK, dtype=np.uint8)
     for row, line in enumerate(lines):

@@ -13,7 +13,9 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.image_tables import inverse
 from legcal.data.measurements import few, row_names
+from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.home import home_at_mid_travel
 from legcal.machine.kinematics import follow_poses
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, readings_at
@@ -159,6 +161,7 @@ def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake
     encoders = _Encoders(given)
     candidates = [
         *_column_mistakes(data, given),
+        *_numbering_mistakes(data, given),
         *_row_mistakes(data, given),
         *_unit_mistakes(encoders),
         *_direction_mistakes(encoders),
@@ -222,6 +225,66 @@ def _column_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
             ("the legs appear to be numbered from a different starting leg in the model",),
             _MOVE_ONE,
         )
+
+
+def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
+    """Yield joints of the platform, or of the base, that the model numbers from another one on.
+
+    Base joints with their motors that are some numbers on are platform joints and columns that are
+    as many back.
+    """
+    machine = given.machine
+    files = inverse(data.order.legs).tolist()  # legs as the files have them
+    motors = [j for j in files if j in machine.motors]
+    groups = [[j for j in files if machine.reads[j] == motor] for motor in motors]
+    n, names = len(groups), [machine.legs[motor].motor_label for motor in motors]
+    if n < 3 or len({len(group) for group in groups}) > 1:
+        return
+
+    def with_platform_joints(k: int) -> Assumed:
+        legs = list(machine.legs)
+        for i, group in enumerate(groups):
+            for j, other in zip(group, groups[(i + k) % n], strict=True):
+                end = machine.legs[other]
+                legs[j] = replace(legs[j], B=end.B, platform_axis=end.platform_axis)
+        return replace(given, machine=_at_reachable_home(replace(machine, legs=tuple(legs))))
+
+    turns = {leg.actuator.turns for leg in machine.legs if leg.actuator is not None}
+    base = "base joints" if not turns else "arms" if turns == {True} else "carriages"
+    renumbered = [(k, with_platform_joints(k)) for k in range(1, n)]
+    # The home that the model states is likelier than one that is solved for.
+    for k, true in sorted(renumbered, key=lambda one: one[1].machine.home is not machine.home):
+        yield Mistake(
+            "platform joints renumbered",
+            "the platform joints of the model appear to be numbered from another one on "
+            f"({names[0]} has that of {names[-k]})",
+            f"with the platform joints renumbered by {k}",
+            "correct the numbers of the platform joints in the model",
+            true,
+            test=_MOVE_ONE,
+        )
+        q = given.q.copy()
+        q[:, motors] = given.q[:, [motors[(i + k) % n] for i in range(n)]]
+        yield Mistake(
+            "base joints renumbered",
+            f"the {base} of the model appear to be turned against the platform ({names[0]} stands "
+            f"where {names[k]} should)",
+            f"with the {base} renumbered by {n - k}",
+            f"correct the numbers of the {base} in the model",
+            replace(true, q=q),
+            test=_MOVE_ONE,
+        )
+
+
+def _at_reachable_home(machine: Machine) -> Machine:
+    """Return a machine with its home, or where it is out of travel with one within, if any."""
+    q = readings_at(machine, machine.home)
+    if all(bool(leg.in_travel(q[j])) for j, leg in enumerate(machine.legs) if leg.is_motor):
+        return machine
+    try:
+        return replace(machine, home=home_at_mid_travel(machine))
+    except (DidNotConverge, ModelError):
+        return machine
 
 
 def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:

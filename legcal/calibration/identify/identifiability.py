@@ -8,16 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.identify.information import expected_intrinsics
-from legcal.calibration.identify.predicted_observations import (
-    THIN,
-    PredictedObservations,
-    cameras_of,
-    legs_in_words,
-    orientations_of,
-    planned_observations,
-    recorded_observations,
-)
+from legcal.calibration.identify.intrinsics import expected_intrinsics
 from legcal.calibration.identify.ranks import Analysis, undetermined, weak_directions
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
@@ -28,16 +19,29 @@ from legcal.calibration.identify.remedies import (
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
 from legcal.calibration.identify.scale import is_scale_open, refusal_of_scale, scale_sources
+from legcal.calibration.identify.session import (
+    THIN,
+    Session,
+    planned_session,
+    recorded_session,
+)
 from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
     known_parameters,
     resolve,
 )
+from legcal.calibration.joint_fit.predicted_noise import (
+    DEFAULT_NOISE,
+    WHITE,
+    PredictedNoise,
+    read_noise,
+)
 from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest
 from legcal.machine.diagnostics import singularity_note
+from legcal.machine.directions import legs_in_words
 from legcal.machine.files import DATASET_YAML
 from legcal.machine.home import legs_outside
 from legcal.machine.leg import TRAVEL_MARGIN, JointType
@@ -70,12 +74,14 @@ def answer(
     board: bool = False,
     platform_board: bool = False,
     hand_held: bool = False,
+    noise: Path | None = None,  # earlier result whose errors of outlines are to be expected
 ) -> Identifiability:
     """Return the report on a model with views, or on a dataset.
 
     Raises UsageError if an option is given for a dataset, or does not fit the model.
     """
     path = Path(source)
+    expected = DEFAULT_NOISE if noise is None else read_noise(noise)
     if not (path.name == DATASET_YAML or (path / DATASET_YAML).is_file()):
         return identifiability(
             load_mechanism(source),
@@ -84,6 +90,7 @@ def answer(
             board=board,
             platform_board=platform_board,
             hand_held=hand_held,
+            noise=expected,
         )
     options = {
         "--view": bool(views),
@@ -106,7 +113,7 @@ def answer(
         axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
-    return identifiability_of_dataset(dataset, resolve(dataset.overrides, parameters))
+    return identifiability_of_dataset(dataset, resolve(dataset.overrides, parameters), expected)
 
 
 def identifiability(
@@ -117,6 +124,7 @@ def identifiability(
     board: bool = False,
     hand_held: bool = False,
     platform_board: bool = False,
+    noise: PredictedNoise = DEFAULT_NOISE,
 ) -> Identifiability:
     """Judge the identifiability of a mechanism's parameters from planned views.
 
@@ -135,6 +143,8 @@ def identifiability(
         A calibration board on the platform, visible in every image, at an unknown pose.
     hand_held : bool
         Hand-held camera: a new camera pose for every image.
+    noise : PredictedNoise
+        Errors of outlines.
 
     Returns
     -------
@@ -159,20 +169,20 @@ def identifiability(
     legs = read_views(views, mechanism.leg_names, images)
     if hand_held:
         return _report_on_hand_held(
-            mechanism, legs, images, board=board, platform_board=platform_board
+            mechanism, legs, images, board=board, platform_board=platform_board, noise=noise
         )
     recommendation = None
     boards = {"board": board, "platform_board": platform_board}
     if not legs:
-        recommendation = recommend(mechanism, images, **boards)
+        recommendation = recommend(mechanism, images, noise, **boards)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    predicted = planned_observations(mechanism, legs, images, **boards)
+    session = planned_session(mechanism, legs, images, **boards)
     replanning = Replanner(
-        lambda more: planned_observations(mechanism, legs, more, **boards),
-        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), **boards),
+        lambda more: planned_session(mechanism, legs, more, **boards),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), noise, **boards),
     )
-    return _report_on(mechanism, Analysis(predicted), recommendation, replanning)
+    return _report_on(mechanism, Analysis(session, noise=noise), recommendation, replanning)
 
 
 def identifiability_of_dataset(
@@ -180,23 +190,16 @@ def identifiability_of_dataset(
     dataset: Dataset,
     # fixed parameters, priors, and estimated twists
     choices: Choices = NO_CHOICES,
+    noise: PredictedNoise = DEFAULT_NOISE,
 ) -> Identifiability:
     """Judge the identifiability from the readings, cameras and visible legs of a dataset.
 
     Raises DidNotConverge if the forward kinematics at the readings fail.
     """
-    analysis = _analysis_of(dataset, choices)
-    predicted, report = analysis.predicted, _report_on(dataset.machine, analysis, None, None)
+    analysis = replace(_analysis_of(dataset, choices), noise=noise)
+    report = _report_on(dataset.machine, analysis, None, None)
     if dataset.axes is None:
-        intrinsics = expected_intrinsics(
-            predicted,
-            analysis.images,
-            analysis.equations,
-            analysis.prior,
-            orientations_of(dataset, predicted),
-            cameras_of(dataset),
-            analysis.arms,
-        )
+        intrinsics = expected_intrinsics(analysis)
         report = replace(report, intrinsics=intrinsics)
     if dataset.machine.is_determined:
         return report
@@ -212,14 +215,14 @@ def ranks_of_dataset(
     As :func:`identifiability_of_dataset`, without remedies.
     """
     analysis = _analysis_of(dataset, choices)
-    return conditions_of(dataset.machine, analysis.predicted), analysis.full
+    return conditions_of(dataset.machine, analysis.session), analysis.full
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
     """Analysis of the recorded observations of a dataset."""
     chosen = (*choices.free, *choices.priors)
     twists = any(is_held_by_default(name) for name in chosen)
-    return Analysis(recorded_observations(dataset, twists=twists), choices)
+    return Analysis(recorded_session(dataset, twists=twists), choices)
 
 
 def check_identifiable(
@@ -232,11 +235,12 @@ def check_identifiable(
 
     Raises NotIdentifiable if the joint fit cannot determine a direction that moves the platform.
     """
-    analysis = _analysis_of(dataset, choices)
+    # A rank does not depend on errors that edges share, and many images have many of these.
+    analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
-    if analysis.predicted.actuators and is_scale_open(analysis):
+    if analysis.session.actuators and is_scale_open(analysis):
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
@@ -254,6 +258,7 @@ def _report_on_hand_held(
     *,
     board: bool,
     platform_board: bool,
+    noise: PredictedNoise,
 ) -> Identifiability:
     """Report on hand-held images, each with its own camera pose."""
     if not board or not legs:
@@ -264,8 +269,10 @@ def _report_on_hand_held(
             "give --board and --view."
         )
     views = tuple(view for view in legs for _ in range(images))
-    predicted = planned_observations(machine, views, 1, board=True, platform_board=platform_board)
-    return _report_on(machine, Analysis(predicted), None, None)
+    session = planned_session(
+        machine, views, 1, board=True, platform_board=platform_board, hand_held=True
+    )
+    return _report_on(machine, Analysis(session, noise=noise), None, None)
 
 
 def _report_on(
@@ -275,11 +282,11 @@ def _report_on(
     replanning: Replanner | None,
 ) -> Identifiability:
     """Report on a session."""
-    predicted = analysis.predicted
-    conditions = conditions_of(machine, predicted)
+    session = analysis.session
+    conditions = conditions_of(machine, session)
     board = judge_board(
         analysis,
-        *(conditions_of(machine, predicted.with_board(board=b)) for b in (False, True)),
+        *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
     )
     platform_board = judge_board(analysis, (), (), link="platform")
     full = analysis.full
@@ -298,12 +305,12 @@ def _report_on(
         n=machine.n_legs,
         n_d=len(machine.frame_legs),
         r=sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
-        n_ac=int(predicted.with_length.sum()),
+        n_ac=int(session.with_length.sum()),
         conditions=conditions,
         full=full,
         identifiable=full.complete,
-        views=tuple(tuple(predicted.leg_names[j] for j in view) for view in predicted.views),
-        images=tuple(int((predicted.view == v).sum()) for v in range(predicted.n_views)),
+        views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
+        images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
         board=board,
         platform_board=platform_board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
@@ -316,18 +323,17 @@ def _report_on(
 
 def _rough_notes(analysis: Analysis) -> list[str]:
     """Note on directions so uncertain that calibrate may reject the dataset."""
-    predicted, motion = analysis.predicted, analysis.motion
-    rough = undetermined(predicted, analysis.information, _ROUGH)
-    harmful = [w for w in weak_directions(predicted, motion, rough) if not w.harmless]
+    session, motion = analysis.session, analysis.motion
+    rough = undetermined(session, analysis.information, _ROUGH)
+    harmful = [w for w in weak_directions(session, motion, rough) if not w.harmless]
     if not harmful:
         return []
     direction = min((weak.direction for weak in harmful), key=len)
     others = f" and {len(harmful) - 1} more" if len(harmful) > 1 else ""
-    known = f"{1e3 * _ROUGH * predicted.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
+    known = f"{1e3 * _ROUGH * session.mean_length:.0f} mm (a tenth of a leg, 1 sigma)"
     return [
-        f"calibrate may reject this dataset: with outlines good to 0.1 px, the predicted "
-        f"uncertainty of {direction}{others} exceeds {known}. Add images from other directions, or "
-        "at poses that differ more."
+        f"calibrate may reject this dataset: the predicted uncertainty of {direction}{others} "
+        f"exceeds {known}. Add images from other directions, or at poses that differ more."
     ]
 
 
@@ -356,35 +362,35 @@ def _machine_notes(machine: Machine) -> list[str]:
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
-def conditions_of(machine: Machine, predicted: PredictedObservations) -> tuple[Condition, ...]:
+def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
     """Return the paper's conditions for a session.
 
     Counts are by views, as printed. Views of a board count as one frame for the directions of a
     leg.
     """
-    image, leg = predicted.seen[predicted.view].nonzero()
+    image, leg = session.seen[session.view].nonzero()
     counts = count_conditions(
-        predicted.views,
-        predicted.n_legs,
-        spatial=predicted.spatial,
-        revolute=[j for j, x in enumerate(predicted.legs) if x.base_joint is JointType.REVOLUTE],
-        passive=[j for j, has in enumerate(predicted.with_length) if not has],
-        board=bool(predicted.board.all()),
-        actuators=predicted.on_actuators,
+        session.views,
+        session.n_legs,
+        spatial=session.spatial,
+        revolute=[j for j, x in enumerate(session.legs) if x.base_joint is JointType.REVOLUTE],
+        passive=[j for j, has in enumerate(session.with_length) if not has],
+        board=bool(session.board.all()),
+        actuators=session.on_actuators,
     )
-    frame, pose = predicted.frame[predicted.view[image]], predicted.pose[image]
-    moves = predicted.carried_by[leg] >= 0
+    frame, pose = session.frame[session.view[image]], session.pose[image]
+    moves = session.carried_by[leg] >= 0
     still, rods = np.flatnonzero(~moves), np.flatnonzero(moves)
-    q = predicted.q[pose[rods], predicted.carried_by[leg[rods]]]
+    q = session.q[pose[rods], session.carried_by[leg[rods]]]
     directions = two_directions(
-        frame[still], leg[still], predicted.u[pose[still], leg[still]], predicted.n_legs
+        frame[still], leg[still], session.u[pose[still], leg[still]], session.n_legs
     )
-    standing = tuple(j for j in directions.legs if predicted.carried_by[j] < 0)
+    standing = tuple(j for j in directions.legs if session.carried_by[j] < 0)
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        *enough_readings(frame[rods], leg[rods], q, predicted.legs),
-        three_legs_at_once(predicted.views, geometries(machine), spatial=predicted.spatial),
+        *enough_readings(frame[rods], leg[rods], q, session.legs),
+        three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
     )
 
 

@@ -13,17 +13,6 @@ from itertools import combinations
 
 import numpy as np
 
-from legcal.calibration.identify.predicted_observations import (
-    FOCAL_PX,
-    PredictedObservations,
-    cameras_for,
-    legs_around,
-    legs_in_words,
-    neighbours,
-    planned_observations,
-    ring_distance,
-    views_in_words,
-)
 from legcal.calibration.identify.ranks import Analysis, missing, undetermined, weak_directions
 from legcal.calibration.identify.report import (
     BoardRanks,
@@ -31,10 +20,19 @@ from legcal.calibration.identify.report import (
     Recommendation,
     Remedy,
     WeakDirection,
+    views_in_words,
 )
-from legcal.estimation.square_root import compress, marginal_rows
-from legcal.geometry.types import Array, IntArray
-from legcal.machine.directions import list_in_words
+from legcal.calibration.identify.session import (
+    Session,
+    cameras_for,
+    legs_around,
+    neighbours,
+    planned_session,
+    ring_distance,
+)
+from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
+from legcal.geometry.types import Array
+from legcal.machine.directions import legs_in_words, list_in_words
 from legcal.machine.leg import JointType
 from legcal.machine.model import Machine
 from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
@@ -54,6 +52,7 @@ _ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "
 def recommend(
     machine: Machine,
     images: int,
+    noise: PredictedNoise = DEFAULT_NOISE,
     *,
     board: bool = False,  # a calibration board on the base relates the cameras
     platform_board: bool = False,  # a calibration board on the platform shows its poses
@@ -67,7 +66,7 @@ def recommend(
     Empty if no set suffices.
     """
     recommendations = list[Recommendation]()
-    candidates = _Candidates(machine, images, board=board, platform_board=platform_board)
+    candidates = _Candidates(machine, images, noise, board=board, platform_board=platform_board)
     size_limit = machine.n_legs + 1
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, size_limit):
@@ -82,15 +81,23 @@ def recommend(
 class _Candidates:
     """Candidate views of neighbouring legs, with their information."""
 
-    def __init__(self, machine: Machine, images: int, *, board: bool, platform_board: bool) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        images: int,
+        noise: PredictedNoise,
+        *,
+        board: bool,
+        platform_board: bool,
+    ) -> None:
         self.machine, self.images = machine, images
         every = [range(machine.n_legs)]
-        self.predicted = planned_observations(
+        self.session = planned_session(
             machine, every, images, board=board, platform_board=platform_board
         )
-        self.every = Analysis(self.predicted)
+        self.every = Analysis(self.session, noise=noise)
         self.motion = self.every.motion
-        self.ring = legs_around(self.predicted)
+        self.ring = legs_around(self.session)
         self.of_size: dict[int, list[Analysis]] = {}
 
     def best(self, n_views: int, size: int) -> Recommendation | None:
@@ -103,13 +110,13 @@ class _Candidates:
                 continue
             chosen = [self.analyses(size)[k] for k in which]
             information = self.together(chosen)
-            if missing(self.predicted, information, self.motion):
+            if missing(self.session, information, self.motion):
                 continue
             sigma = self.motion.sigma(information)
             worst = float(np.linalg.svd(information, compute_uv=False)[-1])
             rank = 1.0 / worst if sigma is None else sigma.dX_m
             if best is None or rank < best[0]:
-                names = tuple(tuple(self.predicted.leg_names[j] for j in legs) for legs in views)
+                names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
                 best = (rank, Recommendation(names, size, sigma))
         return None if best is None else best[1]
 
@@ -122,7 +129,7 @@ class _Candidates:
 
     def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
         """Whether the paper's counts hold."""
-        s = self.predicted
+        s = self.session
         counts = count_conditions(
             views,
             s.n_legs,
@@ -138,16 +145,12 @@ class _Candidates:
     def together(self, chosen: Sequence[Analysis]) -> Array:
         """Combine the information of views on the parameters.
 
-        Views of a board on the base share one camera frame; a board on the platform has one pose.
+        Views of a board on the base share its pose; a board on the platform has one pose.
         """
-        n_p = len(self.predicted.unit)
-        by_view = [a.of_cameras for a in chosen]
-        if not self.predicted.board.all():
-            if not self.predicted.platform_board.any():
-                return compress(np.concatenate([a.information for a in chosen]))
-            kept = np.r_[:n_p, n_p + 6 : by_view[0].shape[1]]
-            by_view = [marginal_rows(rows, kept) for rows in by_view]
-        return marginal_rows(np.concatenate(by_view), np.arange(n_p))
+        first, *others = (a.contributions for a in chosen)
+        joined = first.with_more(others)
+        rows = np.concatenate([joined.all_gains(), joined.known])
+        return self.every.of_parameters(rows, joined.basis)
 
     def analyses(self, size: int) -> list[Analysis]:
         """Analyse every candidate view of *size* legs by itself."""
@@ -156,11 +159,10 @@ class _Candidates:
             seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
             for row, legs in zip(seen, views, strict=True):
                 row[list(legs)] = True
-            camera = cameras_for(self.predicted, views)
-            poses = np.arange(len(self.predicted.t))
+            cameras = cameras_for(self.session, views)
             self.of_size[size] = [
                 self.every.elsewhere(
-                    replace(self.predicted, seen=seen[[k]], camera=camera[[k]]), poses
+                    replace(self.session, seen=seen[[k]], cameras=cameras[k : k + 1])
                 )
                 for k in range(len(views))
             ]
@@ -176,16 +178,16 @@ def judge_board(
     link: Link = "base",
 ) -> BoardReport:
     """Report the effect of a board on a link, whether the session has one or not."""
-    predicted = analysis.predicted
-    is_visible = predicted.board if link == "base" else predicted.platform_board
+    session = analysis.session
+    is_visible = session.board if link == "base" else session.platform_board
     without_board = analysis.with_board(board=False, link=link) if is_visible.any() else analysis
     with_boards = (
         analysis if len(is_visible) and is_visible.all() else analysis.with_board(link=link)
     )
     views = (
-        np.flatnonzero(is_visible) if link == "base" else predicted.view[np.flatnonzero(is_visible)]
+        np.flatnonzero(is_visible) if link == "base" else session.view[np.flatnonzero(is_visible)]
     )
-    is_present = len(np.unique(views)) == predicted.n_views
+    is_present = len(np.unique(views)) == session.n_views
     needed = [
         before.name
         for before, after in zip(without, with_board, strict=True)
@@ -210,10 +212,10 @@ def _ranks(analysis: Analysis) -> BoardRanks:
 def _determined_by_board(without_board: Analysis, with_boards: Analysis) -> tuple[str, ...]:
     """Describe directions that move the platform and that only a board determines."""
     open_before, open_after = (
-        undetermined(a.predicted, a.information) for a in (without_board, with_boards)
+        undetermined(a.session, a.information) for a in (without_board, with_boards)
     )
     newly_determined = _complement(open_before, open_after)
-    directions = weak_directions(without_board.predicted, without_board.motion, newly_determined)
+    directions = weak_directions(without_board.session, without_board.motion, newly_determined)
     return tuple(d.direction for d in directions if not d.harmless)
 
 
@@ -227,7 +229,7 @@ def _complement(space: Array, part: Array) -> Array:
 class Replanner:
     """Planners of other sessions of the same machine."""
 
-    images: Callable[[int], PredictedObservations]  # with another number of images a view
+    images: Callable[[int], Session]  # with another number of images a view
     # the smallest sufficient sets of views
     views: Callable[[], tuple[Recommendation, ...]]
 
@@ -266,11 +268,11 @@ class _Score:
 
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     """Count the open directions with some parameters *known*."""
-    predicted, motion = analysis.predicted, analysis.motion
-    extra = np.zeros((len(known), len(predicted.unit)))
-    extra[np.arange(len(known)), list(known)] = _KNOWN / predicted.mean_length
+    session, motion = analysis.session, analysis.motion
+    extra = np.zeros((len(known), len(session.unit)))
+    extra[np.arange(len(known)), list(known)] = _KNOWN / session.mean_length
     rows = np.concatenate([analysis.information, extra])
-    return _Score(len(undetermined(predicted, rows)), missing(predicted, rows, motion))
+    return _Score(len(undetermined(session, rows)), missing(session, rows, motion))
 
 
 def _try_kind(
@@ -298,62 +300,61 @@ def _more_images(
     analysis: Analysis, replanning: Replanner | None
 ) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a session with more images a view."""
-    images = int(np.bincount(analysis.predicted.view).min())
+    images = int(np.bincount(analysis.session.view).min())
     if replanning is not None and images < ENOUGH_IMAGES:
         yield (
             f"take {ENOUGH_IMAGES} images a view instead of {images}",
-            lambda: _score(Analysis(replanning.images(ENOUGH_IMAGES))),
+            lambda: _score(analysis.elsewhere(replanning.images(ENOUGH_IMAGES))),
         )
 
 
 def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield views with one or two more legs, including a weak one."""
-    predicted, weak = analysis.predicted, _weak_legs(analysis)
-    ring = legs_around(predicted)
+    session, weak = analysis.session, _weak_legs(analysis)
+    ring = legs_around(session)
     for more in (1, 2):
         choices = [
             (sum(ring_distance(ring, j, view) for j in added), v, added)
-            for v, view in enumerate(predicted.views)
+            for v, view in enumerate(session.views)
             for added in combinations([j for j in ring if j not in view], more)
             if set(weak) & {*view, *added}
         ]
         for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
-            legs = tuple(sorted((*predicted.views[v], *added)))
-            text = f"show {legs_in_words(legs, predicted.leg_names)} together in view {v + 1}"
-            wider = _widened(predicted, v, legs)
-            yield text, partial(_score_with_more, analysis, wider, np.arange(len(predicted.t)))
+            legs = tuple(sorted((*session.views[v], *added)))
+            text = f"show {legs_in_words(legs, session.leg_names)} together in view {v + 1}"
+            wider = _widened(session, v, legs)
+            yield text, partial(_score_elsewhere, analysis, wider)
 
 
 def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield further camera positions that show weak legs and their neighbours."""
-    predicted, weak = analysis.predicted, _weak_legs(analysis)
-    ring = legs_around(predicted)
-    largest = max(len(view) for view in predicted.views)
-    which = _ORDINAL[predicted.n_views] if predicted.n_views < len(_ORDINAL) else "further"
+    session, weak = analysis.session, _weak_legs(analysis)
+    ring = legs_around(session)
+    largest = max(len(view) for view in session.views)
+    which = _ORDINAL[session.n_views] if session.n_views < len(_ORDINAL) else "further"
     article = "an" if which == "eighth" else "a"
-    for size in sorted({min(k, predicted.n_legs) for k in (3, 4, largest)}):
+    for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
         groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
         groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
         for legs in groups:
-            named = legs_in_words(legs, predicted.leg_names)
+            named = legs_in_words(legs, session.leg_names)
             text = f"add {article} {which} camera position ({named})"
-            poses = np.append(np.arange(len(predicted.t)), predicted.pose[predicted.view == 0])
-            yield text, partial(_score_with_more, analysis, _extended(predicted, legs), poses)
+            yield text, partial(_score_elsewhere, analysis, _extended(session, legs))
 
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a calibration board on the base, and one on the platform."""
-    if analysis.predicted.n_frames > 1:
+    if len(set(analysis.session.frame.tolist())) > 1:
         text = "put a calibration board on the base, visible to every camera"
         yield text, lambda: _score(analysis.with_board())
-    if not analysis.predicted.platform_board.any():
+    if not analysis.session.platform_board.any():
         text = "put a calibration board on the platform, visible to every camera"
         yield text, lambda: _score(analysis.with_board(link="platform"))
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield parameters to measure otherwise and fix: one of each direction, or all of them."""
-    names = analysis.predicted.parametrization.names
+    names = analysis.session.parametrization.names
     first = list(dict.fromkeys(d.parameters[0] for d in _harmful(analysis)))
     choices: list[tuple[str, ...]] = [(name,) for name in first[:_MOST_FIXED]]
     if 1 < len(first) <= _MOST_FIXED:
@@ -368,23 +369,21 @@ def _other_views(analysis: Analysis, replanning: Replanner | None) -> tuple[Reme
     sets = () if replanning is None else replanning.views()
     if not sets:
         return ()
-    names = analysis.predicted.leg_names
+    names = analysis.session.leg_names
     views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
     n_p = analysis.full.of
     return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, True),)
 
 
-def _score_with_more(
-    analysis: Analysis, predicted: PredictedObservations, poses: IntArray
-) -> _Score:
-    """Count the open directions in a session with more observations, at a subset of poses."""
-    return _score(analysis.elsewhere(predicted, poses))
+def _score_elsewhere(analysis: Analysis, session: Session) -> _Score:
+    """Count the open directions in a session with other observations."""
+    return _score(analysis.elsewhere(session))
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
     """Legs with undetermined parameters."""
     touched = {p for d in _harmful(analysis) for p in d.parameters}
-    names = analysis.predicted.leg_names
+    names = analysis.session.leg_names
     return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
@@ -393,34 +392,33 @@ def _harmful(analysis: Analysis) -> list[WeakDirection]:
     return [d for d in analysis.full.weak if not d.harmless]
 
 
-def _widened(
-    predicted: PredictedObservations, v: int, legs: Sequence[int]
-) -> PredictedObservations:
+def _widened(session: Session, v: int, legs: Sequence[int]) -> Session:
     """Change the legs of a view."""
-    seen = predicted.seen.copy()
+    seen = session.seen.copy()
     seen[v] = False
     seen[v, list(legs)] = True
-    return replace(predicted, seen=seen)
+    return replace(session, seen=seen)
 
 
-def _extended(predicted: PredictedObservations, legs: Sequence[int]) -> PredictedObservations:
+def _extended(session: Session, legs: Sequence[int]) -> Session:
     """Add a camera with as many images as the first."""
-    images = predicted.pose[predicted.view == 0]
-    new = len(predicted.t) + np.arange(len(images))
-    seen = np.zeros((1, predicted.n_legs), dtype=np.bool_)
+    images = session.pose[session.view == 0]
+    new = len(session.t) + np.arange(len(images))
+    seen = np.zeros((1, session.n_legs), dtype=np.bool_)
     seen[0, list(legs)] = True
+    (further,) = cameras_for(session, [legs])
     return replace(
-        predicted,
-        R=np.concatenate([predicted.R, predicted.R[images]]),
-        t=np.concatenate([predicted.t, predicted.t[images]]),
-        view=np.concatenate([predicted.view, np.full(len(images), predicted.n_views)]),
-        pose=np.concatenate([predicted.pose, new]),
-        seen=np.concatenate([predicted.seen, seen]),
-        camera=np.concatenate([predicted.camera, cameras_for(predicted, [legs])]),
-        focal=np.append(predicted.focal, FOCAL_PX),
-        board=np.append(predicted.board, predicted.board.all()),
+        session,
+        R=np.concatenate([session.R, session.R[images]]),
+        t=np.concatenate([session.t, session.t[images]]),
+        unread=np.concatenate([session.unread, session.unread[images]]),
+        view=np.concatenate([session.view, np.full(len(images), session.n_views)]),
+        pose=np.concatenate([session.pose, new]),
+        seen=np.concatenate([session.seen, seen]),
+        cameras=(*session.cameras, replace(further, name="further")),
+        board=np.append(session.board, session.board.all()),
         platform_board=np.append(
-            predicted.platform_board,
-            np.full(len(images), predicted.platform_board.all())[: len(predicted.platform_board)],
+            session.platform_board,
+            np.full(len(images), session.platform_board.all())[: len(session.platform_board)],
         ),
     )

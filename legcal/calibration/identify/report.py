@@ -12,6 +12,17 @@ from legcal.brief import brief
 from legcal.files.schema import Document, SparseDocument
 from legcal.paper.conditions import Condition
 
+_TIMES = {2: "two", 3: "three", 4: "four"}
+
+
+def views_in_words(views: Sequence[str]) -> str:
+    """Return views one after the other, equal ones once: ``1,2,3 from two places``."""
+    said = []
+    for view in dict.fromkeys(views):
+        times = list(views).count(view)
+        said.append(view if times == 1 else f"{view} from {_TIMES.get(times, times)} places")
+    return "; ".join(said)
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -111,8 +122,8 @@ class CameraIntrinsics:
 
     camera: str  # the view after whose name the intrinsics are called
     determined: bool  # whether the legs determine all four
-    # standard deviations of ``fx``, ``fy``, ``cx``, ``cy`` to expect with outlines good to 0.1 px,
-    # radii known to 2 % [px]; None for those that stay open
+    # standard deviations of ``fx``, ``fy``, ``cx``, ``cy`` to expect [px]; None for those that stay
+    # open
     sigma: dict[str, float | None]
 
 
@@ -137,8 +148,8 @@ class Identifiability:
     images: tuple[int, ...]  # number of images of each view
     board: BoardReport  # effect of a calibration board on the base
     platform_board: BoardReport  # the same of one on the platform
-    # standard deviation of the platform that is to be expected from outlines good to 0.1 px, rms
-    # over the poses. None where something that moves the platform is not determined, or the motors
+    # standard deviation of the platform that is to be expected, rms over the poses. None where
+    # something that moves the platform is not determined, or the motors
     # do not determine its pose
     platform_sigma: RmsMotion | None
     remedies: tuple[

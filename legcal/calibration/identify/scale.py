@@ -7,24 +7,18 @@ the scale; a default prior on radii, or on lines of arms, must not do so silentl
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from legcal.calibration.identify.information import (
-    length_rows,
-    prior_of_arms,
-    radius_rows,
-    session_problem,
-)
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
+from legcal.calibration.joint_fit.predicted_noise import WHITE
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
-from legcal.estimation.problem import GaussianPrior, Variables, all_free
-from legcal.estimation.square_root import information_rows, marginal_rows
-from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import SIGMA_LENGTH, LegColumns, radius_name
+from legcal.geometry.types import Array
+from legcal.machine.leg import SIGMA_LENGTH, LegColumns
 from legcal.vision.board import Link
 
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
@@ -35,11 +29,11 @@ _LINKS: tuple[Link, ...] = ("base", "platform")
 
 def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
     """Return possible sources of scale with their accuracy; empty if the scale is known."""
-    if not analysis.predicted.actuators or not is_scale_open(analysis):
+    if not analysis.session.actuators or not is_scale_open(analysis):
         return ()
-    names = analysis.predicted.parametrization.names
-    measured = analysis.predicted.columns(LegColumns.LENGTH)[:1]
-    length = SIGMA_LENGTH * analysis.predicted.mean_length
+    names = analysis.session.parametrization.names
+    measured = analysis.session.columns(LegColumns.LENGTH)[:1]
+    length = SIGMA_LENGTH * analysis.session.mean_length
     radius = RefinementSettings.radius_sigma
     row = np.zeros((1, len(names)))
     row[0, measured] = 1.0 / length
@@ -70,21 +64,29 @@ def is_scale_open(analysis: Analysis) -> bool:
     the scale no better than half of the default prior of radii does not count: the default prior
     would dominate silently.
     """
+    analysis = replace(analysis, noise=WHITE)  # what is known of lengths, and not of edges
     stated = _stated_radii(analysis)
-    if _n_open(analysis, stated) > _n_open(analysis, 0.0):
+    if _n_open(analysis, stated) > _n_open(analysis, _all_known(analysis)):
         return True
     if not analysis.choices.priors:
         return False
-    known, seen = (_sigma(analysis, _information(analysis, radii)) for radii in (stated, 0.0))
+    known, seen = (
+        _sigma(analysis, _information(analysis, radii)) for radii in (stated, _all_known(analysis))
+    )
     if known is None or seen is None or known**2 - seen**2 <= _VAGUE**2:
         return False
-    nothing = Analysis(analysis.predicted, replace(analysis.choices, priors={}))
-    return _n_open(nothing, _stated_radii(nothing)) > _n_open(nothing, 0.0)
+    nothing = replace(analysis, choices=replace(analysis.choices, priors={}))
+    return _n_open(nothing, _stated_radii(nothing)) > _n_open(nothing, _all_known(nothing))
 
 
-def _n_open(analysis: Analysis, sigma_radius: Array | float) -> int:
-    """Count the open directions for standard deviations *sigma_radius* of radii [m]."""
-    return len(undetermined(analysis.predicted, _information(analysis, sigma_radius)))
+def _n_open(analysis: Analysis, sigma_radii: Mapping[str, float]) -> int:
+    """Count the open directions for standard deviations of radii [m]."""
+    return len(undetermined(analysis.session, _information(analysis, sigma_radii)))
+
+
+def _all_known(analysis: Analysis) -> dict[str, float]:
+    """Return standard deviations of radii that are known exactly [m]."""
+    return dict.fromkeys(analysis.session.radii, _KNOWN * analysis.session.mean_length)
 
 
 def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
@@ -96,13 +98,13 @@ def _source(analysis: Analysis, name: str, words: str, information: Array) -> Sc
 
 def _sigma(analysis: Analysis, information: Array) -> float | None:
     """Relative standard deviation of the scale; None if it is open."""
-    predicted = analysis.predicted
-    columns = predicted.columns(LegColumns.LENGTH)
-    lengths = np.array([leg.q0 for leg in predicted.legs])[: len(columns)]
-    mean = np.zeros(len(predicted.unit))  # of the relative errors of lengths
+    session = analysis.session
+    columns = session.columns(LegColumns.LENGTH)
+    lengths = np.array([leg.q0 for leg in session.legs])[: len(columns)]
+    mean = np.zeros(len(session.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
-    undetermined_directions = undetermined(predicted, information)
-    leaves_more = len(undetermined_directions) > _n_open(analysis, 0.0)
+    undetermined_directions = undetermined(session, information)
+    leaves_more = len(undetermined_directions) > _n_open(analysis, _all_known(analysis))
     if leaves_more or np.linalg.norm(undetermined_directions @ mean) > _OPEN * np.linalg.norm(mean):
         return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
@@ -111,56 +113,37 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
 
 
 def _information(
-    analysis: Analysis, sigma_radius: Array | float = np.inf, *, common: float | None = None
+    analysis: Analysis,
+    sigma_radii: Mapping[str, float] | None = None,
+    *,
+    common: float | None = None,
 ) -> Array:
-    """Information rows by parameters, for priors *sigma_radius* [m] or a *common* relative error.
+    """Information rows by parameters, for standard deviations [m] of radii, or a *common* error.
 
-    Lines of arms have stated priors only.
+    That is relative, and the same for all. Lines of arms have stated priors only.
     """
-    predicted = analysis.predicted
-    n, by_radius = predicted.n_bodies, radius_rows(predicted)
-    shape = by_radius.shape[:2]
-    radii: tuple[Variables, IntArray, Array]
+    found, radii = analysis.without_radii, analysis.session.radii
+    rows = np.concatenate([found.all_gains(), found.known])
+    column = {name.removeprefix("radii "): i for i, name in enumerate(found.names)}
     if common is not None:
-        prior_of_common = GaussianPrior(np.zeros(1, dtype=np.intp), np.zeros(1), np.array([common]))
-        relative = by_radius * predicted.body_radius[:, None, None]
-        radii = (
-            Variables("radius", all_free(1, 1), prior=prior_of_common),
-            np.zeros(shape, dtype=np.intp),
-            relative,
-        )
-    else:
-        sigma = np.maximum(np.broadcast_to(sigma_radius, n), _KNOWN * predicted.mean_length)
-        which = np.flatnonzero(np.isfinite(sigma))
-        prior = GaussianPrior(which, np.zeros(len(which)), sigma[which])
-        body = np.broadcast_to(np.arange(n), shape)
-        radii = (Variables("radius", all_free(n, 1), prior=prior), body, by_radius)
-    problem, state = session_problem(
-        predicted,
-        analysis.images,
-        analysis.equations,
-        analysis.prior,
-        (radii,),
-        length_rows(predicted, analysis.choices),
-        prior_of_arms(predicted, analysis.choices, stated=True),
-    )
-    return marginal_rows(information_rows(problem, state), problem.where("parameters"))
+        seen = [name for name in radii if name in column]
+        by_common = rows[:, [column[name] for name in seen]] @ [radii[name] for name in seen]
+        rows = np.column_stack([np.delete(rows, [column[name] for name in seen], 1), by_common])
+        prior = np.eye(1, rows.shape[1], rows.shape[1] - 1) / common
+        return analysis.of_parameters(np.concatenate([rows, prior]), found.basis)
+    sigma_radii = sigma_radii or {}
+    known = [name for name in sigma_radii if name in column]
+    prior = np.zeros((len(known), rows.shape[1]))
+    for row, name in zip(prior, known, strict=True):
+        row[column[name]] = 1.0 / sigma_radii[name]
+    return analysis.of_parameters(np.concatenate([rows, prior]), found.basis)
 
 
-def _stated_radii(analysis: Analysis) -> Array:
-    """Stated standard deviations of radii, infinite for the others [m]."""
-    choices, predicted = analysis.choices, analysis.predicted
-
-    def sigma(j: int, arm: str) -> float:
-        leg = predicted.legs[j]
-        links = [arm] if arm else leg.radius_along
-        names = [radius_name(predicted.leg_names[j], link) for link in links]
-        stated = [choices.priors[name].sigma for name in names if name in choices.priors]
-        if choices.fixed.intersection(names):
-            stated.append(_KNOWN * predicted.mean_length)
-        return min(stated, default=np.inf)
-
-    return np.array([sigma(*part) for part in predicted.parts])
+def _stated_radii(analysis: Analysis) -> dict[str, float]:
+    """Return stated standard deviations of radii [m]."""
+    choices, exact = analysis.choices, _all_known(analysis)
+    stated = {name: sigma for name, sigma in exact.items() if name in choices.fixed}
+    return stated | {name: choices.priors[name].sigma for name in exact if name in choices.priors}
 
 
 def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
@@ -177,7 +160,9 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
             "the gains of all motors that slide are free",
             "fix one of these gains, or ",
         )
-    if _n_open(analysis, _stated_radii(analysis)) == _n_open(analysis, 0.0):  # something is stated
+    if _n_open(analysis, _stated_radii(analysis)) == _n_open(
+        analysis, _all_known(analysis)
+    ):  # something is stated
         reason += f", and the stated values determine the scale no better than {100 * _VAGUE:g} %"
     stated = f"state a measured length ({machine.length_option})"
     if dataset.axes is None:

@@ -145,7 +145,7 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
         directions = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
         if directions:
-            parts.append(OpenPart(frame, kind, tuple(directions)))
+            parts.append(OpenPart(frame=frame, kind=kind, directions=directions))
     return parts
 
 
@@ -298,7 +298,7 @@ def _weak(covariance: Array, fit: FrameFit, pairs: PosePairs, *, oriented: bool)
         if sigma <= limit:
             continue
         v = vectors[:, -1] if frame == "tool" else fit.frames[0, :, :3].T @ vectors[:, -1]
-        part = OpenPart(frame, kind, (direction_of(v),))
+        part = OpenPart(frame=frame, kind=kind, directions=[direction_of(v)])
         uncertainty = (
             f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
         )

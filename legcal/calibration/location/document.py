@@ -39,6 +39,64 @@ _Vector = Annotated[
 _Size = Annotated[Number, Field(ge=0.0)]
 
 
+class RowResidual(FileSchema):
+    """Residuals of a row of the measured poses."""
+
+    row: Annotated[int, Field(ge=1)]  # number of the row in the file, from 1
+    position: _Vector  # measured minus predicted position of the tool, in the world [m]
+    # residual of the orientation as a rotation vector about world axes [rad]; None if the
+    # orientation was not measured
+    rotation: _Vector | None
+    left_out: str  # reason for leaving the row out; "" if it was used
+
+    @property
+    def used(self) -> bool:
+        """Whether the row was used in the fit."""
+        return not self.left_out
+
+    @property
+    def reason(self) -> str:
+        """The reason for leaving the row out; "" if it was used."""
+        return self.left_out
+
+
+class MeasurementNoise(FileSchema):
+    """Standard deviations of the measured poses."""
+
+    position: _Size  # standard deviation of a component, rms over the rows [m]
+    angle: _Size | None  # the same [rad]; None if no orientations were measured
+    # position_stated, angle_stated: whether the standard deviation was stated, rather than
+    # estimated from the residuals
+    position_stated: bool
+    angle_stated: bool
+    reading: _Size  # stated standard deviation of a reading [m or rad]; zero if none was stated
+    model: bool  # whether the covariance of a calibrated model is included
+
+
+class OpenPart(FileSchema):
+    """An undetermined or poorly determined part of the frames."""
+
+    frame: LocatedFrame
+    kind: PoseComponent
+    # unit vectors in the base link or in the platform link
+    directions: Annotated[list[_Vector], Field(min_length=1, max_length=3)]
+
+    @property
+    def words(self) -> str:
+        """Description of the part in words."""
+        whose = "the base in the world" if self.frame == "base" else "the tool in the platform"
+        link = "the base" if self.frame == "base" else "the platform"
+        start = f"the {self.kind} of {whose}"
+        if len(self.directions) == 3:
+            return start
+        if len(self.directions) == 2:
+            normal = np.cross(*np.array(self.directions))
+            return f"{start} across {direction_words(normal)} of {link}"
+        link = "its own axes" if self.frame == "base" else link
+        how = "along" if self.kind == "position" else "about"
+        return f"{start} {how} {direction_words(self.directions[0])} of {link}"
+
+
 @brief
 @dataclass(frozen=True, eq=False)
 class Location:
@@ -125,62 +183,6 @@ class Location:
         return _rms(turns) if turns else None
 
 
-@dataclass(frozen=True)
-class RowResidual:
-    """Residuals of a row of the measured poses."""
-
-    row: int  # number of the row in the file, from 1
-    # measured minus predicted position of the tool, in the world [m]
-    position: tuple[float, float, float]
-    # residual of the orientation as a rotation vector about world axes [rad]; None if the
-    # orientation was not measured
-    rotation: tuple[float, float, float] | None
-    reason: str = ""  # reason for leaving the row out; "" if it was used
-
-    @property
-    def used(self) -> bool:
-        """Whether the row was used in the fit."""
-        return not self.reason
-
-
-@dataclass(frozen=True)
-class MeasurementNoise:
-    """Standard deviations of the measured poses."""
-
-    position: float  # standard deviation of a component, rms over the rows [m]
-    angle: float | None  # the same [rad]; None if no orientations were measured
-    # position_stated, angle_stated: whether the standard deviation was stated, rather than
-    # estimated from the residuals
-    position_stated: bool
-    angle_stated: bool
-    reading: float  # stated standard deviation of a reading [m or rad]; zero if none was stated
-    model: bool  # whether the covariance of a calibrated model is included
-
-
-@dataclass(frozen=True)
-class OpenPart:
-    """An undetermined or poorly determined part of the frames."""
-
-    frame: LocatedFrame  # {"base", "tool"}
-    kind: PoseComponent  # {"position", "orientation"}
-    directions: tuple[Direction, ...]  # unit vectors in the base link or in the platform link
-
-    @property
-    def words(self) -> str:
-        """Description of the part in words."""
-        whose = "the base in the world" if self.frame == "base" else "the tool in the platform"
-        link = "the base" if self.frame == "base" else "the platform"
-        start = f"the {self.kind} of {whose}"
-        if len(self.directions) == 3:
-            return start
-        if len(self.directions) == 2:
-            normal = np.cross(*np.array(self.directions))
-            return f"{start} across {direction_words(normal)} of {link}"
-        link = "its own axes" if self.frame == "base" else link
-        how = "along" if self.kind == "position" else "about"
-        return f"{start} {how} {direction_words(self.directions[0])} of {link}"
-
-
 def open_parts_in_words(parts: list[OpenPart]) -> str:
     """Return one phrase for all parts, the tool's first."""
     words = [part.words for part in sorted(parts, key=lambda part: part.frame != "tool")]
@@ -216,42 +218,14 @@ class _FrameEntry(MotionEntry):
     sigma_rotation: _Vector | None
 
 
-class _OpenPartEntry(FileSchema):
-    """A part that no pose of the machine determines."""
-
-    frame: Literal["base", "tool"]
-    kind: Literal["position", "orientation"]
-    directions: Annotated[list[_Vector], Field(min_length=1, max_length=3)]
-
-
 class _Determined(FileSchema):
     """The determined frames, and the directions held at their given values."""
 
     everything: bool
     tool_orientation: bool
-    held: list[_OpenPartEntry]
+    held: list[OpenPart]
     tool_position: _Vector
     words: str
-
-
-class _Noise(FileSchema):
-    """Standard deviations of the measured poses."""
-
-    position: _Size
-    angle: _Size | None
-    position_stated: bool
-    angle_stated: bool
-    reading: _Size
-    model: bool
-
-
-class _RowEntry(FileSchema):
-    """Residuals of a row."""
-
-    row: Annotated[int, Field(ge=1)]
-    position: _Vector
-    rotation: _Vector | None
-    left_out: str
 
 
 class _ResidualsEntry(FileSchema):
@@ -262,7 +236,7 @@ class _ResidualsEntry(FileSchema):
     p_value: _Size | None
     rms_position: _Size
     rms_angle: _Size | None
-    rows: Annotated[list[_RowEntry], Field(min_length=1)]
+    rows: Annotated[list[RowResidual], Field(min_length=1)]
 
 
 class _Tool(FileSchema):
@@ -290,7 +264,7 @@ class LocationFile(FileSchema):
     T_world_base: _FrameEntry
     T_platform_tool: _FrameEntry
     determined: _Determined
-    noise: _Noise
+    noise: MeasurementNoise
     tool_in_world_sigma: _Tool
     residuals: _ResidualsEntry
     covariance: _Covariance
@@ -318,14 +292,11 @@ def location_document(location: Location) -> dict[str, Any]:
         "determined": {
             "everything": not location.held,
             "tool_orientation": location.has_tool_orientation,
-            "held": [
-                {"frame": h.frame, "kind": h.kind, "directions": [list(v) for v in h.directions]}
-                for h in location.held
-            ],
+            "held": [part.model_dump(mode="json") for part in location.held],
             "tool_position": list(location.held_at),
             "words": location.held_words,
         },
-        "noise": vars(location.noise).copy(),
+        "noise": location.noise.model_dump(mode="json"),
         "tool_in_world_sigma": {
             "position": location.tool_position_sigma,
             "angle": location.tool_angle_sigma,
@@ -336,15 +307,7 @@ def location_document(location: Location) -> dict[str, Any]:
             "p_value": location.p_value,
             "rms_position": location.rms_position,
             "rms_angle": location.rms_angle,
-            "rows": [
-                {
-                    "row": row.row,
-                    "position": list(row.position),
-                    "rotation": None if row.rotation is None else list(row.rotation),
-                    "left_out": row.reason,
-                }
-                for row in location.rows
-            ],
+            "rows": [row.model_dump(mode="json") for row in location.rows],
         },
         "covariance": {"names": list(NAMES), "matrix": location.covariance.tolist()},
         "notes": list(location.notes),
@@ -407,11 +370,11 @@ def load_location(file: str | Path) -> Location:
         T_platform_tool=document.T_platform_tool.motion(),
         has_tool_orientation=determined.tool_orientation,
         covariance=_matrix(path, document.covariance),
-        held=tuple(OpenPart(h.frame, h.kind, tuple(h.directions)) for h in determined.held),
+        held=tuple(determined.held),
         held_at=determined.tool_position,
         held_words=determined.words,
-        noise=MeasurementNoise(**document.noise.model_dump()),
-        rows=tuple(RowResidual(r.row, r.position, r.rotation, r.left_out) for r in residuals.rows),
+        noise=document.noise,
+        rows=tuple(residuals.rows),
         chi2=residuals.chi2,
         dof=residuals.dof,
         p_value=residuals.p_value,

@@ -354,10 +354,10 @@ def _rows(
         reason = "" if inliers.is_inlier[i] else _off(measurements, inliers, i)
         rows.append(
             RowResidual(
-                number,
-                (float(r[i, 0]), float(r[i, 1]), float(r[i, 2])),
-                (float(r[i, 3]), float(r[i, 4]), float(r[i, 5])) if pairs.oriented[i] else None,
-                reason,
+                row=number,
+                position=r[i, :3].tolist(),
+                rotation=r[i, 3:6].tolist() if pairs.oriented[i] else None,
+                left_out=reason,
             )
         )
     return rows

@@ -13,7 +13,7 @@ import numpy as np
 
 from legcal.calibration.identify.identifiability import ranks_of_dataset
 from legcal.calibration.notes import Topic, topic_of
-from legcal.calibration.quantities import DIGITS
+from legcal.calibration.quantities import DIGITS, mm_deg
 from legcal.calibration.result import Calibration
 from legcal.data.dataset import OBSERVATIONS_NAME, Dataset
 from legcal.errors import LegcalError
@@ -125,9 +125,8 @@ def held_out_blocks(calibration: Calibration) -> list[Any]:
     if holdout.platform is not None:
         pair = holdout.platform
         facts["At the platform"] = (
-            f"{1e3 * pair.dX_m:.3f} mm / {np.degrees(pair.dE_rad):.4f} deg (rms over {pair.poses} "
-            f"poses); {1e3 * pair.expected_dX_m:.3f} mm / {np.degrees(pair.expected_dE_rad):.4f} "
-            "deg were expected"
+            f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms over {pair.poses} poses); "
+            f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected"
         )
     rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in holdout.views.items()]
     return [Facts(facts), Table(("view", ">rms [px]"), rows)]

@@ -10,6 +10,7 @@ from legcal.calibration.doubts import Doubt
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.pipeline import exact_cameras
+from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration
 from legcal.calibration.verification import Check
 from legcal.pages.document import Light, Verdict
@@ -35,10 +36,7 @@ def _effect(doubt: Doubt) -> str:
     """Return how far a doubt would move the platform, in words."""
     if doubt.sigma_dX_m is None or doubt.sigma_dE_rad is None:
         return ""
-    return (
-        f" At the platform: {1e3 * doubt.sigma_dX_m:.3f} mm / "
-        f"{np.degrees(doubt.sigma_dE_rad):.4f} deg."
-    )
+    return f" At the platform: {mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)}."
 
 
 def _grounds(calibration: Calibration) -> list[str]:

@@ -1,9 +1,10 @@
-"""Visibility prediction: the visible segment of every part of legs and arms in an image.
+"""Sight: the visible segment of every part of legs and arms in an image, and its outlines.
 
 A segment is visible if it is in the picture with a margin, in front of the camera, and not behind
 another leg or arm, another solid of the model or a plate. The joints of base and platform span
 plates; joints on carriages and arms do not. Points of the axes are tested along rays, for many
-poses at once; outlines follow from eqs (3) and (5).
+poses at once; outlines follow from eqs (3) and (5). Where somebody states which legs a camera
+shows, nothing hides them.
 """
 
 from __future__ import annotations
@@ -15,17 +16,12 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.outlines import Outlines, unmeasured
-from legcal.data.reasons import USED
-from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Cylinder, Leg
-from legcal.machine.model import Machine
-from legcal.machine.occluders import PlacedOccluders
-from legcal.machine.rods import ends_in_base, readings_of_rods
-from legcal.perception.placement import placed_arms
+from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
+from legcal.machine.occluders import Occluder, PlacedOccluders
+from legcal.machine.rods import arms_at, ends_in_base, readings_of_rods
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.visibility import (
     in_picture,
     least_length,
@@ -61,21 +57,31 @@ class Bodies:
         return len(self.is_moved)
 
     @classmethod
-    def at(cls, machine: Machine, legs: Sequence[Leg], poses: Sequence[RigidTransform]) -> Bodies:
-        """Place legs in R_b and R_e at poses T_Rb_Re, with the radii of the model."""
-        (R, t), T = Frames.of(poses), machine.T_base_Rb
+    def at(
+        cls,
+        legs: Sequence[Leg],  # in R_b and R_e
+        R: Array,  # R, t: (n_images, 3, 3) and (n_images, 3): poses T_Rb_Re
+        t: Array,
+        size: float,
+        *,
+        T_base_Rb: RigidTransform | None = None,  # without it R_b is the base link
+        occluders: Sequence[Occluder] = (),
+    ) -> Bodies:
+        """Place legs at poses."""
+        T = RigidTransform.identity() if T_base_Rb is None else T_base_Rb
         A, B = ends_in_base(legs, T, R, t)
-        pose = np.arange(len(poses), dtype=np.intp)
-        arms = placed_arms(legs, readings_of_rods(legs, R, t), pose, T_base=T)
-        near, far = ([arm.ends[:, k : k + 1] for arm in arms.values()] for k in (0, 1))
+        arms = arms_at(legs, readings_of_rods(legs, R, t))
+        ends = [T.apply(arm.reshape(-1, 3)).reshape(arm.shape) for arm in arms.values()]
+        near, far = ([arm[:, k : k + 1] for arm in ends] for k in (0, 1))
+        cylinders = ([cylinder_of_arm(arm)] for leg in legs if (arm := leg.arm) is not None)
         return cls(
             np.concatenate([A, *near], axis=1),
             np.concatenate([B, *far], axis=1),
-            (*(leg.cylinders for leg in machine.legs), *([arm.cylinder] for arm in arms.values())),
+            (*(leg.cylinders for leg in legs), *cylinders),
             np.array([*range(len(legs)), *arms], dtype=np.intp),
             np.array([leg.actuator is not None for leg in legs], dtype=np.bool_),
-            machine.size,
-            PlacedOccluders.at(machine.occluders, A, B) if machine.occluders else (),
+            size,
+            PlacedOccluders.at(occluders, A, B) if occluders else (),
         )
 
     def before(self, T_base_camera: RigidTransform) -> Bodies:
@@ -115,25 +121,6 @@ class Seen:
     ends: Array  # (n, 2, 2, 2) of both outlines, both ends [px], the first nearer to the base joint
     length_px: Array  # (n,)
 
-    def outlines(self, sigma_px: float, row: IntArray) -> Outlines:
-        """Return the outlines with noise *sigma_px* per pixel of length; *row* of each image."""
-        n = len(self.leg)
-        of_ends = np.array([[4.0, -2.0], [-2.0, 4.0]])  # of a line through many points
-        covariance = (sigma_px**2 / self.length_px)[:, None, None] * of_ends
-        return Outlines(
-            row=np.repeat(row[self.image], 2),
-            leg=np.repeat(self.leg, 2),
-            part=tuple(part for part in self.part for _ in EPSILON),
-            edge=np.tile(np.array([1, 2], dtype=np.intp), n),
-            h=self.h.reshape(-1, 3),
-            ends=self.ends.reshape(-1, 2, 2),
-            covariance=np.repeat(covariance, 2, axis=0),
-            used=np.ones(2 * n, dtype=np.bool_),
-            reason=(USED,) * (2 * n),
-            source=("detected",) * (2 * n),
-            **unmeasured(2 * n),
-        )
-
     def only(self, image: int) -> Seen:
         """Select the segments of one image."""
         selected = np.flatnonzero(self.image == image)
@@ -159,6 +146,7 @@ def visible_parts(
     T_base_camera: RigidTransform,
     bodies: Bodies,
     margin_px: float = 0.0,  # free margin at the border of the picture
+    stated: BoolArray | None = None,  # (n_legs,) the legs that the camera shows, if somebody says
 ) -> Seen:
     """Return the visible segments of legs and arms in images of one camera."""
     bodies = bodies.before(T_base_camera)
@@ -168,33 +156,24 @@ def visible_parts(
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, body]
     P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_SAMPLES, 3)
+    margin_px = margin_px if stated is None else -np.inf
     is_visible = (end > start)[..., None] & in_picture(camera, P, bodies.nearest, margin_px)
     foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
     is_visible &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
-    largest_radius = np.zeros(len(bodies.leg))
-    np.maximum.at(largest_radius, body, radius)
-    is_visible &= ~_behind_others(P, body, radius, A, u, length, largest_radius)
-    own, beside = (
-        np.repeat(x, N_SAMPLES) for x in (np.where(body < bodies.n_legs, body, -1), radius)
-    )
-    for k, placed in enumerate(bodies.occluders):
-        hides = placed.hide(P[k].reshape(-1, 3), own, beside, beside) >= 0
-        is_visible[k] &= ~hides.reshape(is_visible.shape[1:])
-    thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
-    is_visible &= ~behind_plate(P, A[:, :n][:, ~bodies.is_moved], thick)
-    is_visible &= ~behind_plate(P, bodies.B[:, :n], thick)
+    if stated is None:
+        is_visible &= ~_hidden(bodies, P, body, radius)
+    else:
+        is_visible &= stated[bodies.leg[body]][:, None]
     first, last = longest_runs(is_visible)
     image, part = np.nonzero(last > first)
     first_end, last_end = (s[image, part, k[image, part]] for k in (first, last))
     u_seen, M = u_part[image, part], A[image, body[part]]
     h = outlines_of_axis(u_seen, M, radius[part])
     axis = M[:, None] + np.stack([first_end, last_end], axis=1)[..., None] * u_seen[:, None]
-    # h . M = epsilon R on the axis: the cylinder touches the plane of its outline at M - eps R h.
-    touching = EPSILON[:, None, None] * radius[part][:, None, None, None] * h[:, :, None]
-    ends = camera.project(axis[:, None] - touching)
+    ends = camera.project(axis[:, None] + steps_to_outlines(h, radius[part])[:, :, None])
     length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
     width_px = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean(axis=1)
-    is_long = length_px >= least_length(width_px)
+    is_long = (length_px >= least_length(width_px)) | (stated is not None)
     parts = part[is_long]
     return Seen(
         image[is_long],
@@ -205,6 +184,22 @@ def visible_parts(
         ends[is_long],
         length_px[is_long],
     )
+
+
+def _hidden(bodies: Bodies, P: Array, body: IntArray, radius: Array) -> BoolArray:
+    """Return a mask of the points P (n_images, n_parts, m, 3) of parts that something hides."""
+    largest_radius = np.zeros(len(bodies.leg))
+    np.maximum.at(largest_radius, body, radius)
+    hidden = _behind_others(P, body, radius, bodies.A, *bodies.axes, largest_radius)
+    own_leg, beside = (
+        np.repeat(x, N_SAMPLES) for x in (np.where(body < bodies.n_legs, body, -1), radius)
+    )
+    for k, placed in enumerate(bodies.occluders):
+        hides = placed.hide(P[k].reshape(-1, 3), own_leg, beside, beside) >= 0
+        hidden[k] |= hides.reshape(hidden.shape[1:])
+    thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
+    hidden |= behind_plate(P, bodies.A[:, :n][:, ~bodies.is_moved], thick)
+    return hidden | behind_plate(P, bodies.B[:, :n], thick)
 
 
 def _parts(

@@ -1,11 +1,12 @@
-"""What predicted images say: the rows that each adds to the information of the joint fit.
+"""The information of the joint fit at images that nobody has taken, or has taken already.
 
-The joint fit itself is built at predicted outlines, with its common-mode edge biases, radii,
-intrinsics of which the camera file states a covariance, lines of arms with their prior, and gamma
-where it is not given. The platform pose of an image is eliminated; machine, cameras and what images
-share are kept, so that an image is a low-rank update: rows U with U^T U added to the information.
-Unknowns have names, those of a view begin with its name; unknown kinematic parameters are
-coordinates inside what the mechanism ties.
+The joint fit itself is built at outlines, with its common-mode edge biases, radii, intrinsics of
+which the camera file states a covariance, lines of arms with their prior, and gamma where it is not
+given. ``identify`` asks for its rank, ``plan`` selects images by it, and ``calibrate`` has it at
+the solution. Platform poses are eliminated; machine, cameras and what images share are kept, so
+that an image is a low-rank update: rows U with U^T U added to the information. Unknowns have names,
+those of a view begin with its name; unknown kinematic parameters are coordinates inside what the
+mechanism ties.
 
 **Places.** Edges that come back to the same place of a view err alike again. Photographs of one
 *site*, with all legs where others of them have theirs, share these errors: the second tells less
@@ -23,7 +24,7 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.factors import ObservedOutlines
+from legcal.calibration.joint_fit.factors import BoardCorners, ObservedOutlines
 from legcal.calibration.joint_fit.outline_errors import (
     NoiseModel,
     possible_biases,
@@ -32,16 +33,23 @@ from legcal.calibration.joint_fit.outline_errors import (
     with_gamma,
 )
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
+from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.reasons import USED
 from legcal.estimation.problem import Frames, linearize
+from legcal.estimation.square_root import marginal_rows
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
+from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON
+from legcal.vision.sight import Seen
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
@@ -49,53 +57,23 @@ _WEAK, _WEAK_LENGTH = 1.0, 2.5
 _RANK = 1e-7  # of the largest singular value
 
 
-@dataclass(frozen=True)
-class PredictedNoise:
-    """Errors of outlines, whatever the contrast.
-
-    By default shared errors are about the largest of a simulated machine
-    (``benchmarks/shared_errors.py``): plans that count on less rely on it.
-
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of an edge in one pixel of length; that of an outline at both of its
-        ends falls with the root of its length [px].
-    correlation : float
-        Of the errors at both ends: -0.5 where errors of pixels are independent.
-    common_px : tuple of float
-        Standard deviations of the common-mode edge biases, in the order of their kinds [px].
-    places_px : tuple of float
-        Standard deviations of bias and tilt of an edge at a place [px].
-    gamma_px : float
-        How far an outline moves with the logarithm of the gamma, which counts as not known [px].
-    source : str
-        Where it is from, in words.
-    """
-
-    sigma_px: float = 0.35
-    correlation: float = 0.0
-    common_px: tuple[float, ...] = (0.045, 0.003, 0.033, 0.009, 0.014, 0.005)
-    places_px: tuple[float, ...] = (0.024, 0.023)
-    gamma_px: float = 0.1
-    source: str = "what photographs of simulated machines show"
-
-    def of(self, outlines: Outlines) -> Outlines:
-        """Return outlines with the covariance and the dependence on gamma that are predicted."""
-        n = len(outlines.row)
-        length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
-        of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
-        with_noise = replace(
-            outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends
-        )
-        if self.gamma_px == 0.0:
-            return with_noise
-        return replace(with_noise, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
-
-
-DEFAULT_NOISE = PredictedNoise()
-# White noise of edge points, as simulated outlines have it
-WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, (0.0, 0.0), 0.0, "independent errors of edge points")
+def predicted_outlines(seen: Seen, row: IntArray, noise: PredictedNoise) -> Outlines:
+    """Return the outlines of visible segments; *row* of each image."""
+    n = len(seen.leg)
+    outlines = Outlines(
+        row=np.repeat(row[seen.image], 2),
+        leg=np.repeat(seen.leg, 2),
+        part=tuple(part for part in seen.part for _ in EPSILON),
+        edge=np.tile(np.array([1, 2], dtype=np.intp), n),
+        h=seen.h.reshape(-1, 3),
+        ends=seen.ends.reshape(-1, 2, 2),
+        covariance=np.tile(np.eye(2), (2 * n, 1, 1)),
+        used=np.ones(2 * n, dtype=np.bool_),
+        reason=(USED,) * (2 * n),
+        source=("detected",) * (2 * n),
+        **unmeasured(2 * n),
+    )
+    return noise.of(outlines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +82,18 @@ class Contributions:
 
     names: tuple[str, ...]  # of m unknowns, the p coordinates of the machine first
     rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
-    prior: Array  # (m, m): prior information
+    known: Array  # (r, m): rows of priors and of measured lengths, of no image
     basis: Array  # (n_parameters, p): directions of the kinematic parameters
     at_site: Array  # (n_images, r) variances of what photographs of a site share, in those rows
     site: IntArray  # (n_images,)
     # (n_images, r, c) how errors at places, one standard deviation of each, move the rows; none of
     # them unless a fit is predicted that does not know them
     shifts: Array
+
+    @property
+    def prior(self) -> Array:
+        """Prior information, (m, m)."""
+        return self.known.T @ self.known
 
     def gains(self, images: IntArray, number: IntArray) -> Array:
         """Return the rows (n, r, m) that images add as that many-th ones of their sites."""
@@ -127,6 +110,62 @@ class Contributions:
         number[order] = 1 + np.arange(len(order)) - np.repeat(first, count)
         rows = self.gains(np.arange(len(order)), number)
         return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
+
+    def tied_by_board(self, T_base_camera: Mapping[str, RigidTransform]) -> Contributions:
+        """Replace camera poses of views by the pose of a board on the base.
+
+        Camera poses relative to the board count as exact, so that all cameras share the six
+        unknowns of the board.
+        """
+        if not T_base_camera:
+            return self
+        names, turn = list(self.names), np.eye(len(self.names))
+        for view, T in T_base_camera.items():
+            R = T.rotation.as_matrix().T
+            columns = [names.index(f"{view}: pose {k}") for k in range(6)]
+            turn[np.ix_(columns, columns)] = block_diag(R, R)
+            for k, i in enumerate(columns):
+                names[i] = f"board {k}"
+        kept = list(dict.fromkeys(names))
+        merge = np.zeros((len(names), len(kept)))
+        merge[np.arange(len(names)), [kept.index(name) for name in names]] = 1.0
+        turn = turn @ merge
+        return replace(self, names=tuple(kept), rows=self.rows @ turn, known=self.known @ turn)
+
+    def of_shared(self) -> Contributions:
+        """Eliminate the unknowns of single views."""
+        is_own = np.array([": " in name for name in self.names])
+        shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
+        rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
+        return self._stacked(
+            tuple(self.names[i] for i in shared), rows, self.known[~with_own][:, shared]
+        )
+
+    def with_more(self, others: Sequence[Contributions]) -> Contributions:
+        """Add images of other cameras at the same machine; all without unknowns of single views."""
+        names = {name: i for i, name in enumerate(self.names)}
+        rows, known = [self.all_gains()], [self.known]
+        for other in others:
+            n_before = len(names)
+            columns = np.array([names.setdefault(name, len(names)) for name in other.names])
+            is_new = other.known[:, columns >= n_before].any(axis=1)
+            for table, more in ((rows, other.all_gains()), (known, other.known[is_new])):
+                wide = np.zeros((len(more), len(names)))
+                wide[:, columns] = more
+                table.append(wide)
+        stacked = (
+            np.concatenate([np.pad(x, ((0, 0), (0, len(names) - x.shape[1]))) for x in table])
+            for table in (rows, known)
+        )
+        return self._stacked(tuple(names), *stacked)
+
+    def _stacked(self, names: tuple[str, ...], rows: Array, known: Array) -> Contributions:
+        """Return rows (m, n) as those of one image."""
+        nothing = np.zeros((1, len(rows)))
+        site = np.zeros(1, dtype=np.intp)
+        return Contributions(
+            names, rows[None], known, self.basis, nothing, site, np.zeros((1, len(rows), 0))
+        )
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""
@@ -149,14 +188,6 @@ class Predictor:
         """The legs as the joint fit sees them."""
         return fitted_legs(self.machine)
 
-    @cached_property
-    def _known(self) -> Choices:
-        """The choices, with lines of arms unknown in all images, also in those that show none."""
-        seen = [j for j, leg in enumerate(self.legs.nominal) if leg.arm is not None]
-        sigmas = arm_sigmas(self.legs.parametrization, self.legs.nominal, seen)
-        arms = {name: Prior(0.0, sigma) for name, sigma in sigmas.items()}
-        return replace(self.choices, priors=arms | dict(self.choices.priors))
-
     def contributions(
         self,
         views: Mapping[str, RigidTransform],  # T_base_camera of views by their names
@@ -170,28 +201,18 @@ class Predictor:
         """Return the contribution of images to the information.
 
         With *is_fit* that of a fit that weighs outlines as if they had no errors at places, and how
-        these move it.
+        these move it. Unknowns without a prior have a weak one.
         """
         n, shown = len(poses), tuple(legs or self.legs.nominal)
-        R, t = Frames.of(poses)
-        q = np.zeros((n, self.legs.n_legs))
-        for j, leg in enumerate(shown):
-            if leg.actuator is not None:  # it has joints at A where readings say
-                q[:, j] = reading_of_rod(leg, R @ leg.B + t)
         camera = replace(self.camera, gamma_is_given=False)
         measurements = Measurements(
             views=tuple(View(name, camera, T) for name, T in views.items()),
             image=("",) * n,
             view=view,
             pose=np.arange(n, dtype=np.intp),
-            q=q,
+            q=readings_at(shown, *Frames.of(poses)),
             sigma_q=self.sigma_q,
             sigma_by_joint=self.sigma_by_joint,
-        )
-        problem = build_fit(self.legs, measurements, self.noise.of(outlines), choices=self._known)
-        biases = possible_biases(problem.outlines, self.legs.names)
-        problem = problem.with_biases(
-            biases.of_sizes(with_gamma(np.append(self.noise.common_px, 0.0)))
         )
         T_base_Rb = self.machine.T_base_Rb
         start = Start(
@@ -200,25 +221,92 @@ class Predictor:
             tuple(poses),
             "plan",
         )
-        state = problem.begin(start)
-        return self._rows(problem.weighted(NoiseModel()), state, list(views), is_fit=is_fit)
+        return information_of_images(
+            self.legs,
+            measurements,
+            self.noise.of(outlines),
+            start,
+            self.noise,
+            self.choices,
+            is_fit=is_fit,
+            known_length=self.machine.size,
+        )
 
-    def _rows(
-        self, problem: FitProblem, state: State, views: Sequence[str], *, is_fit: bool
+
+def readings_at(legs: Sequence[Leg], R: Array, t: Array) -> Array:
+    """Return the readings (n, n_legs) of motors at poses [m or rad], and zero for other legs."""
+    q = np.zeros((len(t), len(legs)))
+    for j, leg in enumerate(legs):
+        end = R @ leg.B + t
+        if leg.actuator is not None:
+            q[:, j] = reading_of_rod(leg, end)
+        elif leg.kind is LegKind.ACTUATED:
+            q[:, j] = leg.sign * (np.linalg.norm(end - leg.A, axis=1) - leg.q0)
+    return q
+
+
+def information_of_images(
+    legs: FittedLegs,
+    measurements: Measurements,
+    outlines: Outlines,
+    start: Start,
+    noise: PredictedNoise,  # besides the covariances of the outlines
+    choices: Choices = NO_CHOICES,
+    *,
+    board: BoardCorners | None = None,
+    is_fit: bool = False,  # as in :meth:`Predictor.contributions`
+    known_length: float | None = None,  # mean leg length of weak priors; without it there are none
+) -> Contributions:
+    """Return the information of the joint fit, linearised at a start."""
+    usual = _as_calibrated(legs, choices)
+    problem = build_fit(legs, measurements, outlines, board=board, choices=usual)
+    biases = possible_biases(problem.outlines, legs.names)
+    problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
+    state = problem.begin(start)
+    images = _Images(problem.weighted(NoiseModel()), state, noise)
+    return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
+
+
+def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
+    """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
+    seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen)
+    twist = float(np.radians(TWIST_SIGMA_DEG))
+    names = legs.parametrization.names
+    sigmas |= {name: twist for name in names if ParameterId.parse(name).kind == "twist"}
+    chosen = {*choices.fixed, *choices.free}
+    usual = {name: Prior(0.0, sigma) for name, sigma in sigmas.items() if name not in chosen}
+    return replace(choices, priors=usual | dict(choices.priors))
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """The joint fit at images, to be linearised."""
+
+    problem: FitProblem
+    state: State
+    noise: PredictedNoise
+
+    def contributions(
+        self, views: Sequence[str], known_length: float | None, *, is_fit: bool
     ) -> Contributions:
         """Return the whitened rows of every image, and the priors of all unknowns."""
+        problem, state = self.problem, self.state
         linear, n = linearize(problem, state), problem.n_elements
         tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
-        shifts = self._shifts(problem, are_shared=is_fit)
-        blocks, is_outline = [], []
+        shifts = self._shifts(are_shared=is_fit)
+        blocks, is_outline, known = [], [], [linear.prior_J]
         for factor in problem.factors:
-            if not factor.n or factor.element is None:
+            if not factor.n:
                 continue
             found, where = linear[factor.name], problem.sparsity[factor.name]
             q = found.r.shape[1]
             J = np.zeros((factor.n, q, problem.n_kept + 1))
             at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
             np.add.at(J, (*at, where.index[:, None, :]), found.J)
+            if factor.element is None:
+                known.append(J[..., :-1].reshape(-1, problem.n_kept))
+                continue
             moved = np.zeros((factor.n, q, shifts.shape[2]))
             if factor.name == "outlines":
                 moved = factor.whitening @ shifts
@@ -239,37 +327,47 @@ class Predictor:
         if not is_fit and np.any(self.noise.places_px):
             at_site, kept = _apart(kept, U, moved, np.array(is_outline))
         names = _names(problem, views)
-        prior = linear.prior_J.T @ linear.prior_J
-        weak = np.array([prior[i, i] == 0.0 for i in range(len(prior))])
-        known = np.where(_are_lengths(problem), _WEAK_LENGTH * self.machine.size, _WEAK)
-        prior[weak, weak] = 1.0 / known[weak] ** 2
+        if known_length is not None:
+            known.append(_weak_rows(problem, np.concatenate(known), known_length))
         k, untied = problem.n_kinematic, np.eye(problem.n_kinematic)
         if problem.parameters.n_tied:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
         basis = np.zeros((len(problem.free), untied.shape[1]))
         # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
         basis[problem.free] = problem.parameters.jacobian(state.legs) @ untied
-        rows = np.concatenate([kept[..., :k] @ untied, kept[..., k:]], axis=2)
-        whole = block_diag(untied.T @ prior[:k, :k] @ untied, prior[k:, k:])
+        turn = block_diag(untied, np.eye(problem.n_kept - k))
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
-        if is_fit:
-            moved = _without(U, moved)
-            return Contributions(named, rows, whole, basis, at_site, np.arange(n), moved)
-        site = _sites(problem.outlines, n)
-        return Contributions(named, rows, whole, basis, at_site, site, moved[..., :0])
+        if not is_fit:
+            moved, site = moved[..., :0], np.arange(n)
+            if self.noise.places_px[0] or self.noise.places_px[1]:
+                site = _sites(problem.outlines, n)
+        else:
+            moved, site = _without(U, moved), np.arange(n)
+        return Contributions(
+            named, kept @ turn, np.concatenate(known) @ turn, basis, at_site, site, moved
+        )
 
-    def _shifts(self, problem: FitProblem, *, are_shared: bool) -> Array:
+    def _shifts(self, *, are_shared: bool) -> Array:
         """Return the shifts of both ends of outlines by repeated errors (n, 2, c) [px].
 
         By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
         """
-        o, sigma = problem.outlines, np.array(self.noise.places_px)
+        o, sigma = self.problem.outlines, np.array(self.noise.places_px)
         if not sigma.any():
             return np.zeros((len(o), 2, 0))
         if not are_shared:
             return np.asarray(shifts_of_edges(len(o)) * sigma, dtype=np.float64)
         shifts = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
         return np.asarray(shifts * np.repeat(sigma, shifts.shape[2] // len(sigma)))
+
+
+def _weak_rows(problem: FitProblem, known: Array, length: float) -> Array:
+    """Return rows of weak priors of unknowns of which nothing is known."""
+    weak = np.flatnonzero(~known.any(axis=0))
+    sigma = np.where(_are_lengths(problem), _WEAK_LENGTH * length, _WEAK)[weak]
+    rows = np.zeros((len(weak), problem.n_kept))
+    rows[np.arange(len(weak)), weak] = 1.0 / sigma
+    return rows
 
 
 def _without(U: Array, X: Array) -> Array:
@@ -295,13 +393,16 @@ def _apart(
 
 def _sites(outlines: ObservedOutlines, n: int) -> IntArray:
     """Return the site (n,) of each image: the same where all edges are within a width of a part."""
-    o = outlines
+    o, view = outlines, np.zeros(n, dtype=np.intp)
+    if len(np.unique(np.stack([o.pose, o.view], axis=1), axis=0)) > len(np.unique(o.pose)):
+        return np.arange(n)  # several cameras see a pose
+    view[o.pose] = o.view
     middle = np.full((n, len(o.parts), 2, 2), np.nan)  # of images that show the edge
     middle[o.pose, o.radius, (o.epsilon < 0.0).astype(np.intp)] = o.pixels.mean(axis=1)
     site, firsts, width = np.zeros(n, dtype=np.intp), list[int](), o.width_px
     shown = np.isfinite(middle)
     for k in range(n):
-        alike = np.all(shown[firsts] == shown[k], axis=(1, 2, 3))
+        alike = np.all(shown[firsts] == shown[k], axis=(1, 2, 3)) & (view[firsts] == view[k])
         apart = np.linalg.norm(middle[firsts] - middle[k], axis=-1)
         near = alike & np.all(~(apart > width), axis=(1, 2))
         site[k] = int(np.argmax(near)) if near.any() else len(firsts)
@@ -337,6 +438,7 @@ def _are_lengths(problem: FitProblem) -> BoolArray:
 def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
     """Return a name for each kept unknown; those of one view begin with ``VIEW:``."""
     names = [""] * problem.n_kept
+    are_alike = len(set(problem.outlines.cameras)) == 1  # all views share one camera
     for block in problem.variables:
         where = problem.where(block.name)
         labels = block.labels or tuple(str(i) for i in range(block.n_unknowns))
@@ -345,7 +447,7 @@ def _names(problem: FitProblem, views: Sequence[str]) -> list[str]:
             head = max(owners, key=len, default="")
             rest = label.removeprefix(f"{head}.")
             if block.name == "cameras" or (block.name == "biases" and rest == "gamma"):
-                names[i] = f"camera {rest}"  # all views share one
+                names[i] = f"camera {rest if are_alike else label}"
             elif block.name == "biases" and head:
                 names[i] = f"{head}: {rest}"
             else:

@@ -1,8 +1,9 @@
-"""Noise of outlines for a plan, from an earlier result."""
+"""Noise of outlines that nobody has measured yet: by default, or of an earlier result."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,59 @@ import numpy as np
 
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.data.dataset import OBSERVATIONS_NAME
-from legcal.data.outlines import OUTLINE_COLUMNS
+from legcal.data.outlines import OUTLINE_COLUMNS, Outlines
 from legcal.errors import DatasetError, UsageError
 from legcal.files.reading import read_json
 from legcal.files.table import read_table
-from legcal.planning.information import DEFAULT_NOISE, PredictedNoise
+
+
+@dataclass(frozen=True)
+class PredictedNoise:
+    """Errors of outlines, whatever the contrast.
+
+    By default shared errors are about the largest of a simulated machine
+    (``benchmarks/shared_errors.py``): plans that count on less rely on it.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of an edge in one pixel of length; that of an outline at both of its
+        ends falls with the root of its length [px].
+    correlation : float
+        Of the errors at both ends: -0.5 where errors of pixels are independent.
+    common_px : tuple of float
+        Standard deviations of the common-mode edge biases, in the order of their kinds [px].
+    places_px : tuple of float
+        Standard deviations of bias and tilt of an edge at a place [px].
+    gamma_px : float
+        How far an outline moves with the logarithm of the gamma, which counts as not known [px].
+    source : str
+        Where it is from, in words.
+    """
+
+    sigma_px: float = 0.35
+    correlation: float = 0.0
+    common_px: tuple[float, ...] = (0.045, 0.003, 0.033, 0.009, 0.014, 0.005)
+    places_px: tuple[float, ...] = (0.024, 0.023)
+    gamma_px: float = 0.1
+    source: str = "what photographs of simulated machines show"
+
+    def of(self, outlines: Outlines) -> Outlines:
+        """Return outlines with the covariance and the dependence on gamma that are predicted."""
+        n = len(outlines.row)
+        length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
+        of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
+        with_noise = replace(
+            outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends
+        )
+        if self.gamma_px == 0.0:
+            return with_noise
+        return replace(with_noise, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
+
+
+DEFAULT_NOISE = PredictedNoise()
+# White noise of edge points, as simulated outlines have it
+WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, (0.0, 0.0), 0.0, "independent errors of edge points")
 
 
 def read_noise(path: Path) -> PredictedNoise:

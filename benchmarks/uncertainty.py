@@ -1,0 +1,136 @@
+"""Do identify and plan predict the uncertainty that calibrate states?
+
+    OMP_NUM_THREADS=1 python benchmarks/uncertainty.py [DATASET ...]
+
+Each dataset is calibrated. At its poses, cameras and used outlines, with the noise of the result,
+the mean predicted error of the platform over the workspace is computed as ``identify`` and as
+``plan`` do, and compared with that of the covariance of the fit, before doubts add to it. Where
+readings do not determine the pose, the mean standard deviation of the parameters takes its place.
+By default the example and recorded sessions of six other machines. Ratios are to lie within 25 %.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import legcal
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import recorded_session
+from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
+from legcal.calibration.joint_fit.predicted import Predictor
+from legcal.calibration.joint_fit.predicted_noise import PredictedNoise, read_noise
+from legcal.calibration.pipeline import chosen_parameters
+from legcal.calibration.result import Calibration
+from legcal.data.dataset import Dataset
+from legcal.estimation.problem import Frames
+from legcal.geometry.types import Array
+from legcal.machine.configurations import workspace
+from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.leg import Leg
+from legcal.planning.exchange import Session
+
+ROOT = Path(__file__).parents[1]
+RECORDED = ROOT / "tests/data/recorded"
+NAMES = ("planar", "revolute", "passive", "constant", "redundant", "arms")
+
+
+def main(*names: str) -> None:
+    """Print a row for each dataset."""
+    folders = [Path(n) for n in names]
+    folders = folders or [ROOT / "examples/hexapod", *(RECORDED / name for name in NAMES)]
+    print(
+        f"{'dataset':16}{'outlines':>9}{'calibrate':>11}{'identify':>10}{'plan':>9}  [mm], ratios"
+    )
+    for folder in folders:
+        with TemporaryDirectory() as temporary:
+            output = Path(temporary) / "result"
+            calibration = legcal.calibrate(
+                folder, output=output, progress=False, use_cache=False, workers=1
+            )
+            noise = read_noise(output)
+        solution = calibration.solution
+        stated = size(calibration, solution.legs, solution.kinematic.covariance)
+        predicted = [f(calibration, noise) for f in (by_identify, by_plan)]
+        columns = "".join(f"{1e3 * x:10.4f}" for x in (stated, *predicted))
+        ratios = " ".join(f"{x / stated:5.2f}" for x in predicted)
+        n = int(solution.outlines.used.sum())
+        print(f"{folder.name:16}{n:9}{columns}  {ratios}", flush=True)
+
+
+def size(calibration: Calibration, legs: Sequence[Leg], covariance: Array) -> float:
+    """Return the figure that is compared, of a covariance of the parameters of legs [m]."""
+    machine = calibration.dataset.machine
+    parametrization = calibration.solution.kinematic.parametrization
+    if not machine.is_determined:
+        unit = [1.0 if u == "m" else machine.size for u in parametrization.units]
+        return float(np.sqrt(np.mean(np.diagonal(covariance) * np.square(unit))))
+    poses = platforms_in_base(machine, workspace(machine)[1])
+    by_parameters = platform_by_parameters(legs, parametrization, machine.frame_legs, poses)
+    return expected_error(by_parameters, covariance).mean_displacement
+
+
+def by_identify(calibration: Calibration, noise: PredictedNoise) -> float:
+    """Return the figure of identify."""
+    dataset, solution = calibration.dataset, calibration.solution
+    R, t = Frames.of(solution.T_Rb_Re)
+    session = recorded_session(dataset, twists=True)
+    places = solution.cameras_in_base(dataset.machine.T_base_Rb)
+    to_Rb = dataset.machine.T_base_Rb.inv()
+    cameras = tuple(
+        replace(view, T_base_camera=to_Rb * T)
+        for view, T in zip(session.cameras, places, strict=True)
+    )
+    found = replace(session, R=R, t=t, cameras=cameras).contributions(
+        choices_of(dataset), noise, solution.outlines
+    )
+    rows = np.concatenate([found.all_gains(), found.known])
+    _, singular, basis = np.linalg.svd(Analysis(session).of_parameters(rows, found.basis))
+    seen = singular * session.mean_length > 1.0
+    root = basis[seen].T / singular[seen] * session.unit[:, None]
+    return size(calibration, session.legs, root @ root.T)
+
+
+def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
+    """Return the figure of plan."""
+    dataset, solution = calibration.dataset, calibration.solution
+    m, o = dataset.measurements, solution.outlines.choose(solution.outlines.used)
+    parts = []
+    predictor = predictor_of(calibration, noise)
+    for v, T in enumerate(solution.cameras_in_base(dataset.machine.T_base_Rb)):
+        rows = np.flatnonzero(m.view == v)
+        of_view = np.isin(o.row, rows)
+        if not of_view.any():
+            continue
+        outlines = replace(o.choose(of_view), row=np.searchsorted(rows, o.row[of_view]))
+        poses = [solution.T_Rb_Re[k] for k in m.pose[rows]]
+        view = np.zeros(len(rows), dtype=np.intp)
+        parts.append(
+            predictor.contributions(
+                {"here": T}, view, poses, noise.of(outlines), solution.legs, is_fit=True
+            )
+        )
+    basis = parts[0].basis
+    return size(calibration, predictor.legs.nominal, basis @ Session([], parts).fitted() @ basis.T)
+
+
+def predictor_of(calibration: Calibration, noise: PredictedNoise) -> Predictor:
+    """Return the predictor of a plan."""
+    dataset = calibration.dataset
+    m = dataset.measurements
+    return Predictor(
+        dataset.machine, m.views[0].camera, noise, m.sigma_q, choices_of(dataset), m.sigma_by_joint
+    )
+
+
+def choices_of(dataset: Dataset) -> Choices:
+    """Return what calibrate knows of parameters."""
+    return chosen_parameters(dataset, ())
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,163 @@
+"""How well a camera projects over its image, and how far two cameras are apart.
+
+A session leaves the pose of its camera free, so a turn of the camera is no error: the turn that
+explains most of a change of the intrinsics, over the whole image, is taken out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from legcal.errors import UsageError
+from legcal.files.schema import Document
+from legcal.geometry.types import Array
+from legcal.vision.camera import Camera, intrinsic_names, project_with_derivatives
+
+GRID = 17, 13  # places along both sides of the image
+_TURNS = 10  # Gauss-Newton steps of the turn between two cameras
+_FOLDED_PX = 0.1  # error of undistortion at a pixel that the lens model does not reach
+
+
+def grid(camera: Camera) -> Array:
+    """Return pixels (n, 2) all over the image, row by row."""
+    u = np.linspace(0.0, camera.width - 1.0, GRID[0])
+    v = np.linspace(0.0, camera.height - 1.0, GRID[1])
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def projection_sigma(camera: Camera, covariance: Array) -> Array:
+    """Return the standard deviation of the projection at ``grid``, (n,) [px].
+
+    That of the worst direction in the image; infinite where the lens model folds back.
+    """
+    pixels = grid(camera)
+    rays, reached = _rays(camera, pixels)
+    _, by_ray, J = project_with_derivatives(camera, rays[reached], intrinsic_names(camera))
+    by_turn = _by_turn(rays[reached], by_ray)
+    turn = np.linalg.lstsq(by_turn.reshape(-1, 3), J.reshape(-1, J.shape[2]), rcond=None)[0]
+    J = J - by_turn @ turn
+    spread = J @ covariance @ np.swapaxes(J, 1, 2)
+    sigma = np.full(len(pixels), np.inf)
+    sigma[reached] = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0))
+    return sigma
+
+
+def _rays(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Return rays (n, 3) at pixels, and a mask of the pixels that the lens model reaches."""
+    xy = camera.undistort(pixels)
+    off = np.linalg.norm(camera.distort(xy) - pixels, axis=1)
+    return np.column_stack([xy, np.ones(len(xy))]), off < _FOLDED_PX
+
+
+def _by_turn(rays: Array, by_ray: Array) -> Array:
+    """Return derivatives of pixels by a turn of their rays, (n, 2, 3) [px/rad]."""
+    return np.cross(rays[:, None, :], by_ray)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraComparison:
+    """The difference of two calibrations of a camera over the image.
+
+    Attributes
+    ----------
+    pixels : (n, 2) array
+        Places in the image of the first camera.
+    off_px : (n, 2) array
+        Pixels of the second camera less those of the first, after the best turn [px].
+    off : (n,) array
+        The same as a length beside the ray, relative to the distance of a point.
+    sigma_px : (n,) array or None
+        Standard deviation of the difference by the covariances of both; None without these.
+    turn : float
+        Angle of the turn [rad].
+    """
+
+    pixels: Array
+    off_px: Array
+    off: Array
+    sigma_px: Array | None
+    turn: float
+
+    @property
+    def px(self) -> Array:
+        """Lengths of the differences, (n,) [px]."""
+        return np.asarray(np.linalg.norm(self.off_px, axis=1))
+
+    def document(self) -> dict[str, Any]:
+        """Return the output of ``--json``."""
+        sigmas = [None] * len(self.px) if self.sigma_px is None else finite(self.sigma_px)
+        return CameraComparisonDocument(
+            legcal_camera_comparison=1,
+            rms_px=float(np.sqrt(np.mean(self.px**2))),
+            largest_px=float(self.px.max()),
+            largest_mm_per_m=float(1e3 * self.off.max()),
+            turn_rad=self.turn,
+            places=[
+                ComparedPlace(u=u, v=v, du=du, dv=dv, sigma_px=sigma)
+                for (u, v), (du, dv), sigma in zip(
+                    self.pixels.tolist(), self.off_px.tolist(), sigmas, strict=True
+                )
+            ],
+        ).document()
+
+
+def finite(numbers: Array) -> list[float | None]:
+    """Return numbers (n,) with None for infinite ones, as JSON has it."""
+    return [number if np.isfinite(number) else None for number in numbers.tolist()]
+
+
+class ComparedPlace(Document):
+    """The difference of two cameras at a pixel of the first [px]."""
+
+    u: float
+    v: float
+    du: float
+    dv: float
+    sigma_px: float | None
+
+
+class CameraComparisonDocument(Document):
+    """The output of ``legcal camera --compare --json``."""
+
+    legcal_camera_comparison: int
+    rms_px: float
+    largest_px: float
+    largest_mm_per_m: float
+    turn_rad: float
+    places: list[ComparedPlace]
+
+
+def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
+    """Compare two calibrations of one camera over the image.
+
+    Raises UsageError if their images differ in size.
+    """
+    sizes = [f"{camera.width} x {camera.height} px" for camera in (first, second)]
+    if sizes[0] != sizes[1]:
+        raise UsageError(
+            f"The cameras could not be compared: found images of {sizes[0]} and of {sizes[1]}, "
+            "needed one size; give two calibrations of one camera."
+        )
+    pixels = grid(first)
+    rays, reached = _rays(first, pixels)
+    pixels, rays = pixels[reached], rays[reached]
+    turn = Rotation.identity()
+    for _ in range(_TURNS):
+        turned = turn.apply(rays)
+        at, by_ray = second.project_with_derivative(turned)
+        by_turn = _by_turn(turned, by_ray)
+        step = np.linalg.lstsq(by_turn.reshape(-1, 3), (pixels - at).ravel(), rcond=None)[0]
+        turn = Rotation.from_rotvec(step) * turn
+    off_px = second.project(turn.apply(rays)) - pixels
+    by_xy = first.pixels_per_unit(rays[:, :2])
+    beside = np.linalg.norm(np.linalg.solve(by_xy, off_px[..., None])[..., 0], axis=1)
+    sigma_px = None
+    if first.covariance is not None and second.covariance is not None:
+        sigma = projection_sigma(first, first.covariance)
+        sigma_px = np.hypot(sigma, projection_sigma(second, second.covariance))[reached]
+    off = beside / np.linalg.norm(rays, axis=1)
+    return CameraComparison(pixels, off_px, off, sigma_px, turn.magnitude())

@@ -1,0 +1,568 @@
+"""The images of a session before the fit: poses, cameras, and the legs that each camera shows.
+
+They are planned (cameras in default places, random poses) or those of a dataset. The machine is
+nearly the nominal one: every parameter is a micrometre or less away, so that no symmetry by
+accident decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.predicted import (
+    Contributions,
+    information_of_images,
+    predicted_outlines,
+    readings_at,
+)
+from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
+from legcal.calibration.joint_fit.variables import FittedLegs, Start
+from legcal.calibration.ordered_dataset import nominal_poses
+from legcal.data.corners import found_corners
+from legcal.data.dataset import Dataset
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines, join_outlines
+from legcal.estimation.problem import Frames
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import components, look_at
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import Actuator
+from legcal.machine.configurations import random_postures_of_legs
+from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
+from legcal.machine.model import Machine
+from legcal.machine.parameters import (
+    Parametrization,
+    geometries,
+    is_spatial,
+    moved_legs,
+    parametrization_of,
+)
+from legcal.machine.rods import (
+    actuator_index,
+    actuators_of,
+    ends_at_poses,
+    joints_at,
+    readings_of_rods,
+)
+from legcal.machine.ties import by_step, independent, machine_ties, on_ties
+from legcal.vision.board import Board, FixedBoard, Link, facing_board
+from legcal.vision.camera import sample_camera
+from legcal.vision.sight import Bodies, visible_parts
+
+_DISTANCE = 2.5  # machine sizes
+_TILT = 0.5  # [rad] from the normal of a planar machine
+_SEED = 2002
+_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
+_PERTURBATION = 1e-6  # of the mean leg length, and [rad]
+REACHED = 20  # poses, at least, over which errors of the platform are judged
+THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
+_BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
+_SQUARES = 8  # along both of its sides
+_CORNER_PX = 0.1  # standard deviation of its corners
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Images as they will be taken, of a machine that is nearly the nominal one."""
+
+    leg_names: tuple[str, ...]
+    legs: tuple[Leg, ...]  # in R_b and R_e
+    frame_legs: tuple[int, ...]  # those that define R_b and R_e
+    parametrization: Parametrization
+    R: Array  # R, t: (k, 3, 3) and (k, 3): platform poses: rotation and position [m] of R_e in R_b
+    t: Array
+    # R_reached, t_reached: (w, 3, 3) and (w, 3): poses over which errors of the platform are
+    # judged: those above, and more if they are few
+    R_reached: Array
+    t_reached: Array
+    view: IntArray  # view, pose: (n_images,): the view and the pose of each image
+    pose: IntArray
+    seen: BoolArray  # (n_views, n_legs): the legs that each view shows
+    cameras: tuple[View, ...]  # of each view, where it stands in R_b
+    sigma_q: float  # standard deviation of a reading [m]
+    unread: BoolArray  # (k, n_legs): which readings are missing
+    # (n_views,): the views whose images show a calibration board on the base: how these cameras
+    # stand to each other is known
+    board: BoolArray
+    # (n_images,): those that show a calibration board on the platform; none if it is empty
+    platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+    shows_arms: bool = True  # which a table of axes does not
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs."""
+        return len(self.legs)
+
+    @property
+    def n_views(self) -> int:
+        """Number of camera positions."""
+        return len(self.seen)
+
+    @cached_property
+    def places(self) -> tuple[RigidTransform, ...]:
+        """Where the camera of each view stands, T_Rb_camera."""
+        places = (view.T_base_camera for view in self.cameras)
+        return tuple(T for T in places if T is not None)
+
+    @cached_property
+    def fitted(self) -> FittedLegs:
+        """The legs as the joint fit takes them; a leg without a visible cylinder has a thin one."""
+        shortest, legs = self.length.min(axis=0).tolist(), list(self.legs)
+        for j, leg in enumerate(self.legs):
+            if not leg.cylinders:
+                thin = Cylinder(leg.name, THIN * self.mean_length, "base", 0.0, shortest[j])
+                legs[j] = replace(leg, cylinders=(thin,))
+        radii = {(j, p): r for j, leg in enumerate(legs) for p, r in leg.radius_of_part.items()}
+        return FittedLegs(self.leg_names, tuple(legs), self.frame_legs, radii, self.home)
+
+    @property
+    def radii(self) -> dict[str, float]:
+        """Radii of all parts, by their names [m]."""
+        names = self.leg_names
+        return {radius_name(names[j], part): r for (j, part), r in self.fitted.radii.items()}
+
+    @cached_property
+    def outlines(self) -> Outlines:
+        """Outlines of all that views show, whatever may hide it."""
+        tables = []
+        for v, view in enumerate(self.cameras):
+            row = np.flatnonzero(self.view == v)
+            pose = self.pose[row]
+            bodies = Bodies.at(self.fitted.nominal, self.R[pose], self.t[pose], self.mean_length)
+            seen = visible_parts(view.camera, self.places[v], bodies, stated=self.seen[v])
+            tables.append(predicted_outlines(seen, row, DEFAULT_NOISE))
+        outlines = join_outlines(tables)
+        if self.shows_arms:
+            return outlines
+        parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
+        return outlines.choose(np.array([not self.legs[j].is_arm(p) for j, p in parts]))
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """The images, with the readings of their poses."""
+        q = np.where(self.unread, np.nan, readings_at(self.legs, self.R, self.t))
+        return Measurements(
+            views=self.cameras,
+            image=("",) * len(self.view),
+            view=self.view,
+            pose=self.pose,
+            q=q[self.pose],
+            sigma_q=self.sigma_q,
+            sigma_by_joint=self.sigma_by_joint,
+        )
+
+    def contributions(
+        self,
+        choices: Choices,
+        noise: PredictedNoise = DEFAULT_NOISE,
+        measured: Outlines | None = None,  # in place of the predicted ones
+    ) -> Contributions:
+        """Return the information of the joint fit of these images."""
+        board, T_Re_board = self._corners()
+        start = Start(
+            self.fitted.nominal,
+            tuple(T.inv() for T in self.places),
+            Frames(self.R, self.t).motions,
+            "identify",
+            T_Re_board=T_Re_board,
+        )
+        contributions = information_of_images(
+            self.fitted,
+            self.measurements,
+            noise.of(self.outlines if measured is None else measured),
+            start,
+            noise,
+            choices,
+            board=board,
+        )
+        places = zip(self.cameras, self.places, self.board, strict=True)
+        return contributions.tied_by_board({view.name: T for view, T, has in places if has})
+
+    def _corners(self) -> tuple[BoardCorners | None, RigidTransform]:
+        """Return the corners of a board on the platform in images, and its pose T_Re_board.
+
+        The board is centred on the platform joints.
+        """
+        image = np.flatnonzero(self.platform_board)
+        if not len(image):
+            return None, RigidTransform.identity()
+        B = np.array([leg.B for leg in self.legs])
+        middle = B.mean(axis=0)
+        _, spread, axes = np.linalg.svd(B - middle)
+        side = 2.0 * _BOARD * float(spread[0]) / np.sqrt(len(B))
+        board = Board("chessboard", _SQUARES, _SQUARES, side / (_SQUARES - 2))
+        T_Re_board = facing_board(board, middle, axes[2], axes[1])
+        corners = T_Re_board.apply(board.points)
+        px = []
+        for v, k in zip(self.view[image].tolist(), self.pose[image].tolist(), strict=True):
+            in_camera = self.places[v].inv().apply(corners @ self.R[k].T + self.t[k])
+            px.append(self.cameras[v].camera.project(in_camera))
+        n = board.n_corners
+        shown = found_corners(
+            np.repeat(image, n),
+            np.tile(np.arange(n), len(image)),
+            np.concatenate(px),
+            np.full(n * len(image), _CORNER_PX),
+        )
+        return BoardCorners((FixedBoard(board, "platform"),), shown), T_Re_board
+
+    @cached_property
+    def frame(self) -> IntArray:
+        """The frame in which each view shows the legs, (n_views,): with a board one for all."""
+        first = int(np.argmax(self.board))
+        frame = np.where(self.board, first, np.arange(self.n_views))
+        return np.asarray(np.unique(frame, return_inverse=True)[1])
+
+    @property
+    def spatial(self) -> bool:
+        """Whether the platform moves in space and not in a plane."""
+        return is_spatial(self.frame_legs)
+
+    @cached_property
+    def views(self) -> tuple[tuple[int, ...], ...]:
+        """The legs of each view."""
+        return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in self.seen)
+
+    @cached_property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """What moves joints at A, each once."""
+        return actuators_of(self.legs)
+
+    @cached_property
+    def carried_by(self) -> IntArray:
+        """Which of the actuators moves A of each leg, (n_legs,); -1 for none."""
+        return np.array(actuator_index(self.legs), dtype=np.intp)
+
+    @cached_property
+    def q(self) -> Array:
+        """Readings of the actuators at every pose, (k, n_actuators) [m or rad]."""
+        return readings_of_rods(self.legs, self.R, self.t)
+
+    @cached_property
+    def A_at(self) -> Array:
+        """Base joint centres in R_b at every pose, (k, n_legs, 3) [m]."""
+        return joints_at(self.legs, self.q)
+
+    @property
+    def on_actuators(self) -> tuple[tuple[tuple[int, ...], bool], ...]:
+        """The legs on each actuator, and whether it turns."""
+        return tuple(
+            (tuple(np.flatnonzero(self.carried_by == a).tolist()), actuator.turns)
+            for a, actuator in enumerate(self.actuators)
+        )
+
+    @cached_property
+    def arm(self) -> Array:
+        """From the origin of R_e to B in the directions of R_b, (k, n_legs, 3) [m]."""
+        return np.asarray(np.einsum("kij,nj->kni", self.R, np.array([leg.B for leg in self.legs])))
+
+    @cached_property
+    def length(self) -> Array:
+        """Leg lengths at every pose, (k, n_legs) [m]."""
+        return np.asarray(np.linalg.norm(self.arm + self.t[:, None] - self.A_at, axis=2))
+
+    @cached_property
+    def u(self) -> Array:
+        """Leg directions in R_b at every pose, (k, n_legs, 3)."""
+        return (self.arm + self.t[:, None] - self.A_at) / self.length[..., None]
+
+    @cached_property
+    def mean_length(self) -> float:
+        """Mean leg length, by which angles become lengths [m]."""
+        return float(self.length.mean())
+
+    @property
+    def sigma_exact(self) -> float:
+        """Standard deviation of the constraints of the mechanism [m]."""
+        return _EXACT * self.mean_length
+
+    @cached_property
+    def unit(self) -> Array:
+        """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
+        lengths = np.array([unit == "m" for unit in self.parametrization.units], dtype=np.bool_)
+        return np.where(lengths, 1.0, 1.0 / self.mean_length)
+
+    @property
+    def n_ties(self) -> int:
+        """Number of independent ties of the parameters to each other."""
+        rows = self.fitted.ties.at(self.legs)
+        return len(independent(rows, by_step(rows, self.parametrization.place) * self.unit)[1])
+
+    @cached_property
+    def with_length(self) -> BoolArray:
+        """Which legs have a length that is measured or constant, (n_legs,)."""
+        return np.array([leg.kind is not LegKind.PASSIVE for leg in self.legs], dtype=np.bool_)
+
+    def with_board(self, *, board: bool = True, link: Link = "base") -> Session:
+        """Return the same with a calibration board on a link in all images, or in none."""
+        if link == "platform":
+            return replace(self, platform_board=np.full(len(self.view), board, dtype=np.bool_))
+        return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
+
+    def columns(self, kind: int) -> IntArray:
+        """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
+        columns_of_legs = self.parametrization.place[:, kind]
+        return np.unique(columns_of_legs[columns_of_legs >= 0])
+
+
+def planned_session(
+    machine: Machine,
+    views: Sequence[Sequence[int]],  # the legs that each view shows
+    images: int = 15,  # and poses, a view
+    *,
+    board: bool = False,  # every image shows a calibration board on the base
+    platform_board: bool = False,  # and one on the platform
+    hand_held: bool = False,  # views are images of one camera in a hand
+) -> Session:
+    """Return a session with cameras in default places and random poses inside the travel.
+
+    Raises DidNotConverge if the machine cannot move.
+    """
+    n_poses = images * len(views)
+    (legs, rng), (R, t) = _random_sessions(machine, max(n_poses, REACHED))
+    rng, home = deepcopy(rng), machine.home_of_frames
+    seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
+    for v, view in enumerate(views):
+        seen[v, list(view)] = True
+    A, B = ends_at_pose(legs, home)
+    return Session(
+        leg_names=machine.leg_names,
+        legs=legs,
+        frame_legs=machine.frame_legs,
+        parametrization=parametrization_of(machine),
+        home=home,
+        R=R[:n_poses],
+        t=t[:n_poses],
+        R_reached=R,
+        t_reached=t,
+        view=np.repeat(np.arange(len(views)), images),
+        pose=np.arange(n_poses),
+        seen=seen,
+        cameras=default_cameras(A, B, views, machine.spatial, rng, hand_held=hand_held),
+        sigma_q=SIGMA_READING * machine.size,
+        unread=np.zeros((n_poses, len(legs)), dtype=np.bool_),
+        board=np.full(len(views), board, dtype=np.bool_),
+        platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
+    )
+
+
+@lru_cache(maxsize=4)
+def _random_sessions(
+    machine: Machine, n_poses: int
+) -> tuple[tuple[tuple[Leg, ...], np.random.Generator], tuple[Array, Array]]:
+    """Return :func:`perturbed_machine`, and random poses and readings."""
+    legs, rng = perturbed_machine(machine)
+    travel = travel_of(machine)
+    postures = random_postures_of_legs(
+        legs, machine.frame_legs, machine.home_of_frames, travel, n_poses, rng
+    )
+    return (legs, rng), postures
+
+
+def recorded_session(
+    # A view is taken to show the legs that have axes in it; without a table of axes those that it
+    # names, or all, which have a visible cylinder
+    dataset: Dataset,
+    *,
+    twists: bool = False,  # count twists of legs and gains of actuators among the parameters
+) -> Session:
+    """Return the session of a dataset.
+
+    Where readings do not give its poses, random ones inside the travel take their place.
+
+    Raises DatasetError if readings are out of reach of the model by more than its errors may be.
+    """
+    machine, m = dataset.machine, dataset.measurements
+    to_Rb, home = machine.T_base_Rb.inv(), machine.home_of_frames
+    legs, rng = perturbed_machine(machine)
+    if machine.is_determined:
+        R, t = Frames.of(nominal_poses(machine, m)[0])
+    else:
+        travel = travel_of(machine)
+        R, t = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+    parametrization = parametrization_of(machine, twists=twists)
+    R_reached, t_reached = R, t
+    if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
+        more = random_postures_of_legs(
+            legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
+        )
+        R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
+    used = np.unique(m.view)
+    views = [m.views[v] for v in used]
+    seen = np.array(
+        [[bool(leg.cylinders) and view.uses(leg.name) for leg in machine.legs] for view in views]
+    )
+    if dataset.axes is not None:
+        shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
+        shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
+        seen = shown_legs[used]
+    A, B = ends_at_pose(legs, home)
+    shown = [np.flatnonzero(row).tolist() for row in seen]
+    placed = default_cameras(A, B, shown, machine.spatial, rng)
+    cameras = tuple(
+        replace(
+            view,
+            T_base_camera=default.T_base_camera
+            if view.T_base_camera is None
+            else to_Rb * view.T_base_camera,
+        )
+        for view, default in zip(views, placed, strict=True)
+    )
+    return Session(
+        leg_names=machine.leg_names,
+        legs=legs,
+        frame_legs=machine.frame_legs,
+        parametrization=parametrization,
+        home=home,
+        R=R,
+        t=t,
+        R_reached=R_reached,
+        t_reached=t_reached,
+        view=np.searchsorted(used, m.view),
+        pose=m.pose,
+        seen=seen,
+        cameras=cameras,
+        sigma_q=m.sigma_q,
+        sigma_by_joint=m.sigma_by_joint,
+        unread=np.isnan(m.q_of_poses),
+        board=np.isin(used, m.view[_showing(dataset, "base")]),
+        platform_board=_showing(dataset, "platform"),
+        shows_arms=dataset.axes is None,
+    )
+
+
+def default_cameras(
+    A: Array,  # A, B: (n_legs, 3): joint centres at home, in R_b [m]
+    B: Array,
+    views: Sequence[Sequence[int]],  # the legs that each view shows
+    # planar machines are seen from along their normal, tilted toward the side of the legs
+    spatial: bool,
+    rng: np.random.Generator,
+    *,
+    hand_held: bool = False,
+) -> tuple[View, ...]:
+    """Return a camera in R_b for each view, which looks at the legs that it shows.
+
+    No two of them stand in the same place, even if they show the same legs.
+    """
+    points = np.concatenate([A, B])
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    middle = 0.5 * (A + B)
+    centre = middle.mean(axis=0)
+    axis = _axis(A, B) if spatial else np.array([0.0, 0.0, 1.0])
+    cameras = []
+    for v, seen in enumerate(views):
+        target = middle[list(seen) or slice(None)].mean(axis=0)
+        outward = target - centre
+        outward -= axis * (outward @ axis)
+        if np.linalg.norm(outward) < 0.02 * size:  # legs all around: any side will do
+            outward = cross(axis, rng.normal(size=3))
+        outward /= np.linalg.norm(outward)
+        side = cross(axis, outward)
+        turn, lift = rng.uniform(-0.15, 0.15), rng.uniform(0.05, 0.3)
+        if not spatial:
+            lift = 0.5 * np.pi - _TILT + rng.uniform(-0.1, 0.1)
+        toward = np.cos(turn) * outward + np.sin(turn) * side
+        toward = np.cos(lift) * toward + np.sin(lift) * axis
+        place = look_at(centre + _DISTANCE * size * rng.uniform(0.95, 1.05) * toward, target)
+        camera = replace(sample_camera(), gamma_is_given=False)
+        cameras.append(View(str(v + 1), camera, place, hand_held=hand_held))
+    return tuple(cameras)
+
+
+def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> tuple[View, ...]:
+    """Return the default positions of further cameras."""
+    B = (session.arm + session.t[:, None]).mean(axis=0)
+    rng = np.random.default_rng(_SEED + 1)
+    return default_cameras(session.A_at.mean(axis=0), B, views, session.spatial, rng)
+
+
+def _axis(A: Array, B: Array) -> Array:
+    """Return the direction from base to platform."""
+    across = B.mean(axis=0) - A.mean(axis=0)
+    size = float(np.linalg.norm(across))
+    if size < 1e-6:
+        return np.array([0.0, 0.0, 1.0])
+    return np.asarray(across / size)
+
+
+def perturbed_machine(machine: Machine) -> tuple[tuple[Leg, ...], np.random.Generator]:
+    """Return legs near the nominal ones, and a source of chance."""
+    rng = np.random.default_rng(_SEED)
+    nominal, parametrization = geometries(machine), parametrization_of(machine)
+    A, B = ends_at_pose(nominal, machine.home_of_frames)
+    length = float(np.linalg.norm(B - A, axis=1).mean())
+    scale = np.where([unit == "m" for unit in parametrization.units], length, 1.0)
+    step = _PERTURBATION * scale * rng.uniform(-1.0, 1.0, len(scale))
+    legs = moved_legs(nominal, parametrization.place, step)
+    return on_ties(legs, nominal, machine_ties(machine), parametrization.place, scale), rng
+
+
+def ends_at_pose(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
+    """Return the joint centres A and B (n_legs, 3) at a pose, in R_b."""
+    A, B = ends_at_poses(legs, *components([T]))
+    return A[0], B[0]
+
+
+def travel_of(machine: Machine) -> Array:
+    """Return shortest and longest length of each leg, (n_legs, 2) [m].
+
+    Of rods on actuators it is the travel of these [m or rad].
+    """
+    travels = []
+    for leg in machine.legs:
+        if leg.actuator is not None:
+            travels.append(list(leg.actuator.travel))
+        elif leg.kind is LegKind.CONSTANT:
+            travels.append([leg.q0, leg.q0])
+        else:
+            travels.append(sorted(leg.length_at(q) for q in leg.travel))
+    return np.array(travels)
+
+
+def _showing(dataset: Dataset, link: Link) -> BoolArray:
+    """Return the mask of images with the board on a link; all if not searched yet."""
+    rows, fixed, corners = (
+        range(dataset.measurements.n_rows),
+        dataset.board_on(link),
+        dataset.corners,
+    )
+    if fixed is None or corners is None:
+        return np.full(len(rows), fixed is not None, dtype=np.bool_)
+    return np.isin(rows, corners.row[corners.used & fixed.has(corners.corner)])
+
+
+def legs_around(session: Session) -> list[int]:
+    """Return the legs in their order around the base."""
+    A = session.A_at.mean(axis=0)
+    points = A + (session.arm + session.t[:, None]).mean(axis=0)
+    centred = points - points.mean(axis=0)
+    _, _, basis = np.linalg.svd(A - A.mean(axis=0))
+    angle = np.arctan2(centred @ basis[1], centred @ basis[0])
+    return [int(j) for j in np.argsort(angle, kind="stable")]
+
+
+def neighbours(ring: Sequence[int], size: int) -> list[tuple[int, ...]]:
+    """Return all groups of so many neighbours, (size,) each, in the order of the legs."""
+    n = len(ring)
+    groups = (
+        tuple(sorted(ring[(start + k) % n] for k in range(min(size, n)))) for start in range(n)
+    )
+    return list(dict.fromkeys(groups))
+
+
+def ring_distance(ring: Sequence[int], leg: int, others: Sequence[int]) -> int:
+    """Return the number of steps around the base from a leg to the nearest of others."""
+    place = {j: k for k, j in enumerate(ring)}
+    steps = (abs(place[leg] - place[other]) for other in others)
+    return min((min(s, len(ring) - s) for s in steps), default=0)

@@ -1,0 +1,95 @@
+"""Camera files written for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from legcal.errors import UsageError
+from legcal.files.folder import OutputFile
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import PARAMETERS, camera_info, read_camera
+from legcal.vision.distortion import CameraProgram
+
+_MARK = "# camera converted by legcal\n"
+CONVERTED = OutputFile(
+    "the camera", "camera file", "", "a new file or one that this command wrote", _MARK.encode()
+)
+
+
+def convert_camera(path: Path, program: CameraProgram, output: Path) -> None:
+    """Write a camera file in the form of a program; its covariance is left out.
+
+    Raises
+    ------
+    DatasetError
+        If the camera file cannot be read.
+    UsageError
+        If the program has no such lens, or if another file stands there.
+    """
+    CONVERTED.check_place(output)
+    text = camera_text(read_camera(path), program, output.stem)
+    CONVERTED.write(output, text.replace("\n", f"\n{_MARK}", 1))
+
+
+def camera_text(camera: Camera, program: CameraProgram, name: str) -> str:
+    """Return the text of a camera file in the form of a program.
+
+    Raises UsageError if the program has no such lens.
+    """
+    if program == "ros":
+        return camera_info(camera, name)
+    D = camera.distortion.tolist()
+    if camera.K[0, 1] != 0.0:
+        raise _no_such_lens(camera, program, "a camera without skew")
+    numbers = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+    pinhole = [float(number) for number in numbers]
+    if program == "opencv":
+        return _storage(camera)
+    if program == "mrcal":
+        n = len(pinhole) + len(D)
+        for lens, (model, parameters) in PARAMETERS["mrcal"].items():
+            if (model, len(parameters.split())) == (camera.model, n):
+                size = [camera.width, camera.height]
+                return (
+                    f"{{\n    'lensmodel':  '{lens}',\n    'extrinsics': {[0.0] * 6},\n"
+                    f"    'intrinsics': {pinhole + D},\n    'imagersize': {size},\n}}\n"
+                )
+        raise _no_such_lens(camera, program, "plumb_bob, rational_polynomial or thin_prism")
+    lens = {"plumb_bob": "radtan", "equidistant": "equidistant"}.get(camera.model, "")
+    if not lens or (lens == "radtan" and any(D[4:])):
+        raise _no_such_lens(camera, program, "radtan (plumb_bob with k3 = 0) or equidistant")
+    block = {
+        "cam_overlaps": [],
+        "camera_model": "pinhole",
+        "distortion_coeffs": D[:4] or [0.0] * 4,
+        "distortion_model": lens,
+        "intrinsics": pinhole,
+        "resolution": [camera.width, camera.height],
+    }
+    return yaml.safe_dump({"cam0": block}, sort_keys=False, default_flow_style=None, width=1000)
+
+
+def _no_such_lens(camera: Camera, program: CameraProgram, needed: str) -> UsageError:
+    """Return the error for a camera that a program cannot hold."""
+    skew = " with skew" if camera.K[0, 1] != 0.0 else ""
+    return UsageError(
+        f"The camera could not be written for {program}: found the lens {camera.model}{skew}, "
+        f"needed {needed}; choose another program, or calibrate with another --model."
+    )
+
+
+def _storage(camera: Camera) -> str:
+    """Return the text of an OpenCV FileStorage."""
+    storage = cv2.FileStorage("camera.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.K)
+    storage.write("distortion_model", camera.model)
+    D = camera.distortion if len(camera.distortion) else np.zeros(5)
+    storage.write("distortion_coefficients", D[:, None])
+    storage.write("fisheye_model", int(camera.model == "equidistant"))
+    return str(storage.releaseAndGetString())
