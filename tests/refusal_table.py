@@ -254,12 +254,7 @@ def _worded(
 
 def _use() -> Iterable[Refusal]:
     rows: list[tuple[str, str, tuple[str, ...]]] = [
-        ("no-command", "", ()),
-        ("no-study", "study", ()),
         ("unknown-command", "frobnicate", ("frobnicate",)),
-        ("unknown-study", "study papers", ("papers",)),
-        ("no-model", "inspect", ("MODEL",)),
-        ("unknown-option", "inspect hexapod --colour", ("--colour",)),
         ("no-dataset", "calibrate nowhere -o {out}", ("nowhere",)),
         ("no-output", "calibrate nowhere", ("--output",)),
         ("no-reference", "evaluate hexapod nowhere.urdf", ("nowhere.urdf",)),
@@ -273,7 +268,6 @@ def _use() -> Iterable[Refusal]:
         ("empty-study", "study paper -o ''", ("-o",)),
         ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
         ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
-        ("workers", "detect x -o {out} --workers 0", ("--workers", "found 0")),
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
@@ -315,7 +309,6 @@ def _options() -> Iterable[Refusal]:
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
         ("no-output", "", ("--output", "-o")),
         ("fraction", "-o {out} --holdout 1.5", ("1.5", "0", "1")),
-        ("fraction-none", "-o {out} --holdout 0", ("0", "1")),
         ("no-result", "--check {in}/none", ("none",)),
     ]
     yield from _worded("check", "calibrate {in}/set", checks, "result")
@@ -323,8 +316,6 @@ def _options() -> Iterable[Refusal]:
     simulate: list[tuple[str, str, tuple[str, ...]]] = [
         ("poses", "--poses 0", ("0",)),
         ("negative-poses", "--poses -3", ("-3",)),
-        ("half-poses", "--poses 1.5", ("1.5",)),
-        ("poses-e", "--poses 1e3", ("1e3",)),
         ("poses-file", "--poses none.csv", ("none.csv",)),
         ("seed", "--seed -1", ("-1",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
@@ -351,14 +342,8 @@ def _options() -> Iterable[Refusal]:
     ]
     yield from _worded("simulate", "simulate hexapod -o {out}", simulate)
 
-    study: list[tuple[str, str, tuple[str, ...]]] = [
-        ("workers", "paper --workers 0", ("--workers", "found 0")),
-    ]
-    yield from _worded("study", "study", study)
-
     locate: list[tuple[str, str, tuple[str, ...]]] = [
         ("tool-position", "-o {out} --tool-position 1,2", ("--tool-position",)),
-        ("tool-unit", "-o {out} --tool-position 1,2,3deg", ("--tool-position",)),
         ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
         ("sigma", "-o {out} --position-sigma 0.02", ("--position-sigma", "0.02")),
         ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
@@ -414,17 +399,14 @@ def _datasets() -> Iterable[Refusal]:
         ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
         ("no-version", entry(legcal_dataset=GONE), ("legcal_dataset",)),
         ("sigma-0", entry(encoder_sigma=0.0), ("encoder_sigma", "0.0")),
-        ("sigma-negative", entry(encoder_sigma=-1e-6), ("encoder_sigma", "-1e-06")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("sigma-text", entry(encoder_sigma="small"), ("encoder_sigma", "'small'")),
         ("no-views", entry(views={}), ("views",)),
-        ("view-list", entry(views=["c1"]), ("views",)),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
         ("no-mechanism", entry(mechanism=None), ("mechanism",)),
         ("mechanism", entry(mechanism="models/none.yaml"), ("none.yaml",)),
         ("key", entry(measurement="x"), ("measurement", "'measurements'")),
-        ("absolute", entry(measurements="/etc/passwd"), ("measurements", "/etc/passwd")),
         ("outside", entry(measurements="../m.csv"), ("measurements", "../m.csv")),
         ("no-table", entry(measurements="none.csv"), ("none.csv",)),
         ("no-camera", entry(views__c1__camera=GONE), ("views.c1.camera",)),
@@ -485,19 +467,14 @@ def _datasets() -> Iterable[Refusal]:
     april = {"kind": "aprilgrid", "tags_x": 6, "tags_y": 6, "tag_size": 0.088, "tag_spacing": 0.3}
     boards: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
         ("square", {**chess, "square": 30}, ("board.square", "30 m", "0.03")),
-        ("square-0", {**chess, "square": 0.0}, ("board.square", "0 m")),
         ("square-nan", {**chess, "square": float("nan")}, ("board.square",)),
         ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
-        ("no-kind", {"squares_x": 9}, ("board.kind",)),
         ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
         ("few", {**chess, "squares_x": 3}, ("3 x 6", "4")),
         ("fraction", {**chess, "squares_x": 9.5}, ("board.squares_x",)),
-        ("negative", {**chess, "squares_x": -1}, ("board.squares_x", "-1")),
-        ("true", {**chess, "squares_x": True}, ("board.squares_x",)),
         ("key", {**chess, "columns": 9}, ("board.columns",)),
         ("pose", {**chess, "T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
         ("marker", {**char, "marker": 0.05}, ("0.05 m", "0.04 m")),
-        ("marker-metres", {**char, "marker": 30}, ("board.marker", "30 m")),
         ("no-marker", {k: v for k, v in char.items() if k != "marker"}, ("board.marker",)),
         ("dictionary", {**char, "dictionary": "4X4"}, ("board.dictionary", "'4X4'")),
         ("markers", {**char, "squares_x": 20, "squares_y": 20}, ("200", "50")),
@@ -568,30 +545,23 @@ def _measurements() -> Iterable[Refusal]:
         ("no-view", header(table, "view", None), ("'view'",)),
         ("column-twice", header(table, "leg2_prismatic", joint), (f"'{joint}'", "2 times")),
         ("semicolons", swap(table, ",", ";", -1), ("commas",)),
-        ("tabs", swap(table, ",", "\t", -1), ("commas",)),
-        ("empty", kept(table, 0), ("no row",)),
         ("nothing", text(table, ""), ("no row",)),
         ("short", swap(table, "c1,images/c1_2.png", "images/c1_2.png"), ("row 2", "7", "8")),
         ("long", swap(table, "c1,images/c1_2.png", "c1,,images/c1_2.png"), ("row 2", "9", "8")),
         ("nan", readings(3, "nan"), ("row 3 (line 4)", joint, "'nan'")),
-        ("inf", readings(3, "inf"), ("row 3 (line 4)", joint, "'inf'")),
         ("blank", readings(3, ""), ("row 3 (line 4)", joint)),
-        ("word", readings(3, "ten"), ("row 3 (line 4)", joint, "'ten'")),
         ("underscore", readings(3, "1_0"), ("row 3 (line 4)", joint, "'1_0'")),
-        ("overflow", readings(3, "1e999"), ("row 3 (line 4)", joint, "'1e999'")),
         ("travel", readings(2, "0.15288"), (joint, "0.15288 m", "row 2", "-0.004", "0.144")),
         ("millimetres", readings(None, "70"), (joint, "millimetres")),
         ("view", cell(table, 3, view="c3"), ("row 3", "view", "'c3'")),
         ("same-image", image("images/c1_1.png"), ("row 3", "images/c1_1.png", "row 1")),
         ("same-path", image("images/../images/c1_1.png"), ("row 3", "row 1")),
         ("outside", image("../other.png"), ("row 3", "../other.png")),
-        ("absolute", image("/tmp/other.png"), ("row 3", "/tmp/other.png")),
         ("windows", image("C:\\other.png"), ("row 3", "C:\\other.png")),
         ("no-image", image("images/none.png"), ("row 3", "none.png")),
         ("folder", image("images"), ("row 3", "images")),
         ("no-name", image(""), ("row 3", "observations.csv")),
         ("bytes", text(table, b"view,image\n\xff\xfe"), ("0xff",)),
-        ("quote", text(table, b'view,image\n"c1,x'), (table,)),
         (
             "all-at-once",
             (cell(table, 1, view="c7"), readings(2, "nan"), image("/a.png"), readings(4, "9")),
@@ -659,7 +629,6 @@ def _cameras() -> Iterable[Refusal]:
         ("centre", matrix((5, 900.0)), ("cy = 900", "64 x 48")),
         ("last-row", matrix((8, 2.0)), ("[0, 0, 1]",)),
         ("mapping", content(camera_matrix=7), ("camera_matrix", "7")),
-        ("shape", content(camera_matrix={"rows": 1, "cols": 2, "data": [1, 2]}), ("1 x 2",)),
         (
             "all-at-once",
             content(camera_matrix__data=[0.0, *K[1:4], -3.0, 900.0, *K[6:]],
@@ -667,16 +636,13 @@ def _cameras() -> Iterable[Refusal]:
             ("fx = 0", "fy = -3", "cy = 900", "3"),
         ),
         ("kalibr-model", kalibr(camera_model="omni"), ("cam0.camera_model", "'omni'")),
-        ("kalibr-lens", kalibr(distortion_model="fov"), ("cam0.distortion_model", "'fov'")),
         ("kalibr-few", kalibr(distortion_coeffs=[0.1]), ("1", "4", "radtan")),
         ("kalibr-intrinsics", kalibr(intrinsics=[1, 2, 3]), ("cam0.intrinsics", "3")),
         ("keys", text(file, "fx: 1\nfy: 2\n"), ("fx", "fy")),
         ("list", text(file, "[1, 2]"), (file,)),
-        ("nothing", text(file, ""), (file,)),
         ("broken", text(file, "a: [1, 2"), ("line 1",)),
         ("repeated", text(file, "a: 1\nb: 2\na: 3"), ("line 3", "'a'")),
         ("python", text(file, "a: !!python/object/apply:os.system [ls]"), (file,)),
-        ("infinite", matrix((0, float("inf"))), ("camera_matrix", "inf")),
         ("centre-negative", matrix((2, -1.0)), ("cx = -1", "64 x 48")),
         ("kalibr-none", kalibr(distortion_model="none", distortion_coeffs=[0.1, 0.0, 0.0, 0.0]),
          ("4", "0 for none")),
@@ -684,7 +650,6 @@ def _cameras() -> Iterable[Refusal]:
         ("kalibr-two", (kalibr(), _two_cameras), ("2 cameras", "cam0, cam1")),
         ("storage-xml", text(file, "<?xml version='1.0'?><opencv_storage><a>"), ("OpenCV",)),
         ("storage-no-matrix", text(file, "%YAML:1.0\n---\nimage_width: 5\n"), ("camera_matrix",)),
-        ("storage-bytes", text(file, b"%YAML:1.0\n# \xff"), ("UTF-8",)),
         ("storage", text(file, "%YAML:1.0\n---\nimage_width: [[["), ("OpenCV",)),
         ("bytes", text(file, b"a: \xff\xfe\xfd"), ("UTF-8",)),
     ]  # fmt: skip
@@ -748,11 +713,8 @@ def _tables() -> Iterable[Refusal]:
         ("number", cell(o, 1, a="0.1x"), ("column a", "'0.1x'")),
         ("blank", cell(o, 1, u0=""), ("column u0",)),
         ("nan", cell(o, 1, v1="nan"), ("column v1", "'nan'")),
-        ("inf", cell(o, 1, s00="inf"), ("column s00", "'inf'")),
-        ("norm", cell(o, 1, a="5"), ("columns a, b, c", "norm")),
         ("zero", cell(o, 1, a="0", b="0", c="0"), ("norm 0",)),
         ("point", cell(o, 1, u0="5", u1="5", v0="7", v1="7"), ("u0", "v1")),
-        ("negative", cell(o, 1, s00="-1"), ("columns s00, s01, s11",)),
         ("indefinite", cell(o, 1, s00="1", s01="2", s11="1"), ("(1, 2, 1)",)),
         (
             "large",
@@ -765,7 +727,6 @@ def _tables() -> Iterable[Refusal]:
             ("columns s00, s01, s11", "1e-10 and 1 px", "1e-05 to 100 px"),
         ),
         ("residual", cell(o, 1, residual="-1"), ("column residual", "'-1'")),
-        ("contrast", cell(o, 1, contrast="inf"), ("column contrast", "'inf'")),
         ("by-gamma", cell(o, 1, by_gamma="nan"), ("column by_gamma", "'nan'")),
         ("rejected", cell(o, 1, verdict="rejected", a="left"), ("column a", "'left'")),
         ("far", cell(o, 1, u0="-400", v0="-300"), ("px", "(a, b, c)")),
@@ -792,16 +753,12 @@ def _tables() -> Iterable[Refusal]:
         ("leg", cell(a, 5, leg="legZ"), ("row 5 (line 6)", "leg", "'legZ'")),
         ("blank", cell(a, 5, psi=""), ("row 5 (line 6)", "psi")),
         ("nan", cell(a, 5, z="nan"), ("column z", "'nan'")),
-        ("underscore", cell(a, 5, x="1_0"), ("column x", "'1_0'")),
         ("degrees", cell(a, 5, theta="-12"), ("-12", "3.1416", "rad")),
         ("tilt", cell(a, 5, psi="1.7"), ("1.7", "1.5708", "rad")),
-        ("far", cell(a, 5, x="1e9"), ("column x", "1e9", "1000 m")),
         ("farther", cell(a, 5, z="-1e300"), ("column z", "-1000 to 1000 m")),
         ("level", cell(a, 5, psi="1.5707963"), ("columns psi, theta", "(x, 0, z)")),
-        ("endless", cell(a, 5, theta="-inf"), ("column theta", "'-inf'")),
         ("sigma-rad", cell(a, 5, sigma_theta="3"), ("column sigma_theta", "1e-09 to 1 rad")),
         ("sigma-0", cell(a, 5, sigma_psi="0"), ("sigma_psi", "0")),
-        ("sigma-negative", cell(a, 5, sigma_x="-1e-3"), ("sigma_x", "-1e-3", "1e-09")),
         ("sigma-large", cell(a, 5, sigma_z="50"), ("sigma_z", "1", "m")),
         ("no-point", cell(a, 5, theta="1.5707963"), ("psi, theta",)),
         ("twice", doubled(a), ("row 1",)),
@@ -810,7 +767,6 @@ def _tables() -> Iterable[Refusal]:
         ("empty", kept(a, 0), ("no row",)),
         ("all-at-once", (cell(a, 2, psi="x", sigma_x="0"), cell(a, 4, leg="leg9")),
          ("'x'", "sigma_x", "'leg9'")),
-        ("all-degrees", cell(a, None, theta="-91"), ("-91", "rad")),
         ("few", (kept("measurements.csv", 1), kept(a, 3)), ()),
         ("missing", kept(a, 60), ("row",)),
     ]  # fmt: skip
@@ -843,7 +799,6 @@ def _tables() -> Iterable[Refusal]:
         ("view", "c8,images/c1_2.png,3,1,2,0.1,used,,detected", ("view", "'c8'")),
         ("twice", good.strip(), ("row 2", "row 1")),
         ("image", "c2,images/c1_2.png,3,1,2,0.1,used,,detected", ("column image", "c1_2.png")),
-        ("nan", "c1,images/c1_2.png,3,1,nan,0.1,used,,detected", ("column v", "'nan'")),
     ]
     for name, row, said in corners:
         edits = (board, text(c, f"{line}{good}{row}\n"))
@@ -872,14 +827,11 @@ def _landmarks() -> Iterable[Refusal]:
     c = "landmarks.csv"
     rows: Rows = [
         ("joint", cell(c, 3, joint="leg9.base"), ("row 3", "'leg9.base'", "leg1.base")),
-        ("leg", cell(c, 3, joint="leg1"), ("row 3", "'leg1'", "leg1.base")),
         ("view", cell(c, 2, view="c8"), ("row 2", "'c8'")),
         ("image", cell(c, 2, image="images/c2_1.png"), ("row 2", "column image", "c2_1.png")),
         ("outside", cell(c, 2, u="470"), ("row 2", "column u", "470 px", "63.5 px")),
         ("number", cell(c, 2, v="x"), ("row 2", "column v", "'x'")),
-        ("no-number", cell(c, 2, v=""), ("row 2", "column v", "an empty cell")),
         ("sigma", cell(c, 2, sigma="0"), ("row 2", "column sigma", "0.01")),
-        ("sigma-nan", cell(c, 2, sigma="nan"), ("column sigma", "'nan'")),
         ("twice", doubled(c), ("row 13", "row 1", "the same image and joint")),
         ("column", header(c, "joint", "leg"), ("'joint'",)),
         ("none", kept(c, 0), ("no row",)),
@@ -903,18 +855,15 @@ def _overrides() -> Iterable[Refusal]:
     priors: list[tuple[str, str, tuple[str, ...]]] = [
         ("empty", "leg1.offset=", ("leg1.offset",)),
         ("sigma-0", "leg1.offset=0.35±0", ("sigma 0",)),
-        ("sigma-negative", "leg1.offset=0.35±-0.001", ("-0.001",)),
         ("infinite", "leg1.offset=0.35±1e999", ("'1e999'",)),
         ("sigma-small", "leg1.offset=0.35±1e-12", ("1e-12", "1e-09")),
         ("sigma-large", "leg1.offset=0.35±1e300", ("1e+300", "1e+06")),
         ("one-unit", "leg1.offset=350mm±0.1", ("unit",)),
-        ("two-kinds", "leg1.offset=350mm±1deg", ("unit",)),
         ("unit", "leg1.offset=350±1furlong", ("'furlong'", "mm")),
         ("pixels", "leg1.offset=350±1px", ("px", "leg1.offset", "m")),
         ("k1", "c1.k1=0±1mm", ("c1.k1",)),
         ("metres", "leg1.offset=350±1", ("350 m", "leg1.offset")),
         ("radius", "leg1.radius.leg1_tube=0±0.001", ("0 m", "leg1.radius.leg1_tube")),
-        ("radius-negative", "leg1.radius.leg1_tube=-0.01±0.001", ("-0.01 m",)),
         ("focal", "c1.fx=10±1", ("10 px", "c1.fx")),
         ("centre", "c1.cx=1024±1", ("1024 px", "c1.cx")),
         ("name", "leg1.ofset=0.35±0.1", ("'leg1.offset'",)),
@@ -946,8 +895,6 @@ def _overrides() -> Iterable[Refusal]:
     planar: list[tuple[str, str, tuple[str, ...]]] = [
         ("height", "--set leg1.base.z", ("leg1.base.z",)),
         ("axis", "--set leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
-        ("contradicted", "--set leg1.offset=0.24", ("leg1.offset", "0.24")),
-        ("contradicted-prior", "--set leg1.offset=240+-0.1mm", ("leg1.offset", "0.24")),
     ]
     for name, words, named in planar:
         yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-axes")
@@ -986,7 +933,6 @@ def _models() -> Iterable[Refusal]:
         ("frame-legs", swap(y, "  - leg1\n", ""), ("2", "3")),
         ("frame-leg-twice", swap(y, "  - leg1\n", "  - leg3\n"), ("'leg3'",)),
         ("home-nan", swap(y, "0.38274", ".nan"), ("legcal.home.xyz.2",)),
-        ("home-text", swap(y, "0.38274", "high"), ("legcal.home.xyz.2",)),
         ("home-norm", swap(y, "0.951057", "0.7"), ("0.765",)),
         ("home-far", swap(y, "0.38274", "0.9"), ("legcal.home",)),
         ("version", swap(y, "  version: 1", "  version: 2"), ("legcal.version", "2")),
@@ -1000,7 +946,6 @@ def _models() -> Iterable[Refusal]:
          ("'nowhere'", "'bass'", "'lost'")),
         ("list", text(y, "- 1\n"), (y,)),
         ("broken", text(y, "a: [1\n"), (y,)),
-        ("nothing", text(y, ""), (y,)),
         ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
         ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
@@ -1013,7 +958,6 @@ def _models() -> Iterable[Refusal]:
         ("no-radius", swap(u, 'radius="0.01" ', ""), ("radius",)),
         ("length", swap(u, 'length="0.3105"', 'length="long"'), ("'leg1_b2_link'", "long")),
         ("limits", swap(u, 'lower="-0.004"', 'lower="0.2"'), ("0.2", "0.144")),
-        ("no-limit", swap(u, limit, ""), ("lower", "upper")),
         ("floating", swap(u, 'type="floating"', 'type="spherical"'), ("'spherical'",)),
         ("mimic", swap(u, limit, f'{limit}<mimic joint="leg2_prismatic"/>'), ("<mimic>",)),
         ("no-parent", swap(u, '<parent link="leg1_b2_link"/>', ""), ("<parent link",)),
@@ -1051,9 +995,6 @@ def _models() -> Iterable[Refusal]:
         *((f"leg-named-{k}", swap(y, "leg2: leg2", f'"{name}": leg2'),
            ("legs", "the first a letter or digit", "rename it"))
           for k, name in enumerate(("leg1,", "../xleg1", "a" * 101, "-leg"))),
-        ("xyz-overflow", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 1e999 0.0"'),
-         ("line", "3 finite numbers")),
-        ("upper-nan", swap(u, 'upper="0.144"', 'upper="NaN"'), ("line", 'upper="NaN"')),
         ("no-travel", swap(u, 'upper="0.144"', 'upper="-0.004"'),
          ("line", "'leg1_prismatic'", "-0.004")),
         ("long-travel", swap(u, 'upper="0.144"', 'upper="144"'), ("travel", "'leg1'", "144 m")),
@@ -1066,7 +1007,6 @@ def _models() -> Iterable[Refusal]:
          ("<visual> cylinder", "250 mm", "along leg")),
         ("two-parents", swap(u, limit, f'{limit}<parent link="base"/>'),
          ("line", "more than one <parent>")),
-        ("no-child", swap(u, '<child link="leg1_tube"/>', ""), ("line", "no <child link=...>")),
         ("link-without-name", swap(u, '<link name="leg1_seat"/>', "<link/>"), ("line", "no name")),
         ("loop-joint", swap(u, end, f'<loop_joint name="l" type="fixed"><link1 link="base"/>'
          f"</loop_joint>{end}"), ("line", "<loop_joint>")),
@@ -1104,8 +1044,6 @@ def _models() -> Iterable[Refusal]:
         ("cycle", text(u, cycle), ("in a cycle",)),
         ("xacro", text(u, '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro">'
                           "<xacro:include/></robot>"), ("xacro",)),
-        ("urdf-empty", text(u, ""), ("could not be read",)),
-        ("urdf-text", text(u, "not xml"), ("could not be read",)),
         ("utf-16", _in_utf_16, ("UTF-8",)),
     ]  # fmt: skip
     placed = [(name, edits, ("{in}", *named)) for name, edits, named in rows]
@@ -1125,7 +1063,7 @@ def _models() -> Iterable[Refusal]:
         "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
     )
     for name, content in {
-        "empty": b"", "binary": b"\x00\x01", "other": b"<a/>",
+        "binary": b"\x00\x01", "other": b"<a/>",
         "bodies": b"<mujoco><worldbody/></mujoco>", "unclosed": b"<mujoco>",
         "entity": b'<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>',
     }.items():  # fmt: skip
@@ -1160,13 +1098,10 @@ def _formats() -> Iterable[Refusal]:
 
     mjcf: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("include", added('<include file="x.xml"/>'), ("include could not be used",)),
-        ("composite", added('<body><composite type="cable"/></body>'), ("composite could not",)),
-        ("replicate", added('<replicate count="2"/>'), ("replicate could not be used",)),
         ("body1", tied("1_end", "1_en"), ("'leg1_en' as body1", "mean 'leg1_end'?")),
         ("no-body1", tied('body1="leg1_end"', ""), ("no body1",)),
         ("no-anchor", tied('anchor="0 0 0"', ""), ("no anchor",)),
         ("anchor", tied("0 0 0", "0 0"), ("anchor='0 0'", "3 finite numbers")),
-        ("anchor-nan", tied("0 0 0", "0 nan 0"), ("anchor='0 nan 0'",)),
         ("itself", tied("seat", "end"), ("to itself",)),
         ("sites", (connect, '<connect site1="a" site2="b"/>'), ("the site 'a' as site1",)),
         ("coupled", (connect, connect + '<joint joint1="leg1_prismatic" joint2="leg2_prismatic"/>'),
@@ -1195,7 +1130,6 @@ def _formats() -> Iterable[Refusal]:
          ("default class without a",)),
         ("two-joints", (joint, joint + '<joint name="x"/>'), ("a body that has other joints",)),
         ("size", (size, size.replace("0.01", "0")), ("without a radius",)),
-        ("two-roots", ("</mujoco>", "</mujoco><mujoco/>"), ("well-formed XML",)),
         ("comment", ("<mujoco", "<sdf/><!--"), ("well-formed XML",)),
         ("bodies-6000", ("</worldbody>", "<body/>" * 6000 + "</worldbody>"), ("at most 5000",)),
         ("outside", tied("leg1_seat", "leg2_tube"),
@@ -1343,14 +1277,12 @@ def _new() -> Iterable[Refusal]:
         ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
         ("twice", f"{head},type\n{row},RPS\n", "--unit mm", ("'type'",)),
         ("long", f"{head}\n{row},1\n", "--unit mm", ("line 2", "6", "5")),
-        ("word", f"{head}\nRPS,1,x,3,4\n", "--unit mm", ("line 2", "base_y", "'x'")),
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
         ("no-type", f"{head}\n{row}\n,1,2,3,4\n", "--unit mm", ("types.1",)),
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
         ("nan", f"{head}\nRPS,nan,2,3,4\n{row}\n", "--unit mm", ("line 2", "base_x", "'nan'")),
-        ("tabs", "type\tbase_x\nRPS\t1,5\n", "--unit mm", ("'base_y'",)),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
         ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
         (
@@ -1547,9 +1479,6 @@ def _results() -> Iterable[Refusal]:
         ("model", remove("result/calibrated.yaml"), ("calibrated.yaml",)),
     ]
     yield from _spoiled("result", "calibrate {in}/set --check {in}/result", "result", rows)
-    yield Refusal(
-        "result-other-machine", "calibrate {in} --check {in}/none", ("none",), "3-rps-axes"
-    )
 
 
 def _scenes() -> Iterable[Refusal]:

@@ -27,7 +27,7 @@ def test_mutated_files_are_used_or_refused_in_time_and_memory() -> None:
 @pytest.mark.skipif(not yaml.__with_libyaml__, reason="there is one parser of YAML")
 def test_both_parsers_of_yaml_read_the_same() -> None:
     chance, n_read = np.random.default_rng(0), 0
-    valid = (made_input("small") / "dataset.yaml").read_bytes()
+    valid = (made_input("plain") / "dataset.yaml").read_bytes()
     for _ in range(300):
         content = mutate(valid, "yaml", chance)
         if not _PLAIN_TEXT.fullmatch(content):

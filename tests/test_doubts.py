@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import yaml
 from command_line import run
 from csv_rows import read_rows, write_rows
+from hexapod_example import Run
 from lxml import html
 from simulated import simulated
 
@@ -41,17 +43,39 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(tmp_path_factory.mktemp("doubts") / "set", "3-rpr", poses=10, views=3).folder
 
 
+Spoil = Callable[[Path], None]
+
+
 @pytest.fixture(scope="module")
-def healthy(session: Path) -> Calibration:
+def calibrated(
+    session: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[Spoil], Calibration]:
+    """Calibrations of that session after something was done to it, each made once."""
+
+    @cache
+    def after(spoil: Spoil) -> Calibration:
+        folder = _copy(session, tmp_path_factory.mktemp("spoiled"))
+        spoil(folder)
+        return calibrate(folder)
+
+    return after
+
+
+def _nothing(folder: Path) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def healthy(calibrated: Callable[[Spoil], Calibration]) -> Calibration:
     """The calibration of that session."""
-    return calibrate(session)
+    return calibrated(_nothing)
 
 
 def _copy(session: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(session, tmp_path / "set"))
 
 
-def _table(name: str, change: Callable[[dict[str, str]], None]) -> Callable[[Path], None]:
+def _table(name: str, change: Callable[[dict[str, str]], None]) -> Spoil:
     def changed(folder: Path) -> None:
         rows = read_rows(folder / name)
         for row in rows:
@@ -61,7 +85,7 @@ def _table(name: str, change: Callable[[dict[str, str]], None]) -> Callable[[Pat
     return changed
 
 
-def _yaml(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+def _yaml(change: Callable[[dict[str, Any]], None]) -> Spoil:
     def changed(folder: Path) -> None:
         found = yaml.safe_load((folder / "dataset.yaml").read_text())
         change(found)
@@ -74,7 +98,7 @@ def _update(folder: Path, keys: dict[str, Any]) -> None:
     _yaml(lambda found: found.update(keys))(folder)
 
 
-def _rejected(is_out: Callable[[dict[str, str]], bool]) -> Callable[[Path], None]:
+def _rejected(is_out: Callable[[dict[str, str]], bool]) -> Spoil:
     def change(row: dict[str, str]) -> None:
         if is_out(row):
             row |= {"verdict": "rejected", "reason": "faint"}
@@ -89,6 +113,9 @@ def _number(name: str) -> int:
 def _backlash(row: dict[str, str]) -> None:
     if _number(row["pose"]) % 2:
         row["leg1_prismatic"] = str(float(row["leg1_prismatic"]) + 1e-3)
+
+
+BACKLASH = _table("measurements.csv", _backlash)
 
 
 def _stretched(row: dict[str, str]) -> None:
@@ -109,7 +136,7 @@ def _moved_hint(found: dict[str, Any]) -> None:
     ("code", "spoil", "said"),
     [
         ("noise", _table("observations.csv", _overrated), "all views scatter"),
-        ("reading_noise", _table("measurements.csv", _backlash), "leg1 scatter"),
+        ("reading_noise", BACKLASH, "leg1 scatter"),
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
         ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
         ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),
@@ -123,11 +150,9 @@ def _moved_hint(found: dict[str, Any]) -> None:
     ],
 )
 def test_a_doubt_is_raised_by_what_it_is_about(
-    code: str, spoil: Callable[[Path], None], said: str, session: Path, tmp_path: Path
+    code: str, spoil: Spoil, said: str, calibrated: Callable[[Spoil], Calibration]
 ) -> None:
-    folder = _copy(session, tmp_path)
-    spoil(folder)
-    calibration = calibrate(folder)
+    calibration = calibrated(spoil)
     (doubt,) = [one for one in calibration.doubts if one.code == code]
     assert said in doubt.what
     assert not calibration.verdict.trustworthy
@@ -217,17 +242,18 @@ def test_left_out_images_contradict_a_model_that_was_led_away(healthy: Calibrati
     assert {"left_out", "no_better"} <= codes
 
 
-@pytest.mark.parametrize("spoil", [None, _table("measurements.csv", _backlash)])
+@pytest.mark.parametrize("spoil", [_nothing, BACKLASH])
 def test_exit_code_document_summary_and_page_agree(
-    spoil: Callable[[Path], None] | None,
-    session: Path,
+    spoil: Spoil,
+    calibrated: Callable[[Spoil], Calibration],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder, out = _copy(session, tmp_path), tmp_path / "result"
-    if spoil is not None:
-        spoil(folder)
+    calibration, out = calibrated(spoil), tmp_path / "result"
+    folder = calibration.dataset.folder
+    again = Run(folder, out, calibration, ()).written_again
+    monkeypatch.setattr("legcal.calibration.pipeline.calibrate", again)
     code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
     printed = json.loads(capsys.readouterr().out)
     written = load_result(out).result
@@ -239,7 +265,7 @@ def test_exit_code_document_summary_and_page_agree(
     assert written.document() == printed
     assert printed["verdict"] in page.xpath("string(//section[@id='verdict'])")
     assert printed["verdict"] in load_result(out).summary()
-    if spoil is None:
+    if spoil is _nothing:
         assert (code, printed["trustworthy"], printed["doubts"]) == (0, True, [])
         assert "good" in light
         assert "Load calibrated.urdf" in first

@@ -113,7 +113,7 @@ def module_at(path: Path) -> ModuleType:
     "name",
     thinned(
         KINEMATICS,
-        ["3-upu", "tricept", "delta"],
+        ["3-upu", "delta"],
     ),
 )
 def test_kinematics_in_python_are_those_of_the_model(
@@ -245,9 +245,7 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
 # --- models of other programs -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", thinned((*NAMES, *ACTUATED), ["hexapod", "3-upu", "tricept", "delta"])
-)
+@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-upu", "delta"]))
 def test_a_urdf_with_its_loops_is_the_same_machine_without_a_yaml(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from dataset_folder import dataset_of_readings
-from hexapod_example import Run
 from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
 from legcal import calibrate
 from legcal.calibration.clicks import click_notes
-from legcal.calibration.result import Verdict
+from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.verdict import judge
 from legcal.data.dataset import load_dataset
 from legcal.data.landmarks import Landmarks, joint_name
@@ -147,12 +146,18 @@ def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints
         load_dataset(folder, check_images=False)
 
 
-def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run) -> None:
-    calibration = example_run.calibration
-    dataset, solution = calibration.dataset, calibration.solution
+@pytest.fixture(scope="module")
+def planar(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """The calibration of a planar machine in three views."""
+    folder = tmp_path_factory.mktemp("planar") / "set"
+    return calibrate(simulated(folder, "3-rpr", views=3, poses=6).folder)
+
+
+def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(planar: Calibration) -> None:
+    calibration, dataset, solution = planar, planar.dataset, planar.solution
     m = dataset.measurements
     rows = np.array([int(np.flatnonzero(m.view == v)[0]) for v in range(2)])
-    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(6), (0, 1), indexing="ij"))
+    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(3), (0, 1), indexing="ij"))
     A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
     joints = np.stack([A, B], axis=2)[m.pose[row], leg, end]
     seen = [
@@ -183,10 +188,9 @@ def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(example_run: Run)
 
 
 def test_a_click_that_a_fit_contradicts_is_named_with_the_joint_that_it_may_show(
-    tmp_path: Path,
+    planar: Calibration,
 ) -> None:
-    calibration = calibrate(simulated(tmp_path / "set", "3-rpr", poses=6).folder)
-    dataset, solution = calibration.dataset, calibration.solution
+    dataset, solution = planar.dataset, planar.solution
     joints = np.stack(ends_at_poses(solution.legs, *components(solution.T_Rb_Re)), axis=2)
     m, v = dataset.measurements, int(dataset.measurements.view[0])
     P = solution.T_camera_Rb[v].apply(joints[m.pose[0]].reshape(-1, 3))

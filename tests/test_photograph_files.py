@@ -78,10 +78,10 @@ def test_damaged_files_never_raise_and_say_little() -> None:
     block = exif(**PHONE)
     contents = [jpeg(PICTURE, 90, block), png(PICTURE, block, Title="a"), block]
     for content in contents:
-        for end in range(0, min(len(content), 900), 3):
+        for end in range(0, min(len(content), 900), 7):
             assert read_facts(content[:end]).device in ("", "Acme", "Acme One")
     chance = np.random.default_rng(3)
-    for k in range(1500):
+    for k in range(500):
         content = mutate(contents[k % 3], "jpg", chance)
         facts = read_facts(content)
         assert (facts.device + facts.lens + facts.software + "x").isprintable()

@@ -58,7 +58,7 @@ _PARTS = (("top left", "top", "top right"), ("left", "middle", "right"),
           ("bottom left", "bottom", "bottom right"))  # fmt: skip
 
 
-def comparison_table(comparison: CameraComparison) -> RenderableType:
+def comparison_table(comparison: CameraComparison) -> Report:
     """Return the difference of two cameras in the nine parts of the image."""
     px, pixels = comparison.px, comparison.pixels
     worst = int(np.argmax(px))
