@@ -61,6 +61,33 @@ SIZES: dict[str, tuple[float, float, tuple[str, ...]]] = {
     "camera": (1e-4, 3e-3, ("camera",)),  # [rad]
     PITCH: (2e-4, 4e-3, ()),
 }
+# Two witnesses of the scale, one of which is wrong, and one alone; asked for by --kinds
+OF_SCALE = {
+    "length": (3e-4, 3e-2, ("scale",)),  # a stated length, relative
+    "pitch and length": (3e-4, 1e-2, ("scale",)),  # all motors, beside a right length
+    "pitch and board": (3e-4, 1e-2, ("scale",)),  # the same beside a right board
+    "board": (3e-4, 3e-2, ("scale",)),  # squares of a board
+    "nominal length": (0.0, 0.0, ("nominal_length",)),  # stated, and not measured
+}
+KINDS = SIZES | OF_SCALE
+
+
+def stated_lengths(kind: str, size: float, truth: Machine, nominal: Machine,
+                   rng: np.random.Generator) -> list[str]:  # fmt: skip
+    """Return the length that somebody states, where a kind or a machine needs one."""
+    if not (kind in ("length", "pitch and length", "nominal length")
+            or not (nominal.readings_carry_length or "board" in kind)):  # fmt: skip
+        return []
+    (stated,) = measured_length(truth, rng)
+    name, _, value = stated.partition("=")
+    number, _, sigma = value.partition("+-")
+    if kind == "length":
+        number = f"{(1.0 + size) * float(number):.4f}"
+    if kind == "nominal length":
+        ends = [nominal.A_base[list(nominal.leg_names).index(end.partition(".")[0])]
+                for end in name.split(":")]  # fmt: skip
+        number = f"{1e3 * float(np.linalg.norm(ends[0] - ends[1])):.3f}"
+    return [f"{name}={number}+-{sigma}"]
 
 
 def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator) -> Dataset:
@@ -73,6 +100,16 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator) 
     later = time_of_row > rng.uniform(0.2, 0.8)
     moves = np.diff(m.q, axis=0, prepend=m.q[:1])
     moves[np.diff(m.view, prepend=-1) != 0] = 0.0
+    if kind == "board":
+        boards = [
+            replace(b, board=replace(b.board, side=(1.0 + size) * b.board.side,
+                                     marker=(1.0 + size) * b.board.marker))
+            for b in dataset.boards
+        ]  # fmt: skip
+        return replace(dataset, boards=tuple(boards))
+    if kind in ("length", "nominal length"):
+        return dataset
+    kind = PITCH if kind.startswith(PITCH) else kind
     if kind in ("camera", "focal length"):
         rows = np.flatnonzero(m.view == int(rng.integers(len(m.views))))
         changed = np.zeros(n, dtype=np.bool_)
@@ -101,23 +138,25 @@ def session(seed: int, name: str, kinds: list[str], scratch: Path) -> dict[str, 
     """Simulate, spoil and calibrate a session."""
     rng = np.random.default_rng(seed)
     folder, out = scratch / f"{seed}", scratch / f"{seed}-out"
-    simulate(name, folder, SimulationSettings(level=Level.OUTLINES, seed=seed))
-    truth = next((folder / "truth/models").glob("*.yaml"))
-    nominal: Machine = load_mechanism(name)
     kind, size = HEALTHY, 0.0
-    dataset = load_dataset(folder)
     if seed % 3:
         kind = kinds[int(rng.integers(len(kinds)))]
-        least, most, _ = SIZES[kind]
-        size = float(np.exp(rng.uniform(np.log(least), np.log(most))))
+        least, most, _ = KINDS[kind]
+        size = float(np.exp(rng.uniform(np.log(least), np.log(most)))) if least else 0.0
+    board = "charuco" if "board" in kind else None
+    simulate(name, folder, SimulationSettings(level=Level.OUTLINES, seed=seed, board=board))
+    truth = next((folder / "truth/models").glob("*.yaml"))
+    nominal: Machine = load_mechanism(name)
+    dataset = load_dataset(folder)
+    if kind != HEALTHY:
         dataset = spoiled(dataset, kind, size, rng)
-    priors = [] if nominal.readings_carry_length else measured_length(load_mechanism(truth), rng)
+    priors = stated_lengths(kind, size, load_mechanism(truth), nominal, rng)
     line: dict[str, object] = {"seed": seed, "machine": name, "kind": kind, "size": size}
     begin = time.perf_counter()
     try:
         calibration = calibrate(dataset, output=out, use_cache=False, priors=priors)
     except LegcalError as error:
-        return line | {"refused": type(error).__name__}
+        return line | {"refused": type(error).__name__, "why": str(error)[:200]}
     after = evaluate(out / "calibrated.yaml", truth, dataset=folder)
     assert calibration.platform is not None
     return line | {
@@ -135,13 +174,13 @@ def report(lines: list[dict[str, object]]) -> None:
         f"{'kind':14}{'sessions':>9}{'refused':>9}{'harmful':>9}{'trusted':>9}{'wrongly':>9}"
         f"{'named first':>13}"
     )
-    for kind in (HEALTHY, *SIZES):
+    for kind in (HEALTHY, *KINDS):
         of_kind = [line for line in lines if line["kind"] == kind]
         judged = [line for line in of_kind if "refused" not in line]
         harmful = [x for x in judged if x["off_mm"] > N_SIGMAS * x["stated_mm"]]  # type: ignore[operator]
         named = 0
         for x in judged:
-            codes = SIZES[kind][2] if kind in SIZES else ()
+            codes = KINDS[kind][2] if kind in KINDS else ()
             doubts = list(x["doubts"])  # type: ignore[call-overload]
             named += bool(doubts) and doubts[0] in codes
         trusted = sum(bool(line["trusted"]) for line in judged)

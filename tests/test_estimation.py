@@ -17,7 +17,7 @@ from legcal.estimation.problem import (
     linearize,
 )
 from legcal.estimation.solver import information, minimise, normal_equations, robust_cost
-from legcal.estimation.uncertainty import named_covariance, squares_of_left_out
+from legcal.estimation.uncertainty import left_out_blocks, named_covariance
 from legcal.estimation.variances import Effects, estimate_variances, expected_variances
 from legcal.geometry.types import Array, IntArray
 
@@ -107,7 +107,7 @@ def test_blocks_that_are_left_out_are_predicted_as_by_the_rest_alone(n_open: int
     problem = waves(np.random.default_rng(4), all_free(N_SHARED, 1), 0.1, n_open)
     state = minimise(problem, AWAY).state
     linear, block = linearize(problem, state), np.array([0, 1, 0, 2, 1])
-    squares, dof = squares_of_left_out(problem, state, linear, block)
+    left_out = left_out_blocks(problem, state, linear, block)
     rows, element = linear["values"], np.repeat(np.arange(N_ELEMENTS), N_EACH)
     J = np.zeros((len(element) + 1, problem.size))
     J[:-1, :N_SHARED] = rows.J[:, 0]
@@ -126,8 +126,12 @@ def test_blocks_that_are_left_out_are_predicted_as_by_the_rest_alone(n_open: int
         weight = np.linalg.inv(covariance)
         cross = by_own.T @ weight
         weight -= cross.T @ np.linalg.pinv(cross @ by_own, hermitian=True) @ cross
-        assert squares[b] == pytest.approx(innovation @ weight @ innovation, rel=1e-6)
-        assert dof[b] == np.linalg.matrix_rank(weight, tol=1e-9)
+        assert left_out[b].squares == pytest.approx(innovation @ weight @ innovation, rel=1e-6)
+        assert left_out[b].dof == np.linalg.matrix_rank(weight, tol=1e-9)
+        H = rest.T @ rest
+        shared, others = H[:N_SHARED, :N_SHARED], H[N_SHARED:, :N_SHARED]
+        by_rest = shared - others.T @ np.linalg.pinv(H[N_SHARED:, N_SHARED:]) @ others
+        np.testing.assert_allclose(left_out[b].information, by_rest, rtol=1e-6, atol=1e-6)
 
 
 def _with_prior(

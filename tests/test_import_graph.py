@@ -139,6 +139,7 @@ PUBLIC: dict[str, set[str]] = {
     "calibration": {
         "camera_calibration.calibration",
         "camera_calibration.document",
+        "camera_calibration.projection",
         "change_detection",
         "closeness",
         "detection",

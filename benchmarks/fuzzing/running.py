@@ -216,8 +216,8 @@ def _share_what_is_whole() -> None:
     load = loader._load
     parse: Callable[..., object] = cache(yaml.load)
 
-    def read(model: str | Path) -> Source:
-        return shipped[Path(model)][0] if Path(model) in shipped else read_source(model)
+    def read(model: str | Path, *stated: str | None) -> Source:
+        return shipped[Path(model)][0] if Path(model) in shipped else read_source(model, *stated)
 
     def loaded(source: Source) -> Machine:
         known = [machine for whole, machine in shipped.values() if whole is source]

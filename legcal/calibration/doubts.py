@@ -16,7 +16,7 @@ from scipy.special import ndtr, stdtrit
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import DoubtBlock
-from legcal.calibration.joint_fit.cross_validation import cross_validate
+from legcal.calibration.joint_fit.cross_validation import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
@@ -57,9 +57,7 @@ MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
 MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sigmas
 _SURE = 5.0  # standard deviations of these squares
-# Of what a change claims to predict better: claims are linear, and cameras absorb so much of a
-# change that a right one may gain a third of its claim only
-MIN_GAIN = 0.1
+MIN_GAIN = 0.5  # of what a change claims to predict better, by its information on left-out images
 _LAST_DIGIT = 0.5e-6  # [m] half of the last digit of printed lengths
 _STUDENT_AT = 3.5  # standard deviations at which Student's distribution is compared
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
@@ -144,13 +142,18 @@ def doubts_of(
     is_of_scale = any(one.kind == "pitch" for one in session.findings)
     scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
     causes = scale or course
+    predicted = cross_validate(solution.posterior.problem, solution.posterior.state)
     motors = {one.subject for one in session.findings} if course else set[str]()
     is_of_motors = any(one.kind in OF_MOTORS for one in session.findings) and bool(course)
     legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
-    symptoms = [] if causes else _symptoms(dataset, solution, platform, changes, held_out, session)
+    symptoms = (
+        []
+        if causes
+        else _symptoms(dataset, solution, platform, changes, held_out, session, predicted)
+    )
     if {one.code for one in causes} == {READING_NOISE}:
         # A model that was led away scatters readings as well
-        symptoms = _left_out(solution, platform)
+        symptoms = _left_out(predicted, platform)
     return (
         *([] if is_of_motors else _readings(solution)),
         *_legs_left_out(solution, legs),
@@ -159,6 +162,7 @@ def doubts_of(
         *_views(dataset, solution, corners),
         *_few_outlines(solution.outlines),
         *_nominal_lengths(dataset, solution, platform, changes),
+        *_no_better(predicted, platform),
         *causes,
         *symptoms,
     )
@@ -171,14 +175,15 @@ def _symptoms(
     changes: _Changes,
     held_out: HeldOut | None,
     session: SessionTests,
+    predicted: CrossValidation | None,
 ) -> list[Doubt]:
     """Return the doubts that a change in the course of a session, or two scales, cause as well."""
     return [
         *_moved_parameters(dataset, solution, platform, changes),
         *_held_out(held_out),
         *_cameras(solution, platform),
-        *_left_out(solution, platform),
-        *_noise(solution, session),
+        *_left_out(predicted, platform),
+        *_noise(solution, session, platform),
     ]
 
 
@@ -220,19 +225,25 @@ def _legs_left_out(solution: Solution, explained: Collection[str]) -> list[Doubt
 
 def _clicks(dataset: Dataset, solution: Solution) -> list[Doubt]:
     """Return views whose clicks the fit contradicts."""
-    contradicted = [
-        f"{name} ({px:.0f} px)"
-        for name, (px, most) in click_distances(dataset, solution).items()
-        if px > most
-    ]
-    if not contradicted:
+    distances = {
+        name: px for name, (px, most) in click_distances(dataset, solution).items() if px > most
+    }
+    if not distances:
         return []
+    contradicted = [f"{name} ({px:.0f} px)" for name, px in distances.items()]
+    views = zip(dataset.measurements.views, solution.T_camera_Rb, solution.cameras, strict=True)
+    seen = [
+        distances[view.name] * float(np.linalg.norm(T.translation)) / camera.K[0, 0]
+        for view, T, camera in views
+        if view.name in distances
+    ]
+    off = float(max(seen))  # [m] in that view
     what = (
         f"most clicks on joints in {few_views(contradicted)} are that far from where the fit has "
         "these joints, so that it is wrong or they are"
     )
     remedy = "look at the outlines in these images, and at the clicks (legcal detect --edit)"
-    return [Doubt("clicks", what, remedy, is_grave=True)]
+    return [Doubt("clicks", what, remedy, off, off / dataset.machine.size, is_grave=True)]
 
 
 def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
@@ -349,35 +360,40 @@ def _few_outlines(outlines: Outlines) -> list[Doubt]:
     return [Doubt("few_outlines", what, remedy)]
 
 
-def _left_out(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
+def _left_out(found: CrossValidation | None, platform: PlatformAccuracy | None) -> list[Doubt]:
     """Return whether images without a part in the fit are predicted as well as it claims."""
-    found = cross_validate(solution.posterior.problem, solution.posterior.state)
     if found is None:
         return []
-    doubts = list[Doubt]()
     most = np.maximum(MOST_SQUARES, 1.0 + _SURE * np.sqrt(2.0 / np.maximum(found.dof, 1)))
     of_blocks = found.squares / np.maximum(found.dof, 1)
     ratio = max(found.ratio, float(of_blocks.max()) if np.any(of_blocks > most) else 0.0)
-    if ratio > MOST_SQUARES:
-        what = (
-            f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
-            "by the others as is stated"
-        )
-        remedy = (
-            "the session does not agree with itself: look for what changed or moved between "
-            "images, for play and bending, and at the worst outlines"
-        )
-        error = _mean(None if platform is None else platform.sigma, float(np.sqrt(ratio - 1.0)))
-        doubts.append(Doubt("left_out", what, remedy, *error))
-    if found.gain is not None and found.gain < MIN_GAIN:
-        what = (
-            "images that are left out are predicted better than by the nominal model by "
-            f"{100.0 * max(found.gain, 0.0):.0f} % of what the change of the model claims"
-        )
-        remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
-        error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
-        doubts.append(Doubt("no_better", what, remedy, *error))
-    return doubts
+    if ratio <= MOST_SQUARES:
+        return []
+    what = (
+        f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
+        "by the others as is stated"
+    )
+    remedy = (
+        "the session does not agree with itself: look for what changed or moved between "
+        "images, for play and bending, and at the worst outlines"
+    )
+    error = _mean(None if platform is None else platform.sigma, float(np.sqrt(ratio - 1.0)))
+    return [Doubt("left_out", what, remedy, *error)]
+
+
+def _no_better(found: CrossValidation | None, platform: PlatformAccuracy | None) -> list[Doubt]:
+    """Return whether left-out images are predicted as much better as the change claims."""
+    if found is None or found.gain is None:
+        return []
+    if found.gain >= min(MIN_GAIN, 1.0 - _SURE * found.gain_sigma):
+        return []
+    what = (
+        "images that are left out are predicted better than by the nominal model by "
+        f"{100.0 * max(found.gain, 0.0):.0f} % of what the change of the model claims"
+    )
+    remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
+    error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
+    return [Doubt("no_better", what, remedy, *error)]
 
 
 def _changes(
@@ -392,7 +408,7 @@ def _changes(
     also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
     """
     doubts = []
-    scatters = READING_NOISE if _noise(solution, session) else ""
+    scatters = READING_NOISE if _noise(solution, session, platform) else ""
     for finding in session.findings:
         effect = None if platform is None else _effect_of(finding, dataset, solution)
         if platform is None or effect is None:
@@ -516,8 +532,13 @@ def _moved_parameters(
     return [Doubt("tolerance", what, remedy, *_mean(error))]
 
 
-def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or of a view, leg or period."""
+def _noise(
+    solution: Solution, session: SessionTests, platform: PlatformAccuracy | None
+) -> list[Doubt]:
+    """Return whether outlines scatter more than they claim: all, or of a view, leg or period.
+
+    What is beyond the claim may be no noise, and move the platform as much as that.
+    """
     problem = solution.posterior.problem
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
@@ -536,7 +557,9 @@ def _noise(solution: Solution, session: SessionTests) -> list[Doubt]:
         "something moves that should not, or edges are not those of the legs: look at the worst "
         "outlines, for play, bending, a camera or board that moved, and readings of another moment"
     )
-    return [Doubt("noise", what, remedy)]
+    part = float(np.sqrt(times[worst] ** 2 - 1.0))
+    sigma = None if platform is None else platform.sigma
+    return [Doubt("noise", what, remedy, *_mean(sigma, part))]
 
 
 def _scale(

@@ -140,7 +140,7 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "before that (--split {subject}@{images})",
     ),
     "drift": (
-        "the zero of the encoder of {subject} drifts by {size} from the first image to the last",
+        "the zero of the encoder of {subject} drifts by {size}",
         "look for a loose coupling or warming up there, and take the images again",
     ),
     "camera": (
@@ -251,12 +251,10 @@ def session_tests(
     hypotheses = [*_of_motors(problem, course), *_of_views(problem, state, linear, course)]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
     tests = [
-        _Test(i, holds, between, hypothesis.kind == "drift")
+        test
         for i, hypothesis in enumerate(hypotheses)
         if has_order or hypothesis.kind in _WITHOUT_ORDER
-        for holds, between in (
-            course.changes(_blocks_of(hypothesis)) if hypothesis.changes else course.always
-        )
+        for test in course.tests(i, hypothesis)
     ]
     if not hypotheses:
         return SessionTests()
@@ -342,7 +340,7 @@ def _forward_selection(
 
 def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
     """Return the images before a change of an encoder; beside that of a camera, the fewer ones."""
-    if test.between is None:
+    if not hypothesis.changes:
         return ""
     names = [view.name for view in measurements.views]
     is_of_camera = hypothesis.kind != "encoder"
@@ -458,10 +456,19 @@ class _Course:
         """Number of blocks."""
         return len(self.size)
 
-    @property
-    def always(self) -> list[tuple[BoolArray, None]]:
-        """The blocks of something that holds in all images."""
-        return [(np.ones(self.n_blocks, dtype=np.bool_), None)]
+    def tests(self, number: int, hypothesis: _Hypothesis) -> Iterator[_Test]:
+        """Yield the tests of a hypothesis, by its number."""
+        if hypothesis.changes:
+            for holds, between in self.changes(np.asarray(_blocks_of(hypothesis).any(axis=0))):
+                yield _Test(number, holds, between, has_levels=False)
+            return
+        drifts, whole = hypothesis.kind == "drift", len(self.sequences) == 1
+        span = (
+            ("the first image", "the last") if whole else ("the first image of a view", "its last")
+        )
+        yield _Test(
+            number, np.ones(self.n_blocks, dtype=np.bool_), span if drifts else None, drifts
+        )
 
     def changes(self, among: BoolArray) -> Iterator[tuple[BoolArray, tuple[str, str]]]:
         """Yield the blocks after each possible change, among some blocks, and what is beside it.
@@ -538,9 +545,9 @@ class _Course:
 
 
 def _blocks_of(hypothesis: _Hypothesis) -> BoolArray:
-    """Return the blocks in which a hypothesis can be told from others, (n_blocks,)."""
+    """Return the blocks in which each number of a hypothesis has an effect, (d, n_blocks)."""
     seen = [
-        np.any(share[np.any(hypothesis.columns[name] != 0.0, axis=(1, 2))] > 0.0, axis=0)
+        np.any(hypothesis.columns[name] != 0.0, axis=1).T @ (share > 0.0)
         for name, share in hypothesis.share.items()
     ]
     return np.asarray(np.any(seen, axis=0))
@@ -685,11 +692,9 @@ class _Scores:
         """Compute the scores."""
         columns, c = list[IntArray](), 0
         for hypothesis in hypotheses:
-            d = next(iter(hypothesis.columns.values())).shape[-1]
             seen = _blocks_of(hypothesis)
-            column = np.full((d, len(seen)), -1, dtype=np.intp)
-            column[:, seen] = c + np.arange(d * int(seen.sum())).reshape(d, -1)
-            c += d * int(seen.sum())
+            column = np.where(seen, c + np.cumsum(seen).reshape(seen.shape) - 1, -1)
+            c += int(seen.sum())
             columns.append(column)
         stacked = dict[str, Array]()
         for hypothesis, column in zip(hypotheses, columns, strict=True):

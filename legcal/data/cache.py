@@ -130,6 +130,7 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
             [view.camera.gamma, view.camera.gamma_is_given],
             [view.camera.K.tolist(), view.camera.distortion.tolist()],
             None if view.camera.covariance is None else view.camera.covariance.tolist(),
+            *(["placed"] if view.is_placed else []),
         ]
         for view in measurements.views
     ]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space
@@ -245,11 +246,17 @@ def score_test(
         np.zeros((c, c)),
     )
     element_products = np.zeros((problem.n_elements, problem.d_element, c))
-    for name, v in columns.items():
-        _add_products(problem.sparsity[name], linear[name], v, kept_products, element_products)
-        flat = v.reshape(-1, c)
-        score += flat.T @ linear[name].r.ravel()
-        projected += flat.T @ flat
+    for name, of_factor in columns.items():
+        acting = np.flatnonzero(of_factor.any(axis=(0, 1)))
+        if not len(acting):
+            continue
+        v = of_factor[..., acting]
+        kept, elements = kept_products[:, acting], element_products[..., acting]
+        _add_products(problem.sparsity[name], linear[name], v, kept, elements)
+        kept_products[:, acting], element_products[..., acting] = kept, elements
+        flat = v.reshape(-1, len(acting))
+        score[acting] += flat.T @ linear[name].r.ravel()
+        projected[np.ix_(acting, acting)] += flat.T @ flat
     following = _element_derivatives(normal).reshape(-1, problem.n_kept)
     kept = kept_products[:-1] + following.T @ element_products.reshape(-1, c)
     by_element = element_products
@@ -271,31 +278,30 @@ def score_test(
     return score, projected
 
 
-def squares_of_left_out(
+class LeftOut(NamedTuple):
+    """How well a block of eliminated elements is predicted by all else."""
+
+    squares: float  # squared Mahalanobis distance of its measurements from their prediction
+    dof: int  # independent innovations, without what only the block determines
+    information: Array  # (n_kept, n_kept) of all else
+
+
+def left_out_blocks(
     problem: EstimationProblem[S], state: S, linear: Linearization, block: IntArray
-) -> tuple[Array, IntArray]:
+) -> list[LeftOut]:
     """Return how well blocks of eliminated elements are predicted by all else.
 
     The block of each element is given, (n_elements,) from 0. The measurements of a block are
     compared with the fit without them, one Gauss-Newton step from here: the squares are those of
     their innovations, whitened by the covariance of these. For right models they are as large as
     their number.
-
-    Returns
-    -------
-    squares : (n_blocks,) array
-        Squared Mahalanobis distance of the measurements of each block.
-    dof : (n_blocks,) array
-        Number of independent innovations; the elements' unknowns and directions that only a block
-        determines are subtracted.
     """
-    n_blocks = int(block.max(initial=-1)) + 1
-    squares, dof = np.zeros(n_blocks), np.zeros(n_blocks, dtype=np.intp)
+    blocks = list[LeftOut]()
     everything = normal_equations(problem, state, linear)
     gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
     rank_of_elements = _ranks(everything.V)
-    for b in range(n_blocks):
-        rows = dict(linear.rows)
+    for b in range(int(block.max(initial=-1)) + 1):
+        rows, squares, dof = dict(linear.rows), 0.0, 0
         for factor in problem.factors:
             if factor.element is None:
                 continue
@@ -307,13 +313,14 @@ def squares_of_left_out(
                 kept[..., None] * of_factor.J_element,
             )
             inside = of_factor.squared_norms[is_inside]
-            squares[b] += inside.sum()
-            dof[b] += factor.n_rows * int(np.sum(inside > 0.0))
+            squares += float(inside.sum())
+            dof += factor.n_rows * int(np.sum(inside > 0.0))
         rest = normal_equations(problem, state, replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
-        squares[b] += pull @ rest.moved_by(pull[:, None])[:, 0]
-        dof[b] -= rank - int(_ranks(rest.reduced())) + rank_of_elements[block == b].sum()
-    return squares, dof
+        squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
+        dof -= rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
+        blocks.append(LeftOut(squares, dof, rest.reduced()))
+    return blocks
 
 
 def _reduced_gradient(normal: NormalEquations) -> Array:

@@ -97,7 +97,6 @@ class Drawing:
     kind: ClassVar = "drawing"
     svg: Markup
     caption: str = ""
-    wide: bool = True
     title: str = ""
 
 

@@ -16,7 +16,7 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import minimise, normal_equations
-from legcal.estimation.uncertainty import marginal, squares_of_left_out
+from legcal.estimation.uncertainty import left_out_blocks, marginal
 from legcal.geometry.types import Array, IntArray
 
 _N_BLOCKS = 5
@@ -37,11 +37,14 @@ class CrossValidation:
     gain : float or None
         By how much the squares of the nominal model are larger, cameras and poses fitted again,
         over what the change of the model claims; None where that could not be fitted.
+    gain_sigma : float
+        Its standard deviation about one, if the claim is right.
     """
 
     squares: Array
     dof: IntArray
     gain: float | None
+    gain_sigma: float = 0.0
 
     @property
     def ratio(self) -> float:
@@ -58,25 +61,32 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
         return None
     problem = with_weights(problem, state)
     linear, block = linearize(problem, state), _blocks(state)
-    squares, dof = squares_of_left_out(problem, state, linear, block)
+    left_out = left_out_blocks(problem, state, linear, block)
+    squares = np.array([one.squares for one in left_out])
+    dof = np.array([one.dof for one in left_out], dtype=np.intp)
     n = problem.n_kinematic
     nominal = problem.legs.vector(problem.legs.nominal)[problem.free]
     change = problem.coordinates(state)[:n] - nominal
-    information = marginal(normal_equations(problem, state, linear).reduced(), np.arange(n))
-    claimed = float(change @ information @ change)
+    everything = normal_equations(problem, state, linear).reduced()
+    # What blocks add to the information of all else, cameras unknown.
+    of_all, *of_rest = (
+        float(change @ marginal(information, np.arange(n)) @ change)
+        for information in (everything, *(one.information for one in left_out))
+    )
+    claimed = len(of_rest) * of_all - sum(of_rest)
     held = problem.changed(held_directions=np.eye(n))
     begin = replace(state, legs=problem.parameters.at_fixed(problem.legs.nominal))
-    gain = None
+    gain, gain_sigma = None, 2.0 / float(np.sqrt(claimed)) if claimed > 0.0 else 0.0
     try:
         minimum = minimise(
             held, begin, max_iterations=_MAX_STEPS, tolerance=_NEARLY, must_converge=False
         )
-        by_nominal, _ = squares_of_left_out(held, minimum.state, minimum.linear, block)
+        by_nominal = left_out_blocks(held, minimum.state, minimum.linear, block)
         if claimed > 0.0:
-            gain = float(by_nominal.sum() - squares.sum()) / claimed
+            gain = float(sum(one.squares for one in by_nominal) - squares.sum()) / claimed
     except DidNotConverge:  # the nominal model does not close at these readings
         pass
-    return CrossValidation(squares, dof, gain)
+    return CrossValidation(squares, dof, gain, gain_sigma)
 
 
 def with_weights(problem: FitProblem, state: State) -> FitProblem:

@@ -123,7 +123,8 @@ def _refuse_other_size(
             f"The dimensions of the calibration board{board} contradict the readings and the legs: "
             f"the board is {size} stated in the dataset ({estimate.apart:.0f} standard deviations; "
             f"assumed accuracy {1e2 * sigma:.2g} %); measure the board and correct its dimensions "
-            f"in dataset.yaml, or estimate them (--set {name}=free)."
+            "in dataset.yaml, or the scale of the readings if the board is right, or estimate the "
+            f"size of the board (--set {name}=free)."
         )
 
 

@@ -61,7 +61,8 @@
     const paper = canvas.getContext("2d");
     const solid = content.marks ?? content.modes[0].models.flatMap((m) => [...m.A.flat(), ...m.B.flat(), ...m.standing.flat()]);
     const [[x0, x1], [y0, y1], [z0, z1]] = [0, 1, 2].map((k) => span(solid, k)), reach = 0.3 * Math.max(x1 - x0, y1 - y0);
-    const corners = [x0 - reach, x1 + reach].flatMap((x) => [y0 - reach, y1 + reach].map((y) => [x, y]));
+    const xs = ticks(x0 - reach, x1 + reach), ys = ticks(y0 - reach, y1 + reach); // of the floor
+    const corners = [xs[0], xs.at(-1)].flatMap((x) => [ys[0], ys.at(-1)].map((y) => [x, y]));
     const room = [...solid, ...corners.map(([x, y]) => [x, y, z0])];
     const all = [...room, ...(content.cameras ?? []).flatMap(({ points }) => points)];
     const view = { azimuth: content.flat ? -Math.PI / 2 : -0.857, elevation: content.flat ? Math.PI / 2 : 0.38,
@@ -78,7 +79,7 @@
     const away = (points, width, height, focal) => {
       const { right, up, back } = axes();
       return Math.max(...points.map(relative).map((d) => dot(d, back)
-        + 2.2 * focal * Math.max(Math.abs(dot(d, right)) / width, Math.abs(dot(d, up)) / height)));
+        + 2.2 * focal * Math.max(Math.abs(dot(d, right)) / (width - 50), Math.abs(dot(d, up)) / height)));
     };
     const draw = () => {
       const width = canvas.clientWidth, height = canvas.clientHeight, dpr = window.devicePixelRatio || 1;
@@ -108,7 +109,6 @@
       paper.lineCap = "round";
 
       // A floor with the coordinates, and the height at the left.
-      const xs = ticks(x0 - reach, x1 + reach), ys = ticks(y0 - reach, y1 + reach);
       const floor = (x, y) => place([x, y, z0]);
       const grid = (from, across, point) => {
         for (const f of from) for (let k = 1; k < across.length; k++) {
@@ -138,9 +138,12 @@
         const end = zs.at(-1)[1];
         if (visible(zs[0][1]) && visible(end)) {
           stroke(zs[0][1], end, RULE, 1);
-          write(`z [${content.unit}]`, end[0] - 6, end[1] - 8, DIM, "right");
+          const [aside, align] = end[0] < 60 ? [6, "left"] : [-6, "right"];
+          write(`z [${content.unit}]`, end[0] + aside, end[1] - 8, DIM, align);
           let last = zs[0][1][1];
-          for (const [z, p] of zs.slice(1)) if (last - p[1] > 13) { write(String(z), p[0] - 6, p[1] + 4, DIM, "right"); last = p[1]; }
+          for (const [z, p] of zs.slice(1)) {
+            if (last - p[1] > 13) { write(String(z), p[0] + aside, p[1] + 4, DIM, align); last = p[1]; }
+          }
         }
       }
 
@@ -166,11 +169,10 @@
         write(name, 42, 18 + 18 * k, INK, "left", 12);
       });
       if (drawn.scale) {
-        const { low, high, unit, shade } = drawn.scale, [x, top, size] = [width - 64, 30, 0.4 * height];
-        for (let k = 0; k < size; k++) { paper.fillStyle = shade(1 - k / size); paper.fillRect(x, top + k, 12, 1.5); }
-        write(unit, x, top - 10, INK, "left");
-        [low, (low + high) / 2, high].forEach((v, k) =>
-          write(Number(v.toPrecision(3)), x + 17, top + size - k * size / 2 + 4, DIM, "left"));
+        const { low, high, unit, shade } = drawn.scale, size = 140, x = width - size - 40;
+        for (let k = 0; k < size; k++) { paper.fillStyle = shade(k / size); paper.fillRect(x + k, 6, 1.5, 12); }
+        write(unit, x + size + 8, 16, INK, "left");
+        [low, (low + high) / 2, high].forEach((v, k) => write(Number(v.toPrecision(3)), x + k * size / 2, 31, DIM));
       }
     };
 

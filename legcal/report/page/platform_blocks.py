@@ -42,11 +42,12 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
         "same readings; errors of the readings themselves are not in sigma."
     )
     histograms = [
-        Drawing(histogram(1e3 * change.displacement, "before: displacement [mm] (number of poses)"),
-                wide=False),
-        Drawing(histogram(1e3 * sigma.displacement, "after: 1 sigma [mm] (number of poses)"),
-                wide=False),
-    ]  # fmt: skip
+        Drawing(histogram(1e3 * displacement, f"{name} [mm] (number of poses)"))
+        for name, displacement in (
+            ("before: displacement", change.displacement),
+            ("after: 1 sigma", sigma.displacement),
+        )
+    ]
     blocks: list[Any] = [Table(columns, rows, note=note), Row(histograms)]
     if workspace is not None:
         blocks += _maps(workspace)
@@ -80,8 +81,7 @@ def _maps(workspace: PlatformMap) -> list[Any]:
                         f"{name} [mm], z = {1e3 * z:z.0f} mm",
                         float(values.max()),
                         digits,
-                    ),
-                    wide=False,
+                    )
                 )
                 for z, level in zip(workspace.z.tolist(), workspace.index, strict=True)
             ]
