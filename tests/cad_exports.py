@@ -30,7 +30,10 @@ def rod() -> trimesh.Trimesh:
     eyes = [trimesh.creation.box(extents=(0.014, 0.006, 0.016)) for _ in range(2)]
     eyes[1].apply_translation([0.0, 0.0, LENGTH])
     whole = trimesh.util.concatenate([shaft, *eyes])
-    return whole.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    assert isinstance(whole, trimesh.Trimesh)
+    turn = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    whole.apply_transform(turn)  # z to x
+    return whole
 
 
 def horns() -> list[tuple[RigidTransform, np.ndarray, np.ndarray]]:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,7 +137,7 @@ def numbers_in(text: str) -> list[float]:
     """Return the numbers of a Delta, in the order of its fields."""
     ideal = read_delta(Path("text"), text)
     fields = (ideal.radius, ideal.angle, ideal.rod, ideal.arm, ideal.height, ideal.stop)
-    return np.concatenate(fields).tolist()
+    return [float(number) for number in np.concatenate(fields)]
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
@@ -186,7 +187,8 @@ def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
     tops = np.array([actuator.travel[1] for actuator in machine.actuators])
     if name == "linuxcnc-arms":  # counts downwards
         q, tops = -q, -np.array([actuator.travel[0] for actuator in machine.actuators])
-    angles, radius, rods, *others = (DOCUMENTED | ARMS)[name]
+    numbers_of_all: dict[str, Any] = DOCUMENTED | ARMS
+    angles, radius, rods, *others = numbers_of_all[name]
     towers = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.radians(angles)]
     for i, (out, rod) in enumerate(zip(towers, rods, strict=True)):
         if name in DOCUMENTED:
@@ -198,7 +200,8 @@ def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
         arm, height, stop = (numbers[i] for numbers in others)
 
         def elbow(angle: float, out: Array = out, arm: float = arm, z: float = height) -> Array:
-            return (radius + arm * np.cos(angle)) * out + [0, 0, z + arm * np.sin(angle)]
+            up = np.array([0.0, 0.0, z + arm * np.sin(angle)])
+            return np.asarray((radius + arm * np.cos(angle)) * out + up)
 
         assert np.linalg.norm(elbow(q[i]) - nozzle) == pytest.approx(rod, abs=1e-6)
         if name != "klipper-arms":
@@ -381,7 +384,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("text", "options", "words"), REFUSED)
 def test_a_configuration_that_cannot_be_one_is_refused_in_a_sentence(
-    text: str, options: dict[str, object], words: tuple[str, ...], tmp_path: Path
+    text: str, options: dict[str, Any], words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(LegcalError) as caught:
         machine_of(text, tmp_path, **options)
