@@ -47,19 +47,24 @@ def main(*names: str) -> None:
         f"{'dataset':16}{'outlines':>9}{'calibrate':>11}{'identify':>10}{'plan':>9}  [mm], ratios"
     )
     for folder in folders:
-        with TemporaryDirectory() as temporary:
-            output = Path(temporary) / "result"
-            calibration = legcal.calibrate(
-                folder, output=output, progress=False, use_cache=False, workers=1
-            )
-            noise = read_noise(output)
-        solution = calibration.solution
-        stated = size(calibration, solution.legs, solution.kinematic.covariance)
-        predicted = [f(calibration, noise) for f in (by_identify, by_plan)]
-        columns = "".join(f"{1e3 * x:10.4f}" for x in (stated, *predicted))
-        ratios = " ".join(f"{x / stated:5.2f}" for x in predicted)
-        n = int(solution.outlines.used.sum())
+        calibration, sizes = compared(folder)
+        columns = "".join(f"{1e3 * x:10.4f}" for x in sizes)
+        ratios = " ".join(f"{x / sizes[0]:5.2f}" for x in sizes[1:])
+        n = int(calibration.solution.outlines.used.sum())
         print(f"{folder.name:16}{n:9}{columns}  {ratios}", flush=True)
+
+
+def compared(folder: Path) -> tuple[Calibration, tuple[float, float, float]]:
+    """Calibrate a dataset; return the figures of calibrate, identify and plan too."""
+    with TemporaryDirectory() as temporary:
+        output = Path(temporary) / "result"
+        calibration = legcal.calibrate(
+            folder, output=output, progress=False, use_cache=False, workers=1
+        )
+        noise = read_noise(output)
+    solution = calibration.solution
+    stated = size(calibration, solution.legs, solution.kinematic.covariance)
+    return calibration, (stated, by_identify(calibration, noise), by_plan(calibration, noise))
 
 
 def size(calibration: Calibration, legs: Sequence[Leg], covariance: Array) -> float:

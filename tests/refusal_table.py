@@ -1231,7 +1231,7 @@ def _new() -> Iterable[Refusal]:
 
     rows: Rows = [
         ("no-unit", entry(unit=GONE), ("unit",)),
-        ("unit", entry(unit="furlong"), ("unit", "'furlong'", "mm")),
+        ("unit", entry(unit="Zoll"), ("unit", "'Zoll'", "mm")),
         ("version", entry(legcal_table=2), ("legcal_table", "2", "1")),
         ("key", entry(ofsets=380), ("ofsets", "'offsets'")),
         ("name", entry(name="a/b"), ("name", "'a/b'")),
@@ -1315,7 +1315,7 @@ def _new() -> Iterable[Refusal]:
         command = f"new --family {words} --unit mm -o {{out}}"
         yield Refusal(f"family-{name}", command, named)
     for name, words, named in (
-        ("unit", "--unit inch", ("'inch'", "mm, um")),
+        ("unit", "--unit inch", ("'inch'", "mm, um, nm, cm, m, in, ft")),
         ("no-unit", "--rod-length 400", ("--rod-length", "--unit mm")),
     ):
         yield Refusal(f"family-{name}", f"new --family delta {words} -o {{out}}", named)

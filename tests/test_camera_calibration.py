@@ -22,6 +22,7 @@ from camera_sessions import (
     together,
     wide_camera,
 )
+from command_line import run
 from thinned import thinned
 
 from legcal import calibrate_camera
@@ -256,6 +257,7 @@ def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
     plain = robust_fit(seen, WIDE_SIZE, "plumb_bob")
     assert plain is not None
     assert {17, 18} <= set(plain.left_out)
+    assert "part of the image that the others do not" in plain.left_out[18]
     chosen = chosen_lens(seen, WIDE_SIZE)
     assert chosen is not None
     assert chosen.fit.adjusted.camera.model == model
@@ -286,13 +288,14 @@ def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     model: DistortionModel,
 ) -> None:
     fit = fitted(seen_corners(CAMERAS[model], 12, 3), model)
-    camera, rng = fit.adjusted.camera, np.random.default_rng(0)
+    camera = replace(fit.adjusted.camera, covariance=fit.covariance)
     values, names = intrinsic_values(camera), intrinsic_names(camera)
+    rng = np.random.default_rng(0)
     off = []
     for drawn in rng.multivariate_normal(values, fit.covariance, 200):
         other = with_intrinsics(camera, dict(zip(names, drawn.tolist(), strict=True)))
         comparison = compare_cameras(camera, other)
-        assert comparison.sigma_px is None
+        assert comparison.sigma_px is not None
         off.append(comparison.off_px)
     spread = np.einsum("dni,dnj->nij", off, off) / len(off)
     sigma = projection_sigma(camera, fit.covariance)
@@ -300,7 +303,8 @@ def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     assert 0.8 < ratio.min() < ratio.max() < 1.25
     # A shift of the principal point is a turn, but for distortion and perspective.
     shifted_camera = with_intrinsics(camera, {"cx": values[2] + 1.0})
-    turned = compare_cameras(camera, shifted_camera)
+    turned = compare_cameras(camera, replace(shifted_camera, covariance=None))
+    assert turned.sigma_px is None
     assert turned.turn == pytest.approx(1.0 / values[0], rel=0.3)
     assert turned.px.max() < 1.0
     with pytest.raises(UsageError, match="one size"):
@@ -421,6 +425,32 @@ def test_the_file_is_a_camera_info_with_the_whole_covariance(
     assert names == [f"b{k:02d}.png" for k in range(N_IMAGES)]
     sigma = document["legcal_camera"]["sigma"]
     np.testing.assert_allclose([sigma[n] for n in found.names], found.sigma, rtol=1e-5)
+
+
+@pytest.mark.usefixtures("found")
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        ("{}/camera.yaml {}/camera.yaml --compare --json", 0, '"largest_px": '),
+        ("{}/camera.yaml {}/camera.yaml --compare", 0, "bottom right"),
+        ("{}/camera.yaml --compare", 2, "needed legcal camera A B --compare"),
+        ("{}/camera.yaml --to opencv -o {}/opencv.yml", 0, ""),
+        ("{}/camera.yaml --to opencv", 2, "found no --output"),
+        ("{}/camera.yaml {}/camera.yaml --to opencv -o {}/c.yml", 2, "a single camera file"),
+        ("{}/b00.png -o {}/c.yml", 2, "found no --board"),
+    ],
+)
+def test_camera_files_are_compared_and_converted_by_the_command(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    code: int,
+    said: str,
+) -> None:
+    assert run(monkeypatch, "camera", *arguments.replace("{}", str(folder)).split()) == code
+    printed = capsys.readouterr()
+    assert said in " ".join((printed.out + printed.err).split())
 
 
 def _block(**changes: Any) -> dict[str, Any]:

@@ -479,6 +479,7 @@ def test_formats_that_a_class_does_not_have_are_refused_with_those_it_has(tmp_pa
         ("hexapod-rod", "linuxcnc"): "leg6",
         ("hexapod", "correction"): "needed a result",
         ("hexaglide", "linuxcnc"): r"'rail1' moves joints at A, .*\(genhexkins\), or a Delta",
+        ("3-prs", "reprapfirmware"): "found 3 rods on them, needed a Delta",
         ("delta", "marlin"): "motors that turn, needed a Delta with three linear motors",
         ("hexaglide", "klipper"): "6 motors that carry rods and 6 freedoms, needed a Delta",
         ("delta", "flypt"): r"'arm1' moves joints at A, .*\(LinearHexapod\); this machine",

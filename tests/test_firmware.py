@@ -371,6 +371,7 @@ REFUSED = [
     (INI.replace("inch", "cubits") + pins(), {}, ("LINEAR_UNITS = cubits",)),
     (INI.replace("inch", "mm") + pins() + "\n" + joints(380.0, (400.0, 700.0)), {},
      ("limits of 400 to 700", "one unit")),
+    (LINUXCNC.partition("[JOINT_1]")[0], {}, ("no HOME_OFFSET in [JOINT_1]", "home switch")),
     (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
     (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),
     (FLYPT.replace("<NUDMiddle>860", "<NUDMiddle>33"), {}, ("Middle 33", "all in mm")),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from layouts import Layout, write_machine
 from machines import MACHINES, with_round_arms
 from thinned import thinned
+from uncertainty import compared
 
 import legcal
 from legcal.calibration.identify.intrinsics import expected_intrinsics
@@ -157,3 +158,10 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
         lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
     )
     assert len(planned_session(machine, [range(6)], 60).t) == 60
+
+
+@pytest.mark.parametrize("name", ["planar", "revolute"])
+def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
+    """At the same poses, cameras and used outlines, with the noise of the result."""
+    _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)
+    np.testing.assert_allclose(predicted, stated, rtol=0.02)

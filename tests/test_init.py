@@ -210,6 +210,18 @@ def test_tables_are_read_as_spreadsheets_write_them(
     assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
 
 
+@pytest.mark.parametrize("above", ["# by hand\n\n# 21 C, again\n", "My hexapod,,,,,\n,,,,,\n"])
+def test_a_title_and_a_row_of_units_are_no_readings(
+    above: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table(own_folder(tmp_path, FLAT), names=[f"L{j}" for j in range(1, 7)], factor=1e3)
+    path = tmp_path / "own.csv"
+    headings, *rows = path.read_text().splitlines()
+    path.write_text(above + "\n".join([headings, ",".join(["(um)"] * 6), *rows]))
+    assert init(monkeypatch, tmp_path) == 0
+    assert [k for *_, k in pairs(tmp_path)] == [0, 1, 2]
+
+
 @pytest.mark.parametrize(
     ("names", "factor", "add", "words"),
     [

@@ -8,15 +8,22 @@ dataset knows the centre and the us for one degree.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import GetJsonSchemaHandler, StringConstraints, TypeAdapter, model_validator
+from pydantic import (
+    BeforeValidator,
+    GetJsonSchemaHandler,
+    TypeAdapter,
+    WithJsonSchema,
+    model_validator,
+)
 
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import BadValue, DatasetError, UsageError
 from legcal.files.quantity import ANGLE, COUNTS, LENGTH, SHOWN_IN, split_quantity, unit_size
 from legcal.files.schema import FileSchema, Number, closest, describe
 from legcal.geometry.types import Array
@@ -27,10 +34,22 @@ PULSES = "us"
 SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
-ReadingUnitName = (
-    Literal["m", "cm", "mm", "um", "in", "ft", "rad", "mrad", "deg", "rev", "us"]
-    | Annotated[str, StringConstraints(pattern=f"^{COUNTS}$")]
-)
+READING_UNITS = (*LENGTH, *ANGLE, PULSES)
+
+
+def _unit_name(name: object) -> object:
+    if name not in READING_UNITS and not (isinstance(name, str) and re.fullmatch(COUNTS, name)):
+        units = ", ".join(READING_UNITS)
+        needed = f"one of {units}, or counts with their scale (80 counts/mm)"
+        raise BadValue(describe(name), needed, "correct it")
+    return name
+
+
+ReadingUnitName = Annotated[
+    str,
+    BeforeValidator(_unit_name),
+    WithJsonSchema({"anyOf": [{"enum": [*READING_UNITS]}, {"pattern": f"^{COUNTS}$"}]}),
+]
 _WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
 
 
@@ -122,8 +141,7 @@ class ReadingsEntry(FileSchema):
         cls, core_schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Return the schema of an entry, or of a unit alone."""
-        unit = TypeAdapter(ReadingUnitName).json_schema()
-        return {"anyOf": [handler(core_schema), *unit["anyOf"]]}
+        return {"anyOf": [handler(core_schema), TypeAdapter(ReadingUnitName).json_schema()]}
 
     @model_validator(mode="before")
     @classmethod

@@ -51,6 +51,8 @@ def firmware_refusal(name: str) -> Callable[[Subject], str | None]:
         if len(actuators) != TOWERS or machine.mobility != TOWERS:
             carry = f"{len(actuators)} motors that carry rods"
             return f"found {carry} and {machine.mobility} freedoms, {needed}"
+        if machine.n_legs != 2 * TOWERS:
+            return f"found {machine.n_legs} rods on them, {needed} and two rods on each"
         if not machine.is_determined:
             return f"found that {machine.undetermined}, {needed}"
         turns = {actuator.turns for actuator in actuators}
@@ -161,7 +163,9 @@ class _Mounted:
 
     def steps(self, readings: Array) -> Array:
         """Return the way (k, 3) of the motors from their endstops, downwards [mm or deg]."""
-        return self._size * self.signs * (self.tops - readings[:, self._columns])
+        gains = np.array([actuator.gain for actuator in self.actuators])
+        way = self.tops - readings[:, self._columns]
+        return np.asarray(self._size * self.signs * gains * way)
 
     @property
     def lowest(self) -> float:

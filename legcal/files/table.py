@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from legcal.errors import HEADER, Code, DatasetError, Place, Problem
-from legcal.files.quantity import LENGTH
+from legcal.files.quantity import ANGLE, LENGTH
 from legcal.files.schema import (
     NAME_NEEDED,
     closest,
@@ -36,6 +36,8 @@ from legcal.geometry.types import Array, BoolArray
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _MAX_NAMED = 10  # maximum number of columns named in a sentence
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
+_COMMENTS = re.compile(r"\A(?:\s*#[^\n]*\n)+")  # above the headings
+_UNITS_BELOW = (*LENGTH, *ANGLE, "us", "s")  # units of a row below the headings
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
@@ -259,10 +261,10 @@ def read_table(
     """Return a CSV file as a table, with the problems of its cells still to be raised.
 
     ``reshape`` converts free-form tables into the declared columns; such tables may be separated by
-    semicolons or tabs, with decimal commas.
+    semicolons or tabs, with decimal commas, below comments and a title, above a row of units.
     """
     lines = _read_lines(path, noun, loose=reshape is not None)
-    if reshape is not None and lines:
+    if reshape is not None and (lines := _with_units(_without_title(lines))):
         lines = reshape(lines)
     if needed and len(lines) < 2:
         actual = f"{'a' if lines else 'no'} header and no row"
@@ -427,6 +429,25 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     return [(number, cells) for number, cells in lines if any(cells)]
 
 
+def _without_title(lines: Lines) -> Lines:
+    """Return lines without those above the headings that have a single cell."""
+    widths = [sum(map(bool, cells)) for _, cells in lines]
+    start = next((k for k, n in enumerate(widths) if n > 1 or max(widths) < 3), 0)
+    return lines[start:]
+
+
+def _with_units(lines: Lines) -> Lines:
+    """Return lines with a row of units below the headings written into these."""
+    if len(lines) < 2 or len(lines[0][1]) != len(lines[1][1]):
+        return lines
+    (number, header), (_, below) = lines[:2]
+    units = [cell.strip("[]() ") for cell in below]
+    if not any(units) or not all(unit in ("", *_UNITS_BELOW) for unit in units):
+        return lines
+    pairs = zip(header, units, strict=True)
+    return [(number, [f"{name} [{unit}]" if unit else name for name, unit in pairs]), *lines[2:]]
+
+
 def _decoded(content: bytes, *, loose: bool) -> str:
     """Return the text of a file in UTF-8.
 
@@ -442,7 +463,8 @@ def _decoded(content: bytes, *, loose: bool) -> str:
         if is_wide or not _TEXT.fullmatch(content):
             raise
         text = content.decode("cp1252")
-    return _SEPARATOR.sub("\n", text, count=1)  # lines keep their numbers
+    text = _SEPARATOR.sub("\n", text, count=1)  # lines keep their numbers
+    return _COMMENTS.sub(lambda match: "\n" * match[0].count("\n"), text)
 
 
 def _delimiter(text: str) -> str:

@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import ModelError
+from legcal.files.quantity import LENGTH
 from legcal.geometry.types import Array
+from legcal.machine.description_csv import MAX_NUMBER
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
 from legcal.machine.hexapod_files import (
     LINEAR_UNITS,
@@ -39,7 +41,7 @@ PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers,
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
-_IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8}
+_BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 
 
 @dataclass
@@ -192,7 +194,7 @@ def _g_code(path: Path, text: str) -> Configuration | None:
     """Return the numbers of M665, M666 and M669 of Marlin or RepRapFirmware."""
     values, unit = dict[str, float](), None
     for line in text.splitlines():
-        words = re.split(r"[;(]", re.sub(r"^\s*(?:N\d+|echo:)\s*", "", line))[0].upper().split()
+        words = re.split(r"[;(]", _BEFORE_CODE.sub("", line))[0].upper().split()
         if words and words[0] in ("G20", "G21"):
             unit = {"G20": "in", "G21": "mm"}[words[0]]
         if not words or words[0] not in ("M665", "M666", "M669"):
@@ -304,6 +306,12 @@ def _shown(key: str) -> str:
 
 def _completed(path: Path, read: Configuration) -> dict[str, float]:
     """Return the values of all parameters, with defaults; refuse those that are missing."""
+    for key, stated in read.values.items():
+        if not abs(stated) < MAX_NUMBER:
+            raise ModelError(
+                f"{path}: {_shown(key)} could not be used: found {stated:g}, needed a number below "
+                f"{MAX_NUMBER:g}; correct it."
+            )
     values, missing = dict[str, float](), list[Parameter]()
     for p in read.firmware.parameters:
         value = read.values.get(p.key)
@@ -325,9 +333,12 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
 
 
 def _needed(firmware: Firmware, p: Parameter) -> str:
-    if p.field == "stop" and firmware.stops_are_motors:
-        return "the lowest and highest angle of the arms"
-    return _WORDS[p.field]
+    """Return the meaning of a parameter."""
+    if p.field != "stop" or not firmware.stops_are_motors:
+        return _WORDS[p.field]
+    if p.key.startswith("JOINT"):
+        return "the position of the joint at its home switch"
+    return "the lowest and highest angle of the arms"
 
 
 def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float | None) -> Table:
@@ -414,11 +425,16 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             f"{ideal.angle[i - 1]:g} and {ideal.angle[i]:g} deg, needed towers around the bed, as "
             f"a rule 120 deg apart; correct their angles."
         )
-    sizes = rod * _IN_MM[unit]
-    if (np.ptp(sizes) > 0.5 * sizes.max()) or min(radius.min(), ideal.arm.min()) < 0.0:
+    sizes = 1e3 * LENGTH[unit] * rod
+    least = min(radius.min(), ideal.arm.min() if ideal.turns else np.inf)
+    if not least > 0.0:
+        problems.append(
+            f"{start} a radius or arm of {least:g} {unit}, needed a positive length; correct it."
+        )
+    elif np.ptp(sizes) > 0.5 * sizes.max():
         problems.append(
             f"{start} rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of "
-            f"{radius.min():g} {unit}, needed rods that are nearly alike and positive numbers; "
+            f"{radius.min():g} {unit}, needed rods that are nearly alike; "
             "write all lengths in one unit."
         )
     elif not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):

@@ -22,7 +22,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import ModelError
+from legcal.files.schema import content_of
 from legcal.geometry.types import Array
+from legcal.machine.description_csv import MAX_NUMBER
 
 STRUTS = 6
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -49,7 +51,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     for name in re.findall(r"^\s*HALFILE\s*=\s*(\S+)", text, re.MULTILINE):
         beside = path.parent / name
         if not name.startswith("LIB:") and beside.is_file():
-            pins += "\n" + beside.read_text(errors="replace")
+            pins += "\n" + content_of(beside, "HAL file").decode(errors="replace")
     numbers = {
         match[1]: float(match[2])
         for match in re.finditer(rf"^\s*setp\s+genhexkins\.(\S+)\s+({NUMBER})", pins, re.MULTILINE)
@@ -261,7 +263,7 @@ def rig_in(path: Path, text: str) -> tuple[Rig, Array, float]:
         if key in names:
             values.setdefault(names[key], float(match[2] or match[4]))
     needed = (*SIDES, "Range", "Middle")
-    if missing := [key for key in needed if not values.get(key, 0.0) > 0.0]:
+    if missing := [key for key in needed if not 0.0 < values.get(key, 0.0) < MAX_NUMBER]:
         raise ModelError(
             f"{path}: the rig could not be read: found no positive {' and '.join(missing)}, needed "
             "the sides L1 to L4, Middle and Range of the actuators; write them as 'L1: 1030'."

@@ -1,6 +1,7 @@
 """Plan a session: poses and camera places that determine the machine best (optimal design).
 
-In: a mechanism, a camera, and the noise of outlines; out: a :class:`Plan`, and the folder of a
+In: a mechanism, a camera, and the noise of outlines; the information of images of the joint fit
+(``calibration.joint_fit.predicted``); out: a :class:`Plan`, and the folder of a
 session. :func:`plan` checks the request, ``planner`` is the method from top to bottom. The paper
 names it as future work: "a better selection of the end-effector poses".
 
@@ -9,13 +10,10 @@ names it as future work: "a better selection of the end-effector poses".
 ``planner``          poses, places and images: selection, exchange, local search, evaluation
 ``poses``            poses within reach for all machines within tolerance
 ``places``           camera places, and tolerances of tripods
-``sight``            visible parts of legs: rays past other legs and plates
-``information``      information of images in the joint fit
 ``exchange``         greedy selection and exchanges by low-rank updates of the covariance
 ``goals``            criteria to minimise
 ``order``            order of poses and paths between them
 ``laid_board``       place of a board, and images that show it
-``noise``            noise of outlines from earlier results
 ``planned_session``  the plan and its document
 ``session``          the folder of a planned session
 ==================== ===================================================================

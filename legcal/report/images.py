@@ -54,8 +54,11 @@ def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     )
 
 
-_PARTS = (("top left", "top", "top right"), ("left", "middle", "right"),
-          ("bottom left", "bottom", "bottom right"))  # fmt: skip
+_PARTS = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
 
 
 def comparison_table(comparison: CameraComparison) -> Report:
@@ -69,11 +72,9 @@ def comparison_table(comparison: CameraComparison) -> Report:
             inside = (cell[:, 0] == x) & (cell[:, 1] == y)
             if not inside.any():
                 continue
-            rms = float(np.sqrt(np.mean(px[inside] ** 2)))
-            sigma = "" if comparison.sigma_px is None else (
-                f"{np.sqrt(np.mean(comparison.sigma_px[inside] ** 2)):.3f} px"
-            )  # fmt: skip
-            rows.append((name, f"{rms:.3f} px", sigma))
+            lengths = [px] if comparison.sigma_px is None else [px, comparison.sigma_px]
+            rms = [f"{np.sqrt(np.mean(length[inside] ** 2)):.3f} px" for length in lengths]
+            rows.append((name, *rms, *[""] * (2 - len(rms))))
     u, v = pixels[worst]
     return report(
         heading("difference", f": {np.sqrt(np.mean(px**2)):.3f} px (rms) over the image"),
@@ -97,7 +98,8 @@ def _model_and_sheet(calibration: CameraCalibration) -> str:
     bend, sigma = 1e3 * abs(calibration.sheet[k]), 1e3 * calibration.sheet_sigma[k]
     wider, wider_sigma = 100.0 * calibration.sheet[3], 100.0 * calibration.sheet_sigma[3]
     sigma_px = calibration.projection_sigma
-    middle, worst = sigma_px[6, 8], sigma_px[np.isfinite(sigma_px)].max()
+    middle = np.sqrt(np.mean(sigma_px[3:10, 4:13] ** 2))
+    worst = sigma_px[np.isfinite(sigma_px)].max()
     return (
         f"Lens model {calibration.lens}{cross_validation}. Pixels are known to {middle:.2g} px (1 "
         f"sigma) in the middle of the image, {worst:.2g} px at worst. The board is bent by "

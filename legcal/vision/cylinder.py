@@ -50,7 +50,7 @@ def steps_to_outlines(
 
     By (5), h . M = epsilon R on the axis, and zero where the cylinder touches the plane of h.
     """
-    return -EPSILON[:, None] * np.asarray(radius)[..., None, None] * h
+    return np.asarray(-EPSILON[:, None] * np.asarray(radius)[..., None, None] * h)
 
 
 def axis_of_outlines(

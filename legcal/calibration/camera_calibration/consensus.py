@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
@@ -292,8 +293,15 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
         i: min(faults, key=partial(complexity, i)) for i, faults in candidates.items() if faults
     }
     reasons = {}
+    in_group = corners.px[group[corners.image]]
     for i in candidates:
         name = best_names.get(i, "")
+        if name in _LIKE_A_LENS and _is_outside(corners.px[corners.image == i], in_group):
+            reasons[i] = (
+                "it reaches a part of the image that the others do not, where the lens model may "
+                "not hold; bring the board there in more images"
+            )
+            continue
         equal = [candidates[k][name].change for k, other in best_names.items() if other == name]
         if name == "zoom":
             longer = candidates[i][name].change.mean() > 0.0
@@ -326,6 +334,13 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
     return reasons
 
 
+def _is_outside(px: Array, others: Array) -> bool:
+    """Return whether most corners of an image lie outside the hull of others."""
+    hull = cv2.convexHull(others.astype(np.float32))
+    inside = [cv2.pointPolygonTest(hull, point, False) >= 0.0 for point in px.tolist()]
+    return 2 * sum(inside) < len(inside)
+
+
 def _shared(changes: Sequence[Array]) -> Array:
     """Return the change (2,) of the majority of images; zero without a majority."""
     middle = np.median(changes, axis=0)
@@ -344,6 +359,7 @@ _FREE = {
     "lens": ("k1", "k2"),
     "crop": ("fx", "fy", "cx", "cy"),
 }
+_LIKE_A_LENS = ("", "zoom", "stretch", "lens", "crop")  # faults like those of a wrong lens model
 _IN_WORDS = {
     "turned": "turned by half a turn after it was taken",
     "mirrored": "mirrored",

@@ -29,6 +29,7 @@ _OF_RING = 3  # smallest number of corners of an image in a ring
 _SIGNIFICANCE = 1e-3  # significance level of a radial trend
 _TREND_OF_SCATTER = 0.3  # radial trend worth a warning, relative to the scatter of corners
 _BETTER = 0.01  # significance level of a better prediction, and of a likelihood ratio
+_MORE_IMAGES = 1.25  # ratio of agreeing images from which predictions of others do not count
 _MIN_RANKED = 4  # smallest number of images that decide
 _LARGE_GAIN = np.log(2.0)  # ratio of mean squares that decides if every image has it
 
@@ -173,19 +174,20 @@ def _lead(simple: ChosenLens, rich: ChosenLens, *, is_likelier: bool) -> str:
         np.array([squares[k] for k in common]) for squares in (simple_squares, rich_squares)
     )
     gain = np.log(simple_px2 / rich_px2)
-    if n < n_other or _is_positive(-gain):
+    if _is_positive(-gain):
         return ""
     if n > n_other:
         return f"{model}: {n} images agree on it, {n_other} on {other}"
-    if not _is_positive(gain):
-        if simple.fit.left_out or not is_likelier:
-            return ""
+    if _is_positive(gain) and n_other <= _MORE_IMAGES * n:
+        middle = [float(np.sqrt(np.median(px2))) for px2 in (rich_px2, simple_px2)]
+        return (
+            f"{model}: it predicts {np.count_nonzero(gain > 0.0)} of {len(gain)} images that it "
+            f"has not seen better than {other}, to {middle[0]:.3f} instead of {middle[1]:.3f} px "
+            "(median)"
+        )
+    if is_likelier and n == n_other and not simple.fit.left_out:
         return f"{model}: all {n} images together fit it better than {other}, beyond chance"
-    rms = [float(np.sqrt(np.mean(px2))) for px2 in (rich_px2, simple_px2)]
-    return (
-        f"{model}: it predicts images that it has not seen to {rms[0]:.3f} px (rms), {other} to "
-        f"{rms[1]:.3f} px"
-    )
+    return ""
 
 
 def _is_positive(gain: Array) -> bool:

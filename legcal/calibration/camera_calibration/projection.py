@@ -1,7 +1,7 @@
 """How well a camera projects over its image, and how far two cameras are apart.
 
 A session leaves the pose of its camera free, so a turn of the camera is no error: the turn that
-explains most of a change of the intrinsics, over the whole image, is taken out.
+explains most of a change of the intrinsics in the middle of the image is taken out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.errors import UsageError
 from legcal.files.schema import Document
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera, intrinsic_names, project_with_derivatives
 
 GRID = 17, 13  # places along both sides of the image
@@ -38,8 +38,7 @@ def projection_sigma(camera: Camera, covariance: Array) -> Array:
     rays, reached = _rays(camera, pixels)
     _, by_ray, J = project_with_derivatives(camera, rays[reached], intrinsic_names(camera))
     by_turn = _by_turn(rays[reached], by_ray)
-    turn = np.linalg.lstsq(by_turn.reshape(-1, 3), J.reshape(-1, J.shape[2]), rcond=None)[0]
-    J = J - by_turn @ turn
+    J = J - by_turn @ _turn_of(by_turn, J, _in_the_middle(camera, pixels[reached]))
     spread = J @ covariance @ np.swapaxes(J, 1, 2)
     sigma = np.full(len(pixels), np.inf)
     sigma[reached] = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0))
@@ -51,6 +50,18 @@ def _rays(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     xy = camera.undistort(pixels)
     off = np.linalg.norm(camera.distort(xy) - pixels, axis=1)
     return np.column_stack([xy, np.ones(len(xy))]), off < _FOLDED_PX
+
+
+def _in_the_middle(camera: Camera, pixels: Array) -> BoolArray:
+    """Return a mask of the pixels in the middle half of the image, each way."""
+    share = (pixels + 0.5) / [camera.width, camera.height]
+    return np.asarray(np.all(np.abs(share - 0.5) < 0.26, axis=1))
+
+
+def _turn_of(by_turn: Array, change: Array, which: BoolArray) -> Array:
+    """Return the turn (3, k) that explains most of changes (n, 2, k) of some pixels."""
+    rows = change[which].reshape(-1, change.shape[2])
+    return np.asarray(np.linalg.lstsq(by_turn[which].reshape(-1, 3), rows, rcond=None)[0])
 
 
 def _by_turn(rays: Array, by_ray: Array) -> Array:
@@ -145,19 +156,19 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
     pixels = grid(first)
     rays, reached = _rays(first, pixels)
     pixels, rays = pixels[reached], rays[reached]
-    turn = Rotation.identity()
-    for _ in range(_TURNS):
-        turned = turn.apply(rays)
-        at, by_ray = second.project_with_derivative(turned)
-        by_turn = _by_turn(turned, by_ray)
-        step = np.linalg.lstsq(by_turn.reshape(-1, 3), (pixels - at).ravel(), rcond=None)[0]
-        turn = Rotation.from_rotvec(step) * turn
-    off_px = second.project(turn.apply(rays)) - pixels
-    by_xy = first.pixels_per_unit(rays[:, :2])
-    beside = np.linalg.norm(np.linalg.solve(by_xy, off_px[..., None])[..., 0], axis=1)
     sigma_px = None
     if first.covariance is not None and second.covariance is not None:
         sigma = projection_sigma(first, first.covariance)
         sigma_px = np.hypot(sigma, projection_sigma(second, second.covariance))[reached]
+    middle = _in_the_middle(first, pixels)
+    turn = Rotation.identity()
+    for _ in range(_TURNS):
+        turned = turn.apply(rays)
+        at, by_ray = second.project_with_derivative(turned)
+        step = _turn_of(_by_turn(turned, by_ray), (pixels - at)[..., None], middle)
+        turn = Rotation.from_rotvec(step[:, 0]) * turn
+    off_px = second.project(turn.apply(rays)) - pixels
+    by_xy = first.pixels_per_unit(rays[:, :2])
+    beside = np.linalg.norm(np.linalg.solve(by_xy, off_px[..., None])[..., 0], axis=1)
     off = beside / np.linalg.norm(rays, axis=1)
     return CameraComparison(pixels, off_px, off, sigma_px, turn.magnitude())

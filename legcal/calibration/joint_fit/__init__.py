@@ -22,6 +22,8 @@ nominal or refused, rounds of outlier rejection and noise estimation, checks, th
 ``held_out``          prediction errors in held-out images
 ``cross_validation``  images without a part in the fit predicted by it and the nominal model
 ``platform``          accuracy at the platform
+``predicted``         the information of images before they are measured
+``predicted_noise``   the noise to expect of them, by default or of an earlier result
 ``solution``          the result
 ===================== ==================================================================
 
