@@ -53,9 +53,10 @@ def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -
     assert "'yaw'" in said
     assert "'antenna' close no loop and are held as drawn" in said
     assert "rod.stl" in said
-    # Written down it needs neither the meshes nor what was inferred.
+    # Written down it needs nothing that was inferred, and what hides parts still does.
     written = load_mechanism(write_model(machine, tmp_path / "to")[0])
     _check(written)
+    assert len(written.occluders) == len(machine.occluders) == 6
     assert written.leg_names == machine.leg_names
 
 

@@ -117,7 +117,7 @@ def test_failures_have_their_exit_code_and_are_said_once(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
+    def fail(model: str, **bodies: str | None) -> None:
         raise error
 
     monkeypatch.setattr("legcal.machine.loader.load_mechanism", fail)

@@ -25,6 +25,7 @@ from legcal.calibration.link_joints import compared_joints
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.measurements import few, row_names
 from legcal.errors import DidNotConverge, ModelError
+from legcal.geometry.motions import components, motions_of, product
 from legcal.geometry.types import Array
 from legcal.machine.configurations import WORKSPACE_POSES, WORKSPACE_SEED, random_poses
 from legcal.machine.kinematics import followed_poses, platforms_in_base, pose_differences
@@ -32,6 +33,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of, vector_of
 from legcal.machine.redundancy import reading_residuals
+from legcal.machine.solved_poses import solve_poses
 from legcal.vision.board import Link
 
 WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
@@ -283,6 +285,16 @@ def _why_none(dataset: Dataset, unreached: Sequence[UnreachedRow]) -> str:
     )
 
 
+def _near(
+    reference: Machine, machine: Machine, q: Array, poses: Sequence[RigidTransform]
+) -> list[RigidTransform]:
+    """Return the poses of a redundant model at readings, nearest to those of another model."""
+    R, t = components(platforms_in_base(machine, poses))
+    solved = solve_poses(geometries(reference), reference.frame_legs, R, t, reference.sign * q)
+    to_link = reference.T_platform_Re.inv()
+    return [product(reference.T_base_Rb, T, to_link) for T in motions_of(solved.R, solved.t)]
+
+
 def _random_poses(
     machine: Machine, reference: Machine
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
@@ -297,7 +309,9 @@ def _random_poses(
             break
         count = WORKSPACE_POSES - len(poses) if draw > 0 else FIRST_POSES
         q, drawn = random_poses(machine, count, rng)
-        reference_poses_drawn = followed_poses(reference, q, on_the_chain=False)
+        reference_poses_drawn = list(followed_poses(reference, q, on_the_chain=False))
+        if reference.is_redundant:  # followed from home it may be another pose of these readings
+            reference_poses_drawn = [(T, None) for T in _near(reference, machine, q, drawn)]
         for T, (reference_T, failure) in zip(drawn, reference_poses_drawn, strict=True):
             if failure is None:  # else the reference cannot have these lengths at the same time
                 poses.append(T)

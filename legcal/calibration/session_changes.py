@@ -21,7 +21,6 @@ from itertools import chain, combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
@@ -865,6 +864,8 @@ class _Scatter:
             return 0.5 * float(np.sum(np.log1p(more) - squares / own_or_one * more / (1.0 + more)))
 
         own_or_one = np.where(own > 0.0, own, 1.0)
+        from scipy.optimize import minimize_scalar  # only where readings scatter
+
         likeliest = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
         more = math.exp(likeliest.x) * own
         spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))

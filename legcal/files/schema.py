@@ -293,10 +293,12 @@ def closest(word: str, candidates: Iterable[str]) -> str:
     near = nearest(word, names)
     if near:
         return f"did you mean '{near}'?"
+    if not names:
+        return "there are none: remove it, or add what it names"
     more = len(names) - _MOST_NAMES
     shown = names[:_MOST_NAMES]
     others = f" and {more} more" if more > 0 else ""
-    return f"known are: {', '.join(shown) or 'none'}{others}"
+    return f"known are: {', '.join(shown)}{others}"
 
 
 def nearest(word: str, names: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation
 
 _AT_MIDDLE = 1e-6  # largest distance from mid-travel, relative to the travel
-_TURNED, _LEVEL = 0.02, 1e-3  # rotations of a link that seem turned, and of a level platform [rad]
+_TURNED, _LEVEL = 0.02, 1e-3  # tilt of a link that seems tilted, and of a level platform [rad]
 _MIN_SINGULARITY = 1e-4  # singularity measure below which it is the rounding of a file
 _GOOD_SINGULARITY = 0.05  # of a home that can be proposed
 _ALONG = np.radians(np.arange(2.0, 62.0, 2.0))  # of a free motion [rad, leg lengths]
@@ -134,7 +134,8 @@ def _good_home(machine: Machine, motion: Array) -> str:
 
 def _level_note(machine: Machine, q: Array) -> list[str]:
     """Return a note if the platform is level at home and the frame of its link is not."""
-    if not machine.spatial or machine.home.rotation.magnitude() < _TURNED:
+    z = machine.home.rotation.apply([0.0, 0.0, 1.0])[2]
+    if not machine.spatial or z > np.cos(_TURNED):
         return []
     level = level_rotation(machine.A_at(q), machine.B_platform)
     if (level.inv() * machine.home.rotation).magnitude() > _LEVEL:

@@ -623,6 +623,8 @@ def completed(source: Source) -> Source:
     off = _loop_error(chain, start)
     if sliders and closed is not None and off > CLOSED:
         configuration = closed = _levelled(chain, closed, source, closures, unit)
+    elif closed is not None and off > CLOSED:
+        configuration = closed = _at_drawn_motors(chain, closed, start, source, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     if sliders:
         readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
@@ -637,6 +639,27 @@ def completed(source: Source) -> Source:
     }
     is_open = not sliders and off > _OPEN * size
     return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
+
+
+def _at_drawn_motors(
+    chain: ClosedChain, closed: Array, start: Array, source: Source, unit: Array
+) -> Array:
+    """Return a closed configuration with the motors where the file draws them, if there is one."""
+    moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
+             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
+    if len(moved) < len(source.file.name_mot) or not all(moved):
+        return closed
+    values = [chain.q_index(name) for name in source.file.name_mot]
+    rates = np.zeros((len(values), chain.nv))
+    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        off = points[0][values] - start[values]
+        return np.concatenate([residual, off])[None], np.concatenate([jacobian, rates])[None]
+
+    there = _solved(chain, equations, closed, unit)
+    return closed if there is None else there
 
 
 def _levelled(

@@ -320,8 +320,10 @@ def _actuators(
                 replace(
                     wrong,
                     found="no motor of that name that carries rods",
-                    needed=f"one of {', '.join(motors) or 'them in the model'}",
-                    remedy=closest(name, motors or ["none"]),
+                    needed=f"one of {', '.join(motors)}" if motors else "no entry",
+                    remedy=closest(name, motors)
+                    if motors
+                    else "remove it: sliders along legs carry none",
                 )
             )
             continue

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, OutOfResources, Problem, UsageError
@@ -25,11 +26,12 @@ from legcal.machine.files import FOLDER_YAML, is_xml, read_file
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
+from legcal.machine.meshes import mesh_file
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
 from legcal.machine.schema import mechanism_yaml, motor_entries
-from legcal.machine.urdf import UrdfPatch
+from legcal.machine.urdf import UrdfPatch, parse_robot
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
@@ -72,7 +74,7 @@ def model_name(machine: Machine) -> str:
 def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism.
 
-    An unconverted URDF is copied byte for byte.
+    An unconverted URDF is copied byte for byte, but for lost paths of meshes.
     """
     name = model_name(machine)
     places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
@@ -90,7 +92,7 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     try:
         for path in places:
             path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(places[1], machine.urdf.content)
+        write_atomically(places[1], _with_paths(machine, places[1]))
         text = mechanism_text(machine, f"../urdf/{name}.urdf")
         write_atomically(places[0], text.encode())  # last: a URDF alone is no model
     except OSError as error:
@@ -99,6 +101,19 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
             "that takes it; free space, correct permissions, or give another folder."
         ) from error
     return places
+
+
+def _with_paths(machine: Machine, destination: Path) -> bytes:
+    """Return the URDF of a mechanism; meshes not found from a destination get absolute paths."""
+    robot, changed = parse_robot(machine.urdf.path, machine.urdf.content), False
+    for mesh in robot.iterfind("link/*/geometry/mesh"):
+        file = mesh_file(machine.urdf.path, mesh.get("filename", ""))
+        if file is not None and mesh_file(destination, mesh.get("filename", "")) is None:
+            mesh.set("filename", file.resolve().as_posix())
+            changed = True
+    if not changed:
+        return machine.urdf.content
+    return etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:
