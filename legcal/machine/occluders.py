@@ -294,7 +294,8 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
     for (link, visual, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
         if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
             with suppress(ValueError):  # it hides nothing; pictures state the reason
-                meshes.setdefault(link, []).append(read_mesh(urdf.path, visual))
+                mesh = read_mesh(urdf.path, visual)
+                meshes.setdefault(link, []).append(mesh)
         corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
             cylinder = None

@@ -115,12 +115,13 @@ class Contributions:
         """Replace camera poses of views by the pose of a board on the base.
 
         Camera poses relative to the board count as exact, so that all cameras share the six
-        unknowns of the board.
+        unknowns of the board. A camera that sees nothing else has no pose to replace.
         """
-        if not T_base_camera:
-            return self
         names, turn = list(self.names), np.eye(len(self.names))
-        for view, T in T_base_camera.items():
+        tied = {view: T for view, T in T_base_camera.items() if f"{view}: pose 0" in names}
+        if not tied:
+            return self
+        for view, T in tied.items():
             R = T.rotation.as_matrix().T
             columns = [names.index(f"{view}: pose {k}") for k in range(6)]
             turn[np.ix_(columns, columns)] = block_diag(R, R)
