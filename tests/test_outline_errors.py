@@ -40,6 +40,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     RECOVERED_SHARE,
     EdgeBiases,
     NoiseModel,
+    estimate_noise,
     possible_biases,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
@@ -519,3 +520,17 @@ def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession
     )
     (note,) = trials.tried(gammas, None).notes({"c1": 2.0})
     assert "with 2.00, fewer of its outlines are usable" in note
+
+
+def test_kinds_of_noise_are_kept_where_they_would_take_turns() -> None:
+    """A tilt below significance is left out of an estimate, unless it had it before."""
+    rng = np.random.default_rng(4)
+    claimed = np.tile(0.01**2 * np.eye(2), (400, 1, 1))
+    tilt = 0.003 * rng.normal(size=(400, 1)) * [-1.0, 1.0]
+    offsets = 0.01 * rng.normal(size=(400, 2)) + tilt
+    none = np.zeros((400, 2, 2))
+    plain = estimate_noise(offsets, none, claimed)
+    kept = estimate_noise(offsets, none, claimed, included=NoiseModel(1.0, 0.0, 0.1))
+    assert plain.tilt_px == plain.bias_px == kept.bias_px == 0.0
+    assert 0.001 < kept.tilt_px < 0.006
+    assert kept.scale < plain.scale < 1.2

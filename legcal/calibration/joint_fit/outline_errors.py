@@ -144,7 +144,11 @@ def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
 
 
 def estimate_noise(
-    offsets: Array, explained: Array, claimed: Array, weight: Array | None = None
+    offsets: Array,
+    explained: Array,
+    claimed: Array,
+    weight: Array | None = None,
+    included: NoiseModel = NoiseModel(),
 ) -> NoiseModel:
     """Estimate the noise of outlines by restricted maximum likelihood.
 
@@ -160,6 +164,8 @@ def estimate_noise(
         Claimed covariances [px^2].
     weight : (n,) array, optional
         Weights of the squares of outlines; *offsets* and *explained* are weighted already.
+    included : NoiseModel
+        A noise whose bias and tilt are included, significant or not.
 
     Returns
     -------
@@ -168,7 +174,8 @@ def estimate_noise(
     weight = np.ones(len(offsets)) if weight is None else weight
     moments = _turned(offsets[:, :, None] * offsets[:, None] + explained)
     claimed = _turned(claimed)
-    best = _fitted(moments, claimed, weight, bias=False, tilt=False)
+    bias, tilt = included.bias_px > 0.0, included.tilt_px > 0.0
+    best = _fitted(moments, claimed, weight, bias=bias, tilt=tilt)
     for _ in range(2):
         has = best.bias_px > 0.0, best.tilt_px > 0.0
         wider = [

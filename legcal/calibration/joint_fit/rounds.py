@@ -62,6 +62,7 @@ _MIN_REDUNDANCY = 0.05  # mean redundancy of corners
 _MIN_SCALE = 0.1
 _MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
 _MAX_ERROR_CHANGE = 0.5  # of the largest error of outlines, in the last round
+_TURNS_OF_NOISE = 4  # rounds after which noise keeps its kinds
 _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
@@ -239,8 +240,10 @@ def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tupl
     """
     settings, changes, are_white = fit.problem.settings, NO_CHANGES, False
     fit = _linearized(fit)
-    for _ in range(settings.noise_rounds if len(fit.accepted) else 1):
-        before, fit = fit, fit.weighted(_noise(fit))
+    for turn in range(settings.noise_rounds if len(fit.accepted) else 1):
+        # Two kinds of noise that are told apart by a hair would take turns.
+        included = fit.noise if turn >= _TURNS_OF_NOISE else NoiseModel()
+        before, fit = fit, fit.weighted(_noise(fit, included))
         changes = Changes.of(before, fit)
         if are_white and changes.converged(settings):
             fit = _linearized(fit)
@@ -359,8 +362,8 @@ def _values_of_biases(problem: FitProblem, state: State, biases: EdgeBiases) -> 
     return np.array([value_of.get(name, 0.0) for name in biases.names])
 
 
-def _noise(fit: Fit) -> NoiseModel:
-    """Estimate the noise of outlines at a fit with its previous noise."""
+def _noise(fit: Fit, included: NoiseModel) -> NoiseModel:
+    """Estimate the noise of outlines at a fit, with the kinds of another included."""
     problem, linear, weight = fit.problem, fit.minimum.linear, fit.weight
     if not fit.accepted.any():
         return fit.noise
@@ -370,7 +373,7 @@ def _noise(fit: Fit) -> NoiseModel:
     share = leverage(problem, linear, normal, "outlines")[used]
     explained = L @ share @ np.swapaxes(L, -1, -2)  # weighted, as the squares are
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
-    return estimate_noise(offsets, explained, claimed[used], weight[used])
+    return estimate_noise(offsets, explained, claimed[used], weight[used], included)
 
 
 def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
