@@ -192,7 +192,7 @@ def test_the_witness_of_the_scale_that_others_contradict_is_named_alone(
     calibration = calibrate(session, priors=stated)
     assert [one.code for one in calibration.doubts] == (["scale"] if wrong else [])
     for doubt in calibration.doubts:
-        assert "says that the machine is 2 % larger than" in doubt.what
+        assert "the machine is 2 % larger than by" in doubt.what
         assert f"the likelier wrong is {wrong}, as the others agree without it" in doubt.what
         assert doubt.sigma_dX_m is not None
         assert calibration.platform is not None
@@ -204,7 +204,7 @@ def test_a_stated_length_that_is_the_nominal_one_is_asked_about(
 ) -> None:
     nominal = _length(load_dataset(session).machine, "leg2")
     beside_travel = calibrate(session, priors=[nominal])
-    assert any("is the nominal length to all digits" in note for note in beside_travel.notes)
+    assert any("is the nominal one to all digits" in note for note in beside_travel.notes)
     settings = SimulationSettings(level=Level.OUTLINES, poses=6, views=2)
     folder = simulate("delta", tmp_path / "set", settings).folder
     alone = calibrate(folder, priors=[_length(load_dataset(folder).machine, "leg3")])

@@ -28,11 +28,14 @@ from legcal.calibration.joint_fit.platform import (
     poses_at_readings,
 )
 from legcal.calibration.joint_fit.scale import (
+    BOARD,
     MODEL,
     RADII,
+    TRAVEL,
     NominalSize,
     compare_scales,
     scale_witnesses,
+    stated_lengths,
 )
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
@@ -118,6 +121,9 @@ def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:
     )
 
 
+OF_SCATTER = frozenset(("noise", CAMERA, "left_out"))  # codes of what a change leaves behind
+
+
 def doubts_of(
     dataset: Dataset,
     solution: Solution,
@@ -141,16 +147,21 @@ def doubts_of(
     # A scale that all motors share is one witness of the scale against the others
     is_of_scale = any(one.kind == "pitch" for one in session.findings)
     scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
-    causes = scale or course
+    causes = [*scale, *(doubt for doubt in course if not (scale and doubt.code == "pitch"))]
     predicted = cross_validate(solution.posterior.problem, solution.posterior.state)
-    motors = {one.subject for one in session.findings} if course else set[str]()
-    is_of_motors = any(one.kind in OF_MOTORS for one in session.findings) and bool(course)
+    codes = {doubt.code for doubt in course}
+    motors = {one.subject for one in session.findings if one.kind in codes}
+    is_of_motors = bool(codes & OF_MOTORS)
     legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
     symptoms = (
         []
         if causes
         else _symptoms(dataset, solution, platform, changes, held_out, session, predicted)
     )
+    if session.findings and any(one.code in OF_SCATTER for one in symptoms):
+        # Certain changes, too small to count by themselves, are what makes outlines scatter
+        causes = [Doubt(one.kind, one.what, one.remedy) for one in session.findings]
+        symptoms = [one for one in symptoms if one.code not in OF_SCATTER]
     if {one.code for one in causes} == {READING_NOISE}:
         # A model that was led away scatters readings as well
         symptoms = _left_out(predicted, platform)
@@ -158,9 +169,9 @@ def doubts_of(
         *([] if is_of_motors else _readings(solution)),
         *_legs_left_out(solution, legs),
         *_clicks(dataset, solution),
-        *_strayed_cameras(dataset, solution),
+        *(one for one in _strayed_cameras(dataset, solution) if one.is_grave or not causes),
         *_views(dataset, solution, corners),
-        *_few_outlines(solution.outlines),
+        *([] if causes else _few_outlines(solution.outlines)),
         *_nominal_lengths(dataset, solution, platform, changes),
         *_no_better(predicted, platform),
         *causes,
@@ -543,9 +554,13 @@ def _noise(
     o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
     times = {"all views": scatter.ratio()}
     if times["all views"] <= MOST_SCATTER:
-        times = {f"view {name}": scatter.ratio(o.view == v) for v, name in enumerate(o.views)}
-        times |= {name: scatter.ratio(o.leg == j) for j, name in enumerate(problem.legs.names)}
-        times |= {name: scatter.ratio(of) for name, of in session.periods.items()}
+        groups = {f"view {name}": o.view == v for v, name in enumerate(o.views)}
+        groups |= {name: o.leg == j for j, name in enumerate(problem.legs.names)}
+        groups |= session.periods
+        times = {
+            name: scatter.ratio(of) * scatter.is_beyond_chance(of, len(groups))
+            for name, of in groups.items()
+        }
     worst = max(times, key=times.__getitem__)
     if times[worst] <= MOST_SCATTER:
         return []
@@ -576,8 +591,11 @@ def _scale(
     found = None if nominal is None else compare_scales(solution.posterior, nominal)
     if found is None:
         return []
-    alone, wrong = len(scale_witnesses(problem)) == 1, found.likelier_wrong()
-    explained = wrong is not None and found.witnesses[wrong] in (RADII, *([] if alone else [MODEL]))
+    witnesses, wrong = scale_witnesses(problem), found.likelier_wrong()
+    alone = len(witnesses) == 1
+    # One ruler may have measured all that is stated, and one file has all squares of boards
+    others = () if alone or not {TRAVEL, BOARD} & set(witnesses) else (MODEL,)
+    explained = wrong is not None and found.witnesses[wrong] in (RADII, *others)
     pairs = [
         pair
         for pair in found.disagreements
@@ -585,10 +603,15 @@ def _scale(
     ]
     if not pairs:
         return []
-    first = pairs[0]
+    suspects = [pairs[0].larger, pairs[0].smaller] if wrong is None else [wrong]
+    first = next((p for p in pairs if wrong in (p.larger, p.smaller)), pairs[0])
+    if wrong is not None and found.witnesses[wrong] == MODEL:  # it has no part in the fit
+        suspects = (
+            [first.larger + first.smaller - wrong] if wrong in (first.larger, first.smaller) else []
+        )
     clauses = [
-        f"{found.witnesses[pair.larger]} says that the machine is {100.0 * pair.ratio:.2g} % "
-        f"larger than {found.witnesses[pair.smaller]} does ({pair.sigmas:.0f} standard deviations)"
+        f"by {found.witnesses[pair.larger]} the machine is {100.0 * pair.ratio:.2g} % larger than "
+        f"by {found.witnesses[pair.smaller]} ({pair.sigmas:.0f} standard deviations)"
         for pair in pairs
     ]
     likelier = (
@@ -596,15 +619,14 @@ def _scale(
         if wrong is None
         else f"the likelier wrong is {found.witnesses[wrong]}, as the others agree without it"
     )
-    rests = f"; the scale rests on {scale_witnesses(problem)[0]} alone" if alone else ""
+    rests = f"; the scale rests on {witnesses[0]} alone" if alone else ""
     what = f"{few(clauses)}: {likelier}{rests}"
     remedy = (
-        "measure that again, or another length, and state it "
+        "check these, and measure another length and state it "
         f"({dataset.machine.length_option}, --set)"
     )
     error = None
-    if platform is not None:
-        suspects = [first.larger, first.smaller] if wrong is None else [wrong]
+    if platform is not None and suspects:
         step_of = [dict(zip(names, step, strict=True)) for step in found.steps.T.tolist()]
         errors = [
             _moved_platform(
@@ -636,8 +658,8 @@ def _nominal_lengths(
         if error.mean_displacement <= platform.sigma.mean_displacement:
             return []
     what = (
-        f"the scale rests on {few(stated)} alone, which is the nominal length to all digits: was "
-        "it measured?"
+        f"the scale rests on {few(stated)} alone, stated as in the model to all digits: was it "
+        "measured?"
     )
     remedy = (
         "measure it and state that, or state a second length beside it "
@@ -649,12 +671,11 @@ def _nominal_lengths(
 def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
     """Return stated lengths that are the nominal ones to all digits, as nobody measures them."""
     known = known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
-    priors = solution.posterior.problem.choices.priors
     return [
         name
-        for name in sorted(priors)
+        for name, value in stated_lengths(solution.posterior.problem).items()
         if (":" in name or ParameterId.parse(name).kind == "length")
-        and abs(priors[name].mean - known.parameter(name).nominal) < _LAST_DIGIT
+        and abs(value - known.parameter(name).nominal) < _LAST_DIGIT
     ]
 
 

@@ -120,8 +120,8 @@ def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]
     if not stated or any(doubt.code == "nominal_length" for doubt in doubts):
         return []
     return [
-        f"The stated {few(stated)} is the nominal length to all digits: measure it and state that, "
-        "or leave it out."
+        f"{few(stated)}: the stated length is the nominal one to all digits; state a measured one, "
+        "or leave it out if there is another."
     ]
 
 

@@ -40,14 +40,14 @@ def image_sequences(
 
 def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | None:
     """Return the time of each row [s], None unless all are known and most poses differ in it."""
-    if measurements.time is not None and np.isfinite(measurements.time).all():
-        return measurements.time
-    times = np.full(measurements.n_rows, np.nan)
-    for row, image in enumerate(measurements.image):
-        moment = moment_of(taken_at.get(image, ""))
-        if moment is None:
-            return None
-        times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
+    times = measurements.time
+    if times is None or not np.isfinite(times).all():
+        times = np.full(measurements.n_rows, np.nan)
+        for row, image in enumerate(measurements.image):
+            moment = moment_of(taken_at.get(image, ""))
+            if moment is None:
+                return None
+            times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
     n_moments = len(np.unique(times))
     return times if 2 * n_moments > measurements.n_poses else None
 
@@ -66,9 +66,16 @@ def moment_of(text: str, day: date | None = None) -> datetime | None:
 
 
 def _numbers(names: Sequence[str]) -> IntArray | None:
-    """Return the last number in the stem of each name, None unless all have another one."""
-    found = [_NUMBER.findall(PurePosixPath(name).stem) for name in names]
+    """Return the rank of each name by the last number in its stem, None unless they all differ.
+
+    Where all names have as many numbers, as dates and times have, the first ones count before.
+    """
+    found = [
+        [int(digits) for digits in _NUMBER.findall(PurePosixPath(name).stem)] for name in names
+    ]
     if len(names) < 2 or not all(found):
         return None
-    numbers = np.array([int(digits[-1]) for digits in found])
-    return numbers if len(np.unique(numbers)) == len(numbers) else None
+    if len({len(numbers) for numbers in found}) > 1:
+        found = [numbers[-1:] for numbers in found]
+    ranks = {numbers: rank for rank, numbers in enumerate(sorted({tuple(n) for n in found}))}
+    return np.array([ranks[tuple(n)] for n in found]) if len(ranks) == len(names) else None

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri, ndtr
+from scipy.special import chdtrc, chdtri, ndtr
 
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
@@ -51,6 +51,7 @@ _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 MOST_SCATTER = 2.0  # of outlines, over the standard deviations that they came with
+_SCATTER_BY_CHANCE = 1e-3
 RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
@@ -371,6 +372,12 @@ class Scatter:
         """Return the root mean square of some outlines, or of all that are used; 0 without any."""
         squares = self.squares[self.used & of]
         return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
+
+    def is_beyond_chance(self, of: BoolArray, n_groups: int) -> bool:
+        """Return whether outlines scatter more than one of so many groups does by chance."""
+        squares = self.squares[self.used & of]
+        chance = float(chdtrc(2.0 * len(squares), 2.0 * squares.sum())) if len(squares) else 1.0
+        return n_groups * chance < _SCATTER_BY_CHANCE
 
 
 @dataclass(frozen=True)

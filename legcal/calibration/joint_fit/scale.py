@@ -23,6 +23,7 @@ from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_o
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
+from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
@@ -127,17 +128,39 @@ def _travel(problem: FitProblem) -> dict[str, Array]:
     return {name: lengths for name, lengths in travel.items() if lengths.any()}
 
 
+def stated_lengths(problem: FitProblem) -> dict[str, float]:
+    """Return the stated values of lengths by parameter, with a standard deviation or as exact."""
+    legs, choices = problem.legs, problem.choices
+    nominal = dict(zip(legs.parametrization.names, legs.vector(legs.nominal).tolist(), strict=True))
+    lengths = {name: prior.mean for name, prior in choices.priors.items() if ":" in name}
+    for name in stated_parameters(problem):
+        if ":" not in name and ParameterId.parse(name).kind in _LENGTHS:
+            prior = choices.priors.get(name)
+            fixed = choices.values.get(name, nominal.get(name, 0.0))
+            lengths[name] = fixed if prior is None else prior.mean
+    return dict(sorted(lengths.items()))
+
+
 def _stated_lengths(problem: FitProblem) -> list[tuple[str, list[str]]]:
-    """Return stated lengths in words with the names of their priors; coordinates count together."""
-    lengths, coordinates = list[tuple[str, list[str]]](), list[str]()
-    for name in sorted(problem.choices.priors):
-        kind = "" if ":" in name else ParameterId.parse(name).kind
-        if kind in ("base", "platform"):
-            coordinates.append(name)
-        elif not kind or kind in _LENGTHS:
-            lengths.append((f"the stated {name}", [name]))
-    together = [("the stated coordinates of joints", coordinates)] if coordinates else []
-    return lengths + together
+    """Return stated lengths in words with the names of their parameters.
+
+    Coordinates of joints count together, and so do parameters of a kind with one value: somebody
+    measured it once.
+    """
+    groups = dict[tuple[str, float], list[str]]()
+    for name, value in stated_lengths(problem).items():
+        kind = name if ":" in name else ParameterId.parse(name).kind
+        is_coordinate = kind in ("base", "platform")
+        groups.setdefault(("joints", 0.0) if is_coordinate else (kind, value), []).append(name)
+    return [
+        (
+            "the coordinates of joints that are stated"
+            if kind == "joints"
+            else f"the stated {few(names)}",
+            names,
+        )
+        for (kind, _), names in groups.items()
+    ]
 
 
 def single_witness(problem: FitProblem) -> str:
@@ -330,11 +353,30 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
             at = np.equal(of_distances, stated[0])
             error = np.where(at, -distances.length / distances.sigma, 0.0)[:, None]
             errors.append(_Error(words, {"lengths": error}, no_prior))
-        elif set(stated) & set(names):
-            errors.append(_Error(words, {}, of_priors(stated)))
+        else:
+            held = _of_held(problem, state, linear, stated)
+            if held or set(stated) & set(names):
+                errors.append(_Error(words, held, of_priors(stated)))
     radii = problem.block("radii").labels
     of_radii = np.array([name in radii for name in names], dtype=np.bool_)
     if of_radii.any():
         common = float(np.max(priors.sigma[of_radii] / priors.mean[of_radii]))
         errors.append(_Error(RADII, {}, of_priors(radii), common))
     return errors
+
+
+def _of_held(
+    problem: FitProblem, state: State, linear: Linearization, names: Collection[str]
+) -> dict[str, Array]:
+    """Return the changes of residuals by held parameters that are too large by one unit."""
+    parametrization, held = problem.legs.parametrization, problem.choices.fixed
+    values = problem.legs.vector(state.legs)
+    lengths = [
+        value if name in names and name in held else 0.0
+        for name, value in zip(parametrization.names, values.tolist(), strict=True)
+    ]
+    if not any(lengths):
+        return {}
+    place = parametrization.place
+    error = np.where(place >= 0, np.array(lengths)[place], 0.0)
+    return residual_changes(problem, linear, "legs", error)
