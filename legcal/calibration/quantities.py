@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.parameter_id import ParameterId
-from legcal.vision.board import LINKS, Link
 
 if TYPE_CHECKING:
     from legcal.calibration.documents import FrameMark, Result
+    from legcal.vision.board import Link
 
 FRAMES: dict[str, str] = {"base": "R_b", "platform": "R_e"}
 DIGITS = {"mm": 4, "deg": 4, "px": 3, "": 6}  # decimals by unit
@@ -94,7 +94,7 @@ def frame_of(name: str) -> str:
 def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:
     """Yield the coordinates of the joints in the links of the model."""
     for side, block in (result.links or {}).items():
-        for joint in block.joints if side in (sides or LINKS) else ():
+        for joint in block.joints if side in (sides or FRAMES) else ():
             for k, axis in enumerate("xyz"):
                 numbers = joint.xyz[k], joint.nominal[k], joint.sigma[k]
                 name = f"{joint.leg}.{side}.{axis}"
