@@ -21,6 +21,7 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, session_tests
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import chosen_images
 from legcal.data.image_order import image_sequences
 from legcal.errors import UsageError
 from legcal.files.table import format_table
@@ -38,6 +39,17 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Outlines of a hexapod in two views."""
     folder = simulated(tmp_path_factory.mktemp("course") / "set", "hexapod", poses=12).folder
     return load_dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Start]:
+    """Outlines of poses that two cameras photograph one after the other, and their fit."""
+    folder = tmp_path_factory.mktemp("shared") / "set"
+    dataset = load_dataset(simulated(folder, "hexapod", poses=12, shared_poses=True).folder)
+    m = dataset.measurements
+    dataset = replace(dataset, measurements=replace(m, time=10.0 * m.pose + m.view))
+    solution = calibrate(dataset).solution
+    return dataset, Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "nominal")
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +205,33 @@ def test_the_remedy_of_a_slip_gives_a_result_within_its_sigmas(
     (note,) = [note for note in result.notes if "zero of the encoder of leg4" in note]
     (value, sigma) = map(float, re.findall(r"is (\S+) ± (\S+) mm", note)[0])
     assert abs(value - 1e3 * slip) < 4.0 * sigma < 0.05
+
+
+def test_images_without_outlines_are_on_the_side_of_those_around_them(
+    healthy: Dataset, start: Start
+) -> None:
+    bumped = _with_later_rays(turned(TURN))(healthy)
+    outlines = bumped.observations
+    assert outlines is not None
+    without = outlines.choose(~np.isin(outlines.row, [15, 23]))
+    finding = _findings(replace(bumped, observations=without), start)[0]
+    assert (finding.kind, finding.images) == ("camera", "c2:p20..p24")
+
+
+@pytest.mark.parametrize("has_times", [True, False])
+def test_a_split_has_all_images_of_the_poses_before_a_slip(
+    shared: tuple[Dataset, Start], has_times: bool
+) -> None:
+    dataset, start = shared
+    m = dataset.measurements
+    q = m.q + SLIP * np.outer(m.pose >= 5, np.arange(6) == 0)
+    m = replace(m, q=q, time=m.time if has_times else None)
+    slipped = replace(dataset, measurements=m)
+    finding = _findings(slipped, start)[0]
+    assert (finding.kind, finding.subject) == ("encoder", "leg1")
+    assert finding.images == ("c1:p01..c2:p05" if has_times else "c1:p01..p05,c2:p01..p05")
+    chosen = chosen_images(slipped, finding.images)
+    assert chosen.tolist() == (m.pose < 5).tolist()
 
 
 def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:

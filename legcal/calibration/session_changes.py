@@ -338,23 +338,49 @@ def _forward_selection(
 
 
 def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
-    """Return the images before a change of an encoder; beside that of a camera, the fewer ones."""
+    """Return the images before a change of an encoder; beside that of a camera, the fewer ones.
+
+    Images of a pose share its readings, and so the side of an encoder. Those in which nothing can
+    be seen of a change are on the side of the ones before them.
+    """
     if not hypothesis.changes:
         return ""
-    names = [view.name for view in measurements.views]
-    is_of_camera = hypothesis.kind != "encoder"
-    sides = []
-    for is_after in (False, True):
-        parts = []
-        for rows in course.rows_in_order:
-            on_side = test.holds[course.block[rows]] == is_after
-            if is_of_camera:
-                on_side &= measurements.view[rows] == names.index(hypothesis.subject)
-            parts.append(rows[on_side])
-        sides.append([rows for rows in parts if len(rows)])
-    if is_of_camera:
-        sides.sort(key=lambda side: sum(map(len, side)))
-    return images_in_words(measurements, sides[0])
+    if hypothesis.kind == "encoder":
+        images, by = list(course.rows_in_order), course.reading_row
+    else:
+        names = [view.name for view in measurements.views]
+        of_view = measurements.view == names.index(hypothesis.subject)
+        images = [rows[of_view[rows]] for rows in course.rows_in_order]
+        by = np.arange(measurements.n_rows)
+    seen = np.append(_blocks_of(hypothesis).any(axis=0), False)
+    block = np.where(by >= 0, course.block[by], -1)  # -1 is the last of those seen
+    after = np.append(test.holds, False)[block]
+    is_known, sides = seen[block], (list[IntArray](), list[IntArray]())
+    for rows in images:
+        known = np.flatnonzero(is_known[rows])
+        if len(known):
+            last = np.searchsorted(known, np.arange(len(rows)), side="right") - 1
+            is_after = after[rows[known[np.maximum(last, 0)]]]
+            for side, on_side in zip(sides, (~is_after, is_after), strict=True):
+                side.extend(_runs(measurements.view, rows, on_side))
+    if hypothesis.kind == "encoder":
+        for row in np.flatnonzero(is_known & (course.block < 0)).tolist():
+            sides[int(after[row])].append(np.array([row], dtype=np.intp))
+        return images_in_words(measurements, sides[0])
+    return images_in_words(measurements, min(sides, key=lambda side: sum(map(len, side))))
+
+
+def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArray]:
+    """Yield chosen rows as ranges of a sequence: one of all views, or those of each view."""
+    of_each = [view[rows] == v for v in dict.fromkeys(view[rows].tolist())]
+    at = np.flatnonzero(chosen)
+    is_one = len(at) > 0 and len(at) == at[-1] - at[0] + 1
+    for among in [np.ones(len(rows), dtype=np.bool_)] if is_one else of_each:
+        places = np.flatnonzero(chosen[among])
+        breaks = np.flatnonzero(np.diff(places) > 1) + 1
+        for run in np.split(rows[among][places], breaks):
+            if len(run):
+                yield run
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:
@@ -400,6 +426,7 @@ class _Course:
     size: IntArray  # (n_blocks,) images
     rows: Mapping[tuple[int, int], int]  # of views and poses of the fit
     row_of_pose: IntArray  # (n_poses,) first row of each pose of the fit
+    reading_row: IntArray  # (n_rows,) the same of the pose of each row; -1: not in the fit
     before: IntArray  # (n_rows,) the row taken before each; -1: none
 
     @classmethod
@@ -437,6 +464,9 @@ class _Course:
         row_of_pose = np.full(problem.n_elements, -1, dtype=np.intp)
         for (_, pose), row in sorted(rows_of.items(), reverse=True):
             row_of_pose[pose] = row
+        reading_row = np.full(measurements.n_poses, -1, dtype=np.intp)
+        in_fit = row_of_pose[row_of_pose >= 0]
+        reading_row[measurements.pose[in_fit]] = in_fit
         return cls(
             block,
             tuple(first),
@@ -447,6 +477,7 @@ class _Course:
             np.array(size, dtype=np.intp),
             rows_of,
             row_of_pose,
+            reading_row[measurements.pose],
             before,
         )
 
