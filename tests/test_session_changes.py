@@ -234,6 +234,15 @@ def test_a_split_has_all_images_of_the_poses_before_a_slip(
     assert chosen.tolist() == (m.pose < 5).tolist()
 
 
+def test_a_lag_is_found_where_cameras_take_turns(shared: tuple[Dataset, Start]) -> None:
+    dataset, start = shared
+    moves = np.diff(dataset.measurements.q_of_poses, axis=0, prepend=dataset.measurements.q[:1])
+    late = _with_readings(lambda q: q + LAG * moves[dataset.measurements.pose])(dataset)
+    finding = _findings(late, start)[0]
+    assert finding.kind == "lag"
+    assert abs(finding.amount - LAG) < 4.0 * finding.sigma < 0.6 * LAG
+
+
 def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
     bumped = _with_later_rays(turned(5.0 * TURN))(healthy)
     (option,) = re.findall(r"--leave-out (\S+)\)", calibrate(bumped).doubts[0].remedy)

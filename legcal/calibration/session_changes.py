@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, combinations
+from itertools import chain, combinations, pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -427,7 +427,7 @@ class _Course:
     rows: Mapping[tuple[int, int], int]  # of views and poses of the fit
     row_of_pose: IntArray  # (n_poses,) first row of each pose of the fit
     reading_row: IntArray  # (n_rows,) the same of the pose of each row; -1: not in the fit
-    before: IntArray  # (n_rows,) the row taken before each; -1: none
+    before: IntArray  # (n_rows,) the reading row of the pose taken before that of each; -1: none
 
     @classmethod
     def of(
@@ -441,7 +441,9 @@ class _Course:
         size, ordered = list[int](), list[IntArray]()
         for sequence in sequences:
             rows = sequence.tolist()
-            before[rows[1:]] = rows[:-1]
+            for previous, row in pairwise(rows):
+                moved = measurements.pose[row] != measurements.pose[previous]
+                before[row] = previous if moved else before[previous]
             numbers = []
             for begin in range(0, len(rows), per_block):
                 members = rows[begin : begin + per_block]
@@ -464,9 +466,10 @@ class _Course:
         row_of_pose = np.full(problem.n_elements, -1, dtype=np.intp)
         for (_, pose), row in sorted(rows_of.items(), reverse=True):
             row_of_pose[pose] = row
-        reading_row = np.full(measurements.n_poses, -1, dtype=np.intp)
+        row_of_measured = np.full(measurements.n_poses, -1, dtype=np.intp)
         in_fit = row_of_pose[row_of_pose >= 0]
-        reading_row[measurements.pose[in_fit]] = in_fit
+        row_of_measured[measurements.pose[in_fit]] = in_fit
+        reading_row = row_of_measured[measurements.pose]
         return cls(
             block,
             tuple(first),
@@ -477,8 +480,8 @@ class _Course:
             np.array(size, dtype=np.intp),
             rows_of,
             row_of_pose,
-            reading_row[measurements.pose],
-            before,
+            reading_row,
+            np.where(before >= 0, reading_row[before], -1),
         )
 
     @property
@@ -661,13 +664,13 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
-    """Return how far readings are from those of the image before, zero for first images."""
+    """Return how far readings are from those of the pose before, zero for first poses."""
     keys = zip(leg.tolist(), row.tolist(), strict=True)
     reading = dict(zip(keys, q.tolist(), strict=True))
     previous = np.where(row >= 0, before[row], -1).tolist()
     return np.array(
         [
-            x - reading.get((j, last), x)
+            x - reading.get((j, last), x) if last >= 0 else 0.0
             for x, j, last in zip(q.tolist(), leg.tolist(), previous, strict=True)
         ]
     )
