@@ -21,7 +21,7 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, session_tests
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
-from legcal.data.image_choice import chosen_images
+from legcal.data.image_choice import chosen_images, own_zeros
 from legcal.data.image_order import image_sequences
 from legcal.errors import UsageError
 from legcal.files.table import format_table
@@ -234,6 +234,14 @@ def test_a_split_has_all_images_of_the_poses_before_a_slip(
     assert chosen.tolist() == (m.pose < 5).tolist()
 
 
+def test_a_split_stands_for_all_images_of_its_poses(shared: tuple[Dataset, Start]) -> None:
+    dataset, _ = shared
+    (zero,) = own_zeros(dataset, ["leg1@c2:p01..p05"])
+    assert zero.rows.tolist() == (dataset.measurements.pose < 5).tolist()
+    with pytest.raises(UsageError, match="share a pose with them"):
+        own_zeros(dataset, ["leg1@c2"])
+
+
 def test_a_lag_is_found_where_cameras_take_turns(shared: tuple[Dataset, Start]) -> None:
     dataset, start = shared
     moves = np.diff(dataset.measurements.q_of_poses, axis=0, prepend=dataset.measurements.q[:1])
@@ -262,6 +270,11 @@ def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
         ({"leave_out": "c1,c2"}, "found all images"),
         ({"split": ["leg7@p03"]}, "found no motor of that name"),
         ({"split": ["leg1"]}, "needed MOTOR@IMAGES"),
+        ({"split": ["leg1@"]}, "found no images, needed MOTOR@IMAGES"),
+        ({"split": ["leg1@c1", "leg1@c2"]}, "found all images in splits of that motor, needed"),
+        ({"split": ["leg1@c1", "leg1@c1:p03"]}, "found images of another split of that motor"),
+        ({"split": ["leg1@c1:p03"], "leave_out": "c1"}, "found only images that are left out"),
+        ({"split": ["leg1@c1"], "leave_out": "c2"}, "found all images in splits of that motor,"),
     ],
 )
 def test_images_that_cannot_be_chosen_are_refused_with_the_cause(
