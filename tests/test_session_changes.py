@@ -242,6 +242,19 @@ def test_a_split_stands_for_all_images_of_its_poses(shared: tuple[Dataset, Start
         own_zeros(dataset, ["leg1@c2"])
 
 
+def test_a_slip_that_cannot_be_seen_has_no_least_size(shared: tuple[Dataset, Start]) -> None:
+    dataset, start = shared
+    few = dataset_at(dataset, np.flatnonzero(dataset.measurements.pose < 6))  # one moment
+    m = replace(few.measurements, own_zeros=own_zeros(few, ["leg1@c1:p01..p03"]))
+    assert few.observations is not None
+    solution = refine(
+        fitted_legs(few.machine), m, few.observations, replace(start, T_Rb_Re=start.T_Rb_Re[:6])
+    )
+    session = session_tests(solution.posterior, m, image_sequences(m, {}))
+    assert sorted(session.least_slips) == [f"leg{j}" for j in range(2, 7)]
+    assert min(session.least_slips.values()) > 0.0
+
+
 def test_a_lag_is_found_where_cameras_take_turns(shared: tuple[Dataset, Start]) -> None:
     dataset, start = shared
     moves = np.diff(dataset.measurements.q_of_poses, axis=0, prepend=dataset.measurements.q[:1])

@@ -212,7 +212,8 @@ class SessionTests:
     findings : tuple of Finding
         The numbers that the fit lacks, the most certain first.
     least_slips : dict
-        The least changes of encoders that would show half of the time, by motor [m or rad].
+        The least changes of encoders that would show half of the time, by motor [m or rad];
+        motors of which no change can be seen are not in it.
     periods : dict
         The outlines of the fit (n,) in each quarter of the images in order, by its images.
     """
@@ -262,7 +263,7 @@ def session_tests(
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for test, number in zip(tests, solved, strict=True):
         hypothesis = hypotheses[test.hypothesis]
-        if hypothesis.kind == "encoder":
+        if hypothesis.kind == "encoder" and number.rank:
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(hypothesis.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, tests, solved, len(tests))
