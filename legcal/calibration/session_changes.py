@@ -108,7 +108,7 @@ class Finding:
 
     @property
     def size(self) -> str:
-        """The amount with its standard deviation."""
+        """The amount with its standard deviation, without a sign where words tell it."""
         scale, unit = (100.0, "%") if self.unit == "1" else SHOWN_IN[self.unit]
         sigma = scale * self.sigma
         digits = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0.0 else 3
@@ -116,13 +116,16 @@ class Finding:
             stated = f"{scale * self.stated:.2g} {unit}"
             return f"{scale * self.amount:.{digits}f} {unit} where {stated} are stated"
         sign = "" if self.kind in _WITHOUT_SIGN else "+"
-        return f"{scale * self.amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
+        amount = abs(self.amount) if self.kind in _BY_SIGN else self.amount
+        return f"{scale * amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
 
     @property
     def what(self) -> str:
         """What was found, as a clause."""
         between = "" if self.between is None else f" between {' and '.join(self.between)}"
-        return f"{_WORDS[self.kind][0].format(subject=self.subject, size=self.size)}{between}"
+        sense = _BY_SIGN.get(self.kind, ("", ""))[int(self.amount < 0.0)]
+        what = _WORDS[self.kind][0].format(subject=self.subject, size=self.size, sense=sense)
+        return f"{what}{between}"
 
     @property
     def remedy(self) -> str:
@@ -131,7 +134,12 @@ class Finding:
 
 
 _WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
-_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity")
+_BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
+    "lag": ("ahead of", "behind"),
+    "gain": ("too large", "too small"),
+    "pitch": ("larger", "smaller"),
+}
+_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity", *_BY_SIGN)
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
@@ -154,7 +162,7 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "(--leave-out {images})",
     ),
     "lag": (
-        "readings are ahead of the platform by {size} of the last move",
+        "readings are {sense} the platform by {size} of the last move",
         "wait until the platform stands still before each photograph, and read the encoders then",
     ),
     "backlash": (
@@ -162,11 +170,11 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "approach all poses from one side, and look for backlash there",
     ),
     "gain": (
-        "readings of {subject} are {size} too large",
+        "readings of {subject} are {size} {sense}",
         "check the pitch or gear ratio of that motor, and its counts per turn",
     ),
     "pitch": (
-        "readings of {subject} are {size} larger than all other measurements say together",
+        "readings of {subject} are {size} {sense} than all other measurements say together",
         "measure stated lengths and boards again, and check pitch or gear ratio and counts per "
         "turn",
     ),
