@@ -18,9 +18,10 @@ from legcal.calibration.closeness import commanded
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.result import Calibration
-from legcal.calibration.session_changes import Finding, session_tests
+from legcal.calibration.session_changes import Finding, Kind, session_tests
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import chosen_images, own_zeros
 from legcal.data.image_order import image_sequences
 from legcal.errors import UsageError
 from legcal.files.table import format_table
@@ -38,6 +39,17 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Outlines of a hexapod in two views."""
     folder = simulated(tmp_path_factory.mktemp("course") / "set", "hexapod", poses=12).folder
     return load_dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Start]:
+    """Outlines of poses that two cameras photograph one after the other, and their fit."""
+    folder = tmp_path_factory.mktemp("shared") / "set"
+    dataset = load_dataset(simulated(folder, "hexapod", poses=12, shared_poses=True).folder)
+    m = dataset.measurements
+    dataset = replace(dataset, measurements=replace(m, time=10.0 * m.pose + m.view))
+    solution = calibrate(dataset).solution
+    return dataset, Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "nominal")
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +207,82 @@ def test_the_remedy_of_a_slip_gives_a_result_within_its_sigmas(
     assert abs(value - 1e3 * slip) < 4.0 * sigma < 0.05
 
 
+def test_images_without_outlines_are_on_the_side_of_those_around_them(
+    healthy: Dataset, start: Start
+) -> None:
+    bumped = _with_later_rays(turned(TURN))(healthy)
+    outlines = bumped.observations
+    assert outlines is not None
+    without = outlines.choose(~np.isin(outlines.row, [15, 23]))
+    finding = _findings(replace(bumped, observations=without), start)[0]
+    assert (finding.kind, finding.images) == ("camera", "c2:p20..p24")
+
+
+@pytest.mark.parametrize("has_times", [True, False])
+def test_a_split_has_all_images_of_the_poses_before_a_slip(
+    shared: tuple[Dataset, Start], has_times: bool
+) -> None:
+    dataset, start = shared
+    m = dataset.measurements
+    q = m.q + SLIP * np.outer(m.pose >= 5, np.arange(6) == 0)
+    m = replace(m, q=q, time=m.time if has_times else None)
+    slipped = replace(dataset, measurements=m)
+    finding = _findings(slipped, start)[0]
+    assert (finding.kind, finding.subject) == ("encoder", "leg1")
+    assert finding.images == ("c1:p01..c2:p05" if has_times else "c1:p01..p05,c2:p01..p05")
+    chosen = chosen_images(slipped, finding.images)
+    assert chosen.tolist() == (m.pose < 5).tolist()
+
+
+def test_a_split_stands_for_all_images_of_its_poses(shared: tuple[Dataset, Start]) -> None:
+    dataset, _ = shared
+    (zero,) = own_zeros(dataset, ["leg1@c2:p01..p05"])
+    assert zero.rows.tolist() == (dataset.measurements.pose < 5).tolist()
+    with pytest.raises(UsageError, match="share a pose with them"):
+        own_zeros(dataset, ["leg1@c2"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "positive", "negative"),
+    [
+        (
+            "lag",
+            "ahead of the platform by 0.400 ± 0.010 %",
+            "behind the platform by 0.400 ± 0.010 %",
+        ),
+        ("gain", "leg4 are 0.400 ± 0.010 % too large", "leg4 are 0.400 ± 0.010 % too small"),
+        ("pitch", "leg4 are 0.400 ± 0.010 % larger than", "leg4 are 0.400 ± 0.010 % smaller than"),
+    ],
+)
+def test_words_tell_the_sign_of_readings_that_are_off(
+    kind: Kind, positive: str, negative: str
+) -> None:
+    for amount, words in ((LAG, positive), (-LAG, negative)):
+        assert words in Finding(kind, "leg4", "1", amount, 1e-4, None, 0.0, np.zeros((0, 1))).what
+
+
+def test_a_slip_that_cannot_be_seen_has_no_least_size(shared: tuple[Dataset, Start]) -> None:
+    dataset, start = shared
+    few = dataset_at(dataset, np.flatnonzero(dataset.measurements.pose < 6))  # one moment
+    m = replace(few.measurements, own_zeros=own_zeros(few, ["leg1@c1:p01..p03"]))
+    assert few.observations is not None
+    solution = refine(
+        fitted_legs(few.machine), m, few.observations, replace(start, T_Rb_Re=start.T_Rb_Re[:6])
+    )
+    session = session_tests(solution.posterior, m, image_sequences(m, {}))
+    assert sorted(session.least_slips) == [f"leg{j}" for j in range(2, 7)]
+    assert min(session.least_slips.values()) > 0.0
+
+
+def test_a_lag_is_found_where_cameras_take_turns(shared: tuple[Dataset, Start]) -> None:
+    dataset, start = shared
+    moves = np.diff(dataset.measurements.q_of_poses, axis=0, prepend=dataset.measurements.q[:1])
+    late = _with_readings(lambda q: q + LAG * moves[dataset.measurements.pose])(dataset)
+    finding = _findings(late, start)[0]
+    assert finding.kind == "lag"
+    assert abs(finding.amount - LAG) < 4.0 * finding.sigma < 0.6 * LAG
+
+
 def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
     bumped = _with_later_rays(turned(5.0 * TURN))(healthy)
     (option,) = re.findall(r"--leave-out (\S+)\)", calibrate(bumped).doubts[0].remedy)
@@ -214,6 +302,11 @@ def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
         ({"leave_out": "c1,c2"}, "found all images"),
         ({"split": ["leg7@p03"]}, "found no motor of that name"),
         ({"split": ["leg1"]}, "needed MOTOR@IMAGES"),
+        ({"split": ["leg1@"]}, "found no images, needed MOTOR@IMAGES"),
+        ({"split": ["leg1@c1", "leg1@c2"]}, "found all images in splits of that motor, needed"),
+        ({"split": ["leg1@c1", "leg1@c1:p03"]}, "found images of another split of that motor"),
+        ({"split": ["leg1@c1:p03"], "leave_out": "c1"}, "found only images that are left out"),
+        ({"split": ["leg1@c1"], "leave_out": "c2"}, "found all images in splits of that motor,"),
     ],
 )
 def test_images_that_cannot_be_chosen_are_refused_with_the_cause(

@@ -47,7 +47,7 @@ from legcal.data.cache import fingerprint, plan_dataset, store_outlines
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at, split_images
 from legcal.data.image_causes import image_notes
-from legcal.data.image_choice import chosen_images, own_zero
+from legcal.data.image_choice import chosen_images, own_zeros
 from legcal.data.measurements import few_views
 from legcal.data.outlines import reject_unused_legs
 from legcal.data.overrides import Override, listed, overrides_of_call
@@ -164,10 +164,9 @@ def calibrate(
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
-    zeros = tuple(own_zero(dataset, text) for text in listed(split))
-    if zeros:
-        dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
+    if zeros := own_zeros(dataset, listed(split), left_out):
+        dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
     fitted, held_out = _fitted_and_held_out(dataset, left_out, holdout)
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 

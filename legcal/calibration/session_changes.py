@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, combinations
+from itertools import chain, combinations, pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -108,7 +108,7 @@ class Finding:
 
     @property
     def size(self) -> str:
-        """The amount with its standard deviation."""
+        """The amount with its standard deviation, without a sign where words tell it."""
         scale, unit = (100.0, "%") if self.unit == "1" else SHOWN_IN[self.unit]
         sigma = scale * self.sigma
         digits = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0.0 else 3
@@ -116,13 +116,16 @@ class Finding:
             stated = f"{scale * self.stated:.2g} {unit}"
             return f"{scale * self.amount:.{digits}f} {unit} where {stated} are stated"
         sign = "" if self.kind in _WITHOUT_SIGN else "+"
-        return f"{scale * self.amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
+        amount = abs(self.amount) if self.kind in _BY_SIGN else self.amount
+        return f"{scale * amount:{sign}.{digits}f} ± {sigma:.{digits}f} {unit}"
 
     @property
     def what(self) -> str:
         """What was found, as a clause."""
         between = "" if self.between is None else f" between {' and '.join(self.between)}"
-        return f"{_WORDS[self.kind][0].format(subject=self.subject, size=self.size)}{between}"
+        sense = _BY_SIGN.get(self.kind, ("", ""))[int(self.amount < 0.0)]
+        what = _WORDS[self.kind][0].format(subject=self.subject, size=self.size, sense=sense)
+        return f"{what}{between}"
 
     @property
     def remedy(self) -> str:
@@ -131,7 +134,12 @@ class Finding:
 
 
 _WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
-_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity")
+_BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
+    "lag": ("ahead of", "behind"),
+    "gain": ("too large", "too small"),
+    "pitch": ("larger", "smaller"),
+}
+_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity", *_BY_SIGN)
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
@@ -154,7 +162,7 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "(--leave-out {images})",
     ),
     "lag": (
-        "readings are ahead of the platform by {size} of the last move",
+        "readings are {sense} the platform by {size} of the last move",
         "wait until the platform stands still before each photograph, and read the encoders then",
     ),
     "backlash": (
@@ -162,11 +170,11 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
         "approach all poses from one side, and look for backlash there",
     ),
     "gain": (
-        "readings of {subject} are {size} too large",
+        "readings of {subject} are {size} {sense}",
         "check the pitch or gear ratio of that motor, and its counts per turn",
     ),
     "pitch": (
-        "readings of {subject} are {size} larger than all other measurements say together",
+        "readings of {subject} are {size} {sense} than all other measurements say together",
         "measure stated lengths and boards again, and check pitch or gear ratio and counts per "
         "turn",
     ),
@@ -212,7 +220,8 @@ class SessionTests:
     findings : tuple of Finding
         The numbers that the fit lacks, the most certain first.
     least_slips : dict
-        The least changes of encoders that would show half of the time, by motor [m or rad].
+        The least changes of encoders that would show half of the time, by motor [m or rad];
+        motors of which no change can be seen are not in it.
     periods : dict
         The outlines of the fit (n,) in each quarter of the images in order, by its images.
     """
@@ -262,7 +271,7 @@ def session_tests(
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for test, number in zip(tests, solved, strict=True):
         hypothesis = hypotheses[test.hypothesis]
-        if hypothesis.kind == "encoder":
+        if hypothesis.kind == "encoder" and number.rank:
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(hypothesis.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, tests, solved, len(tests))
@@ -338,23 +347,49 @@ def _forward_selection(
 
 
 def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
-    """Return the images before a change of an encoder; beside that of a camera, the fewer ones."""
+    """Return the images before a change of an encoder; beside that of a camera, the fewer ones.
+
+    Images of a pose share its readings, and so the side of an encoder. Those in which nothing can
+    be seen of a change are on the side of the ones before them.
+    """
     if not hypothesis.changes:
         return ""
-    names = [view.name for view in measurements.views]
-    is_of_camera = hypothesis.kind != "encoder"
-    sides = []
-    for is_after in (False, True):
-        parts = []
-        for rows in course.rows_in_order:
-            on_side = test.holds[course.block[rows]] == is_after
-            if is_of_camera:
-                on_side &= measurements.view[rows] == names.index(hypothesis.subject)
-            parts.append(rows[on_side])
-        sides.append([rows for rows in parts if len(rows)])
-    if is_of_camera:
-        sides.sort(key=lambda side: sum(map(len, side)))
-    return images_in_words(measurements, sides[0])
+    if hypothesis.kind == "encoder":
+        images, by = list(course.rows_in_order), course.reading_row
+    else:
+        names = [view.name for view in measurements.views]
+        of_view = measurements.view == names.index(hypothesis.subject)
+        images = [rows[of_view[rows]] for rows in course.rows_in_order]
+        by = np.arange(measurements.n_rows)
+    seen = np.append(_blocks_of(hypothesis).any(axis=0), False)
+    block = np.where(by >= 0, course.block[by], -1)  # -1 is the last of those seen
+    after = np.append(test.holds, False)[block]
+    is_known, sides = seen[block], (list[IntArray](), list[IntArray]())
+    for rows in images:
+        known = np.flatnonzero(is_known[rows])
+        if len(known):
+            last = np.searchsorted(known, np.arange(len(rows)), side="right") - 1
+            is_after = after[rows[known[np.maximum(last, 0)]]]
+            for side, on_side in zip(sides, (~is_after, is_after), strict=True):
+                side.extend(_runs(measurements.view, rows, on_side))
+    if hypothesis.kind == "encoder":
+        for row in np.flatnonzero(is_known & (course.block < 0)).tolist():
+            sides[int(after[row])].append(np.array([row], dtype=np.intp))
+        return images_in_words(measurements, sides[0])
+    return images_in_words(measurements, min(sides, key=lambda side: sum(map(len, side))))
+
+
+def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArray]:
+    """Yield chosen rows as ranges of a sequence: one of all views, or those of each view."""
+    of_each = [view[rows] == v for v in dict.fromkeys(view[rows].tolist())]
+    at = np.flatnonzero(chosen)
+    is_one = len(at) > 0 and len(at) == at[-1] - at[0] + 1
+    for among in [np.ones(len(rows), dtype=np.bool_)] if is_one else of_each:
+        places = np.flatnonzero(chosen[among])
+        breaks = np.flatnonzero(np.diff(places) > 1) + 1
+        for run in np.split(rows[among][places], breaks):
+            if len(run):
+                yield run
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:
@@ -400,7 +435,8 @@ class _Course:
     size: IntArray  # (n_blocks,) images
     rows: Mapping[tuple[int, int], int]  # of views and poses of the fit
     row_of_pose: IntArray  # (n_poses,) first row of each pose of the fit
-    before: IntArray  # (n_rows,) the row taken before each; -1: none
+    reading_row: IntArray  # (n_rows,) the same of the pose of each row; -1: not in the fit
+    before: IntArray  # (n_rows,) the reading row of the pose taken before that of each; -1: none
 
     @classmethod
     def of(
@@ -414,7 +450,9 @@ class _Course:
         size, ordered = list[int](), list[IntArray]()
         for sequence in sequences:
             rows = sequence.tolist()
-            before[rows[1:]] = rows[:-1]
+            for previous, row in pairwise(rows):
+                moved = measurements.pose[row] != measurements.pose[previous]
+                before[row] = previous if moved else before[previous]
             numbers = []
             for begin in range(0, len(rows), per_block):
                 members = rows[begin : begin + per_block]
@@ -437,6 +475,10 @@ class _Course:
         row_of_pose = np.full(problem.n_elements, -1, dtype=np.intp)
         for (_, pose), row in sorted(rows_of.items(), reverse=True):
             row_of_pose[pose] = row
+        row_of_measured = np.full(measurements.n_poses, -1, dtype=np.intp)
+        in_fit = row_of_pose[row_of_pose >= 0]
+        row_of_measured[measurements.pose[in_fit]] = in_fit
+        reading_row = row_of_measured[measurements.pose]
         return cls(
             block,
             tuple(first),
@@ -447,7 +489,8 @@ class _Course:
             np.array(size, dtype=np.intp),
             rows_of,
             row_of_pose,
-            before,
+            reading_row,
+            np.where(before >= 0, reading_row[before], -1),
         )
 
     @property
@@ -630,13 +673,13 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
-    """Return how far readings are from those of the image before, zero for first images."""
+    """Return how far readings are from those of the pose before, zero for first poses."""
     keys = zip(leg.tolist(), row.tolist(), strict=True)
     reading = dict(zip(keys, q.tolist(), strict=True))
     previous = np.where(row >= 0, before[row], -1).tolist()
     return np.array(
         [
-            x - reading.get((j, last), x)
+            x - reading.get((j, last), x) if last >= 0 else 0.0
             for x, j, last in zip(q.tolist(), leg.tolist(), previous, strict=True)
         ]
     )

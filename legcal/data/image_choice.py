@@ -44,23 +44,60 @@ def chosen_images(dataset: Dataset, text: str) -> BoolArray:
     return chosen
 
 
-def own_zero(dataset: Dataset, text: str) -> OwnZero:
-    """Return the images of ``MOTOR@IMAGES``, in which that motor has a zero of its own.
+def own_zeros(
+    dataset: Dataset, texts: Sequence[str], left_out: BoolArray | None = None
+) -> tuple[OwnZero, ...]:
+    """Return the images of each ``MOTOR@IMAGES``, in which that motor has a zero of its own.
+
+    All images of a pose have its readings, and so belong to it if one of them is named.
 
     Raises
     ------
     UsageError
-        If there is no such motor, or images cannot be used.
+        If there is no such motor, or images cannot be used: other ones of the motor, or none, have
+        to remain.
     """
+    pose, zeros = dataset.measurements.pose, list[OwnZero]()
+    kept = np.ones(len(pose), dtype=np.bool_) if left_out is None else ~left_out
+    for text in texts:
+        motor, images = _motor_and_images(dataset, text)
+        named = chosen_images(dataset, images)
+        rows = np.isin(pose, pose[named])
+        used = [one.rows & kept for one in zeros if one.motor == motor]
+        used.append(rows & kept)
+        cause = ""
+        if not used[-1].any():
+            cause = "found only images that are left out, needed others"
+        elif any((used[-1] & other).any() for other in used[:-1]):
+            cause = "found images of another split of that motor, needed each image in one of them"
+        elif (np.any(used, axis=0) == kept).all():
+            shared = " with those that share a pose with them" * bool((rows & ~named).any())
+            cause = (
+                f"found all images in splits of that motor{shared}, needed some that have the zero "
+                "of the model"
+            )
+        if cause:
+            raise UsageError(
+                f"The split {describe(text)} could not be used: {cause}; name other images or "
+                "leave it out."
+            )
+        zeros.append(OwnZero(motor, rows, images))
+    return tuple(zeros)
+
+
+def _motor_and_images(dataset: Dataset, text: str) -> tuple[str, str]:
+    """Return both parts of ``MOTOR@IMAGES``."""
     motor, _, images = text.partition("@")
     legs = [dataset.machine.legs[j] for j in dataset.machine.motors]
     motors = [leg.motor_label for leg in legs]
-    if not images or motor not in motors:
-        raise UsageError(
-            f"The split {describe(text)} could not be used: found no motor of that name, needed "
-            f"MOTOR@IMAGES such as {motors[0]}@p22..p45; {closest(motor, motors)}"
-        )
-    return OwnZero(motor, chosen_images(dataset, images), images)
+    needed = f"needed MOTOR@IMAGES such as {motors[0]}@p22..p45"
+    if motor not in motors:
+        cause = f"found no motor of that name, {needed}; {closest(motor, motors)}"
+    elif not images.strip():
+        cause = f"found no images, {needed}; name them."
+    else:
+        return motor, images
+    raise UsageError(f"The split {describe(text)} could not be used: {cause}")
 
 
 def images_in_words(measurements: Measurements, parts: Sequence[IntArray]) -> str:
