@@ -238,10 +238,11 @@ def check_identifiable(
     # A rank does not depend on errors that edges share, and many images have many of these.
     analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
+    is_open = bool(analysis.session.actuators) and is_scale_open(analysis)
+    if is_open and sum(not direction.harmless for direction in full.weak) <= 1:  # nothing else
+        raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
-    if analysis.session.actuators and is_scale_open(analysis):
-        raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
     if full.weak:  # only harmless ones are left
