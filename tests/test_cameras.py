@@ -324,6 +324,13 @@ def test_files_of_other_programs_are_read(
         (basalt("ds", {}), ("'ds'", "kb4")),
         (f"1 FOV 1024 768 {AT_CORNER} 0.9\n", ("'FOV'", "OPENCV_FISHEYE")),
         (f"1 PINHOLE 1024 768 {AT_CORNER}\n2 PINHOLE 1024 768 {AT_CORNER}\n", ("2 cameras",)),
+        ("1 PINHOLE 1024\n", ("camera 1 could not be read", "'1024'", "width and height")),
+        ("1 PINHOLE 1024 768 1.2.3 1 5 5\n", ("'1.2.3'", "parameters of PINHOLE")),
+        (f"1 PINHOLE 1024 - {AT_CORNER}\n", ("'-'", "COLMAP's cameras.txt")),
+        (f"1 PINHOLE 1e400 768 {AT_CORNER}\n", ("'1e400'", "COLMAP's cameras.txt")),
+        *((MATLAB | {key: rows}, (f"{key} could not be used", "three rows of three numbers"))
+          for key in ("K", "IntrinsicMatrix")
+          for rows in (5, [1, 2, 3], [[1.0, 0.0, 0.0], [0.0, 1.0], [1.0]], 3 * [[1.0, 2.0]])),
         (kalibr(camera_model="omni", intrinsics=[0.8, *FOUR]), ("'omni'", "pinhole-radtan")),
         (kalibr(distortion_model="fov", distortion_coeffs=[0.9]), ("'fov'", "equidistant")),
         (ros(distortion_model="plumb_bob", D=RATIONAL), ("8 coefficients", "name the lens")),

@@ -163,13 +163,37 @@ class BasaltEntry(_OpenSchema):
     resolution: Annotated[list[Size], Field(min_length=1)]
 
 
-class MatlabEntry(_OpenSchema):
-    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+def _as_3x3(rows: object) -> object:
+    """Refuse what is not three rows of three entries."""
+    lists = rows if isinstance(rows, list) else []
+    if [len(row) if isinstance(row, list) else 0 for row in lists] != [3, 3, 3]:
+        raise BadValue(
+            describe(rows), "three rows of three numbers", "copy the matrix from the calibration"
+        )
+    return rows
 
-    K: Annotated[list[list[float]], Field(min_length=3, max_length=3)]
+
+_Rows = Annotated[list[list[float]], BeforeValidator(_as_3x3)]
+
+
+class _MatlabLens(_OpenSchema):
+    """The image and the lens in the struct of MATLAB's camera parameters."""
+
     ImageSize: Size  # rows, columns
     RadialDistortion: Annotated[list[float], Field(min_length=2, max_length=3)]
     TangentialDistortion: Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class MatlabEntry(_MatlabLens):
+    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+
+    K: _Rows
+
+
+class OldMatlabEntry(_MatlabLens):
+    """The struct of MATLAB before R2022b: with the transpose of K."""
+
+    IntrinsicMatrix: _Rows
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
@@ -185,6 +209,7 @@ _YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
 _SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
 _LAST_SEPARATOR = re.compile(rb"(?<=\n)---\s*\Z")
 _COLMAP = re.compile(rb"^[ \t]*(\d+)[ \t]+([A-Z][A-Z_]+)[ \t]+([\d.eE+\- \t]+)$", re.MULTILINE)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _PINHOLE = "fx fy cx cy"
 _OPENCV4, _FISHEYE = f"{_PINHOLE} k1 k2 p1 p2", f"{_PINHOLE} k1 k2 k3 k4"
 PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
@@ -416,11 +441,19 @@ def _from_colmap(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the only camera of a cameras.txt of COLMAP: the corner of the image is its origin."""
     rows = [[part.decode() for part in row] for row in document["colmap"]]
     _only([f"camera {number}" for number, _, _ in rows], path)
-    _, lens, numbers = rows[0]
-    width, height, *parameters = (float(number) for number in numbers.split())
-    return _of_parameters(
-        path, "COLMAP", lens, parameters, (int(width), int(height)), first_pixel=0.5
-    )
+    number, lens, listed = rows[0]
+    words = listed.split()
+    values = [float(word) if _NUMBER.fullmatch(word) else np.nan for word in words]
+    size = [int(value) for value in values[:2] if value > 0.0 and value.is_integer()]
+    wrong = [word for word, value in zip(words, values, strict=True) if not np.isfinite(value)]
+    if len(size) < 2 or wrong:
+        found = wrong[0] if wrong else " ".join(words[:2])
+        raise DatasetError(
+            f"{path}: camera {number} could not be read: found {describe(found)}, needed the "
+            f"width and height of the image [px] and the parameters of {lens}; copy the line from "
+            "COLMAP's cameras.txt."
+        )
+    return _of_parameters(path, "COLMAP", lens, values[2:], (size[0], size[1]), first_pixel=0.5)
 
 
 def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
@@ -435,10 +468,14 @@ def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of MATLAB's struct: its first pixel is (1, 1)."""
-    transposed = document.get("IntrinsicMatrix")
-    by_rows = [list(row) for row in zip(*transposed, strict=True)] if transposed else None
-    entry = validate(MatlabEntry, {"K": by_rows, **document}, path)
-    K = np.array(entry.K) - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    entry: MatlabEntry | OldMatlabEntry
+    if "K" not in document and "IntrinsicMatrix" in document:
+        entry = validate(OldMatlabEntry, document, path)
+        by_rows = np.transpose(entry.IntrinsicMatrix)
+    else:
+        entry = validate(MatlabEntry, document, path)
+        by_rows = np.array(entry.K)
+    K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     height, width = entry.ImageSize
     k1, k2, *k3 = entry.RadialDistortion
     coefficients = [k1, k2, *entry.TangentialDistortion, *(k3 or [0.0])]
