@@ -271,6 +271,8 @@ AT_CORNER = "1290 1310 518.8 380.1"
 MATLAB = {"RadialDistortion": [-0.25, 0.08, 0.01], "TangentialDistortion": [1e-3, -8e-4]} | {
     "ImageSize": SIZE[::-1]
 }
+FULL = MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}
+ROI = {"x_offset": 0, "y_offset": 0, "width": SIZE[0], "height": SIZE[1], "do_rectify": False}
 BY_ONE = [[1290.0, 2.5, 519.3], [0.0, 1310.0, 380.6], [0.0, 0.0, 1.0]]
 
 
@@ -291,6 +293,7 @@ def echoed(*messages: dict[str, Any]) -> str:
     [
         (echoed(*2 * [MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}]), "plumb_bob",
          PLUMB_BOB, 2.5),
+        (FULL | {"binning_x": 1, "binning_y": 0, "roi": ROI}, "plumb_bob", PLUMB_BOB, 2.5),
         (echoed(MESSAGE | {"K": K.ravel().tolist(), "D": PLUMB_BOB}), "plumb_bob", PLUMB_BOB, 2.5),
         (MRCAL.format("LENSMODEL_OPENCV8", FOUR + RATIONAL), "rational_polynomial", RATIONAL, 0.0),
         (MRCAL.format("LENSMODEL_OPENCV12", FOUR + PRISM), "thin_prism", PRISM, 0.0),
@@ -335,6 +338,8 @@ def test_files_of_other_programs_are_read(
         (kalibr(distortion_model="fov", distortion_coeffs=[0.9]), ("'fov'", "equidistant")),
         (ros(distortion_model="plumb_bob", D=RATIONAL), ("8 coefficients", "name the lens")),
         (ros(distortion_model="rational_polynomial", D=[*PRISM, 0.1, 0.0]), ("tilt",)),
+        (FULL | {"binning_x": 2}, ("binning_x", "found 2", "0 or 1")),
+        (FULL | {"roi": ROI | {"y_offset": 8, "height": 760}}, ("roi", "1024 x 760 px at (0, 8)")),
         (echoed(MESSAGE | {"k": K.ravel().tolist(), "d": FISHEYE},
                 MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}), ("different cameras",)),
     ],

@@ -122,6 +122,15 @@ class RosEntry(_OpenSchema):
     legcal_camera: CalibratedEntry | None = None
 
 
+class RoiEntry(_OpenSchema):
+    """The part of the sensor in the images of a ROS message; all zeros are the full image."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
 class MessageEntry(_OpenSchema):
     """A ROS message of a camera, as ``ros2 topic echo`` prints it."""
 
@@ -130,6 +139,9 @@ class MessageEntry(_OpenSchema):
     distortion_model: LensName
     d: list[float]
     k: Annotated[list[float], Field(min_length=9, max_length=9)]
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: RoiEntry = Field(default_factory=RoiEntry)
 
 
 class KalibrEntry(_OpenSchema):
@@ -389,6 +401,25 @@ def _from_message(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of a ROS message; ROS 1 has capital letters."""
     small = {"d": document.get("D", []), "k": document.get("K"), "distortion_model": ""}
     entry = validate(MessageEntry, {**small, **document}, path)
+    part = entry.roi
+    problems = [
+        f"{path}: {key} could not be used: found {binning}, needed 0 or 1, as k is for images that "
+        "are not binned; calibrate the camera at the size of the images."
+        for key, binning in (("binning_x", entry.binning_x), ("binning_y", entry.binning_y))
+        if binning not in (0, 1)
+    ]
+    if (
+        (part.x_offset, part.y_offset) != (0, 0)
+        or part.width not in (0, entry.width)
+        or part.height not in (0, entry.height)
+    ):
+        problems.append(
+            f"{path}: roi could not be used: found {part.width} x {part.height} px at "
+            f"({part.x_offset}, {part.y_offset}), needed the full image of {entry.width} x "
+            f"{entry.height} px; calibrate the camera at the size of the images."
+        )
+    if problems:
+        raise DatasetError(problems)
     K = np.reshape(entry.k, (3, 3))
     return _checked(path, K, (entry.width, entry.height), entry.distortion_model, entry.d)
 
