@@ -258,6 +258,15 @@ def test_a_named_lens_counts_in_any_file_and_four_coefficients_need_a_name(tmp_p
     assert_camera(read_camera(path), "equidistant", FISHEYE)
     write_opencv(path, PLUMB_BOB[:4], fisheye_model=0)
     assert_camera(read_camera(path), "plumb_bob", PLUMB_BOB[:4])
+    write_opencv(path, FISHEYE, camera_model="fisheye")
+    assert_camera(read_camera(path), "equidistant", FISHEYE)
+    for D, more, found in (
+        (PLUMB_BOB, {"camera_model": "fisheye"}, "found 5 coefficients, needed 4 for equidistant"),
+        (PLUMB_BOB, {"camera_model": "omnidir"}, "camera_model could not be used: found 'omnidir'"),
+        (FISHEYE, {"camera_model": "fisheye", "fisheye_model": 0}, "beside the distortion 'plumb"),
+    ):
+        with pytest.raises(DatasetError, match=found):
+            read_camera(write_opencv(path, D, **more))
     kept = write_opencv(tmp_path / "four.yaml", FISHEYE)
     for four in (kept, write(tmp_path, ros(distortion_model=..., D=FISHEYE))):
         with pytest.raises(DatasetError, match="four coefficients without a lens model"):

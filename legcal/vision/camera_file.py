@@ -216,6 +216,7 @@ _OPENCV_KEYS = {
     "distortion_model": ("distortion_model",),
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
     "fisheye_model": ("fisheye_model",),
+    "camera_model": ("camera_model", "Camera_Model", "cameraModel"),
 }
 _YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
 _SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
@@ -556,14 +557,7 @@ def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
                 if node is not None
             }
             document = {name: _node_value(node) for name, node in nodes.items()}
-            fisheye, D = (
-                document.pop("fisheye_model", None),
-                document.get("distortion_coefficients"),
-            )
-            if fisheye is not None and isinstance(D, dict):
-                lens = "equidistant" if fisheye else _counted(D["data"])
-                document.setdefault("distortion_model", lens)
-            return document
+            return _with_lens(document, path)
     except UnicodeDecodeError:
         reason = "bytes that are not UTF-8 text"
     except (cv2.error, SystemError):
@@ -571,6 +565,33 @@ def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
     raise DatasetError(
         f"{path}: the camera file could not be read: found {reason}, needed an OpenCV FileStorage "
         "in YAML, XML or JSON; write it again with cv2.FileStorage."
+    )
+
+
+def _with_lens(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the entries of a storage with the lens that its other keys name as its distortion."""
+    fisheye, camera = (document.pop(key, None) for key in ("fisheye_model", "camera_model"))
+    D = document.get("distortion_coefficients")
+    if fisheye is not None and isinstance(D, dict):
+        lens = "equidistant" if fisheye else _counted(D["data"])
+        document.setdefault("distortion_model", lens)
+    name = str(camera or "pinhole").lower()
+    if name == "pinhole":  # with any distortion
+        return document
+    start = f"{path}: camera_model could not be used: found {describe(camera)}"
+    for model, kind in DISTORTION_MODELS.items():
+        names = (model, *kind.aliases)
+        if name not in names:
+            continue
+        if (stated := document.setdefault("distortion_model", model)) not in names:
+            raise DatasetError(
+                f"{start} beside the distortion {describe(stated)}, needed one lens model; correct "
+                "the one that is wrong."
+            )
+        return document
+    raise DatasetError(
+        f"{start}, needed pinhole or a lens that legcal reads ({', '.join(DISTORTION_MODELS)}); "
+        f"{_CALIBRATE}."
     )
 
 
