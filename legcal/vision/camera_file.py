@@ -5,6 +5,7 @@ numbers of a camera in one row.
 """
 
 import ast
+import codecs
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -221,7 +222,7 @@ _OPENCV_KEYS = {
 _YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
 _SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
 _LAST_SEPARATOR = re.compile(rb"(?<=\n)---\s*\Z")
-_COLMAP = re.compile(rb"^[ \t]*(\d+)[ \t]+([A-Z][A-Z_]+)[ \t]+([\d.eE+\- \t]+)$", re.MULTILINE)
+_COLMAP = re.compile(rb"(\d+)\s+([A-Z][A-Z0-9_]+)(?:\s+(.*))?")  # one line
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _PINHOLE = "fx fy cx cy"
 _OPENCV4, _FISHEYE = f"{_PINHOLE} k1 k2 p1 p2", f"{_PINHOLE} k1 k2 k3 k4"
@@ -274,7 +275,7 @@ def _document(content: bytes, path: Path) -> Mapping[str, Any]:
     """Return the mapping in a camera file of any syntax."""
     if b"LENSMODEL_" in content and (literal := _literal(content)):
         return literal
-    if rows := _COLMAP.findall(content):
+    if rows := _colmap_rows(content):
         return {"colmap": rows}
     bare = _YAML_HEADER.sub(b"", content)
     if _OPENCV_MARKS.search(content):
@@ -296,6 +297,19 @@ def _document(content: bytes, path: Path) -> Mapping[str, Any]:
             "needed one camera; copy one message into a file of its own."
         )
     return first
+
+
+def _colmap_rows(content: bytes) -> list[tuple[str, str, str]]:
+    """Return number, lens and the rest of the lines of a cameras.txt; none of another file."""
+    lines = [line.strip() for line in content.removeprefix(codecs.BOM_UTF8).splitlines()]
+    rows = [_COLMAP.fullmatch(line) for line in lines if line and not line.startswith(b"#")]
+    found = [row.groups(default=b"") for row in rows if row]
+    if len(found) < len(rows):
+        return []
+    return [
+        (number.decode(), lens.decode(), rest.decode(errors="replace"))
+        for number, lens, rest in found
+    ]
 
 
 def _literal(content: bytes) -> dict[str, Any]:
@@ -471,7 +485,7 @@ def _from_mrcal(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _from_colmap(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the only camera of a cameras.txt of COLMAP: the corner of the image is its origin."""
-    rows = [[part.decode() for part in row] for row in document["colmap"]]
+    rows = document["colmap"]
     _only([f"camera {number}" for number, _, _ in rows], path)
     number, lens, listed = rows[0]
     words = listed.split()
