@@ -392,6 +392,18 @@ def test_cameras_are_written_for_other_programs(
         np.testing.assert_array_equal(camera.distortion[: len(D)], D)
 
 
+def test_the_covariance_of_a_converted_camera_is_kept_where_it_can_be(tmp_path: Path) -> None:
+    block = {"version": 1, "sigma": {"fx": 2.0}, "names": ["fx"], "covariance": [[4.0]]}
+    source = write(tmp_path, camera_info(PLAIN, "any", {"legcal_camera": block}))
+    assert len(convert_camera(source, "ros", tmp_path / "ros.yaml")) == 1
+    assert yaml.safe_load((tmp_path / "ros.yaml").read_text())["legcal_camera"] == block
+    covariance = read_camera(tmp_path / "ros.yaml").covariance
+    assert covariance is not None
+    assert covariance[0, 0] == 4.0
+    _, note = convert_camera(source, "mrcal", tmp_path / "mrcal.txt")
+    assert "files of mrcal do not hold it" in note
+
+
 @pytest.mark.parametrize(
     ("name", "model", "written", "D"),
     [

@@ -271,6 +271,12 @@ def read_camera(path: Path) -> Camera:
     )
 
 
+def calibrated_block(path: Path) -> Mapping[str, Any] | None:
+    """Return what legcal adds to a camera that it calibrated, as it stands in a camera file."""
+    block = _document(content_of(path, "camera file"), path).get(CALIBRATED)
+    return block if isinstance(block, dict) else None
+
+
 def _document(content: bytes, path: Path) -> Mapping[str, Any]:
     """Return the mapping in a camera file of any syntax."""
     if b"LENSMODEL_" in content and (literal := _literal(content)):
