@@ -433,6 +433,7 @@ def test_the_file_is_a_camera_info_with_the_whole_covariance(
     [
         ("{}/camera.yaml {}/camera.yaml --compare --json", 0, '"largest_px": '),
         ("{}/camera.yaml {}/camera.yaml --compare", 0, "bottom right"),
+        ("{}/camera.yaml {}/camera.yaml --compare", 0, "100 % of the image compared."),
         ("{}/camera.yaml --compare", 2, "needed legcal camera A B --compare"),
         ("{}/camera.yaml --to opencv -o {}/opencv.yml", 0, "files of opencv do not hold it"),
         ("{}/camera.yaml --to ros -o {}/ros.yaml", 0, "written: "),

@@ -10,6 +10,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from legcal.calibration.camera_calibration.projection import compare_cameras
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.geometry.lines import distance_to_line, moment
 from legcal.geometry.types import Array
@@ -419,6 +420,20 @@ def test_kalibr_files_are_read(
 ) -> None:
     path = write(tmp_path, kalibr(distortion_model=name, distortion_coeffs=written))
     assert_camera(read_camera(path), model, D, skew=0.0)
+
+
+@pytest.mark.parametrize(("k1", "part"), [(0.0, 1.0), (-0.9, 0.855), (-3.0, 0.0)])
+def test_the_compared_part_of_the_image_is_said_and_one_below_half_refused(
+    k1: float, part: float
+) -> None:
+    folded = Camera(STRAIGHT, *SIZE, np.array([k1, 0.0, 0.0, 0.0]))
+    if part == 0.0:
+        with pytest.raises(UsageError, match="% of the image that the lens model"):
+            compare_cameras(folded, PLAIN)
+        return
+    comparison = compare_cameras(folded, PLAIN)
+    assert comparison.reached == comparison.document()["reached"] == pytest.approx(part, abs=0.01)
+    assert (comparison.reached < 1.0) == (k1 < 0.0)
 
 
 # A cylinder in the camera frame.

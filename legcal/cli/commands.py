@@ -84,7 +84,8 @@ def camera(
     from legcal.vision.camera_file import read_camera
 
     if compare:
-        if len(images) != 2 or board is not None or output is not None:
+        others = board, output, model, picture, to
+        if len(images) != 2 or any(other is not None for other in others):
             raise UsageError(
                 "The cameras could not be compared: found other arguments than two camera files, "
                 "needed legcal camera A B --compare; leave out the others."
