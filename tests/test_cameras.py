@@ -307,6 +307,8 @@ def echoed(*messages: dict[str, Any]) -> str:
         (echoed(MESSAGE | {"K": K.ravel().tolist(), "D": PLUMB_BOB}), "plumb_bob", PLUMB_BOB, 2.5),
         (MRCAL.format("LENSMODEL_OPENCV8", FOUR + RATIONAL), "rational_polynomial", RATIONAL, 0.0),
         (MRCAL.format("LENSMODEL_OPENCV12", FOUR + PRISM), "thin_prism", PRISM, 0.0),
+        (MRCAL.replace("lensmodel", "lens_model").format("LENSMODEL_OPENCV8", FOUR + RATIONAL),
+         "rational_polynomial", RATIONAL, 0.0),
         (MRCAL.format("LENSMODEL_PINHOLE", FOUR), "plumb_bob", [0.0] * 5, 0.0),
         (f"# Camera list\n1 OPENCV_FISHEYE 1024 768 {AT_CORNER} 0.03 -0.01 0.004 -0.002\n",
          "equidistant", FISHEYE, 0.0),
@@ -410,6 +412,7 @@ def test_the_covariance_of_a_converted_camera_is_kept_where_it_can_be(tmp_path: 
     [
         ("radtan", "plumb_bob", PLUMB_BOB[:4], PLUMB_BOB[:4]),
         ("equidistant", "equidistant", FISHEYE, FISHEYE),
+        ("equi", "equidistant", FISHEYE, FISHEYE),
         ("none", "plumb_bob", [], []),
         ("none", "plumb_bob", ..., []),
         ("none", "plumb_bob", [0.0] * 4, []),

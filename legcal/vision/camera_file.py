@@ -223,6 +223,7 @@ _YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
 _SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
 _LAST_SEPARATOR = re.compile(rb"(?<=\n)---\s*\Z")
 _COLMAP = re.compile(rb"(\d+)\s+([A-Z][A-Z0-9_]+)(?:\s+(.*))?")  # one line
+_OLD_LENSMODEL = "lens_model"  # the key lensmodel in older files of mrcal
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _PINHOLE = "fx fy cx cy"
 _OPENCV4, _FISHEYE = f"{_PINHOLE} k1 k2 p1 p2", f"{_PINHOLE} k1 k2 k3 k4"
@@ -280,6 +281,8 @@ def calibrated_block(path: Path) -> Mapping[str, Any] | None:
 def _document(content: bytes, path: Path) -> Mapping[str, Any]:
     """Return the mapping in a camera file of any syntax."""
     if b"LENSMODEL_" in content and (literal := _literal(content)):
+        if _OLD_LENSMODEL in literal:
+            literal.setdefault("lensmodel", literal.pop(_OLD_LENSMODEL))
         return literal
     if rows := _colmap_rows(content):
         return {"colmap": rows}
