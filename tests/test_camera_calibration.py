@@ -433,8 +433,12 @@ def test_the_file_is_a_camera_info_with_the_whole_covariance(
     [
         ("{}/camera.yaml {}/camera.yaml --compare --json", 0, '"largest_px": '),
         ("{}/camera.yaml {}/camera.yaml --compare", 0, "bottom right"),
+        ("{}/camera.yaml {}/camera.yaml --compare", 0, "100 % of the image compared."),
         ("{}/camera.yaml --compare", 2, "needed legcal camera A B --compare"),
-        ("{}/camera.yaml --to opencv -o {}/opencv.yml", 0, ""),
+        ("{}/camera.yaml --to opencv -o {}/opencv.yml", 0, "files of opencv do not hold it"),
+        ("{}/camera.yaml --to ros -o {}/ros.yaml", 0, "written: "),
+        ("{}/camera.yaml --to ros -o {}/c.yml --model plumb_bob", 2, "--model, --picture"),
+        ("{}/camera.yaml --to ros -o {}/c.yml --picture {}/c.png", 2, "--model, --picture"),
         ("{}/camera.yaml --to opencv", 2, "found no --output"),
         ("{}/camera.yaml {}/camera.yaml --to opencv -o {}/c.yml", 2, "a single camera file"),
         ("{}/b00.png -o {}/c.yml", 2, "found no --board"),

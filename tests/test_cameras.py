@@ -10,6 +10,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from legcal.calibration.camera_calibration.projection import compare_cameras
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.geometry.lines import distance_to_line, moment
 from legcal.geometry.types import Array
@@ -258,6 +259,15 @@ def test_a_named_lens_counts_in_any_file_and_four_coefficients_need_a_name(tmp_p
     assert_camera(read_camera(path), "equidistant", FISHEYE)
     write_opencv(path, PLUMB_BOB[:4], fisheye_model=0)
     assert_camera(read_camera(path), "plumb_bob", PLUMB_BOB[:4])
+    write_opencv(path, FISHEYE, camera_model="fisheye")
+    assert_camera(read_camera(path), "equidistant", FISHEYE)
+    for D, more, found in (
+        (PLUMB_BOB, {"camera_model": "fisheye"}, "found 5 coefficients, needed 4 for equidistant"),
+        (PLUMB_BOB, {"camera_model": "omnidir"}, "camera_model could not be used: found 'omnidir'"),
+        (FISHEYE, {"camera_model": "fisheye", "fisheye_model": 0}, "beside the distortion 'plumb"),
+    ):
+        with pytest.raises(DatasetError, match=found):
+            read_camera(write_opencv(path, D, **more))
     kept = write_opencv(tmp_path / "four.yaml", FISHEYE)
     for four in (kept, write(tmp_path, ros(distortion_model=..., D=FISHEYE))):
         with pytest.raises(DatasetError, match="four coefficients without a lens model"):
@@ -271,6 +281,8 @@ AT_CORNER = "1290 1310 518.8 380.1"
 MATLAB = {"RadialDistortion": [-0.25, 0.08, 0.01], "TangentialDistortion": [1e-3, -8e-4]} | {
     "ImageSize": SIZE[::-1]
 }
+FULL = MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}
+ROI = {"x_offset": 0, "y_offset": 0, "width": SIZE[0], "height": SIZE[1], "do_rectify": False}
 BY_ONE = [[1290.0, 2.5, 519.3], [0.0, 1310.0, 380.6], [0.0, 0.0, 1.0]]
 
 
@@ -291,12 +303,18 @@ def echoed(*messages: dict[str, Any]) -> str:
     [
         (echoed(*2 * [MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}]), "plumb_bob",
          PLUMB_BOB, 2.5),
+        (FULL | {"binning_x": 1, "binning_y": 0, "roi": ROI}, "plumb_bob", PLUMB_BOB, 2.5),
         (echoed(MESSAGE | {"K": K.ravel().tolist(), "D": PLUMB_BOB}), "plumb_bob", PLUMB_BOB, 2.5),
         (MRCAL.format("LENSMODEL_OPENCV8", FOUR + RATIONAL), "rational_polynomial", RATIONAL, 0.0),
         (MRCAL.format("LENSMODEL_OPENCV12", FOUR + PRISM), "thin_prism", PRISM, 0.0),
+        (MRCAL.replace("lensmodel", "lens_model").format("LENSMODEL_OPENCV8", FOUR + RATIONAL),
+         "rational_polynomial", RATIONAL, 0.0),
         (MRCAL.format("LENSMODEL_PINHOLE", FOUR), "plumb_bob", [0.0] * 5, 0.0),
         (f"# Camera list\n1 OPENCV_FISHEYE 1024 768 {AT_CORNER} 0.03 -0.01 0.004 -0.002\n",
          "equidistant", FISHEYE, 0.0),
+        (f"# Camera list\r\n\r\n1 PINHOLE 1024 768 {AT_CORNER}\r\n".encode(), "plumb_bob",
+         [0.0] * 5, 0.0),
+        (yaml.safe_dump(ros()) + "note: |\n  1 AB 3 4\n", "plumb_bob", PLUMB_BOB, 2.5),
         (f"3 OPENCV 1024 768 {AT_CORNER} -0.25 0.08 0.001 -0.0008\n", "plumb_bob",
          [*PLUMB_BOB[:4], 0.0], 0.0),
         (basalt("kb4", dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True))), "equidistant",
@@ -324,10 +342,19 @@ def test_files_of_other_programs_are_read(
         (basalt("ds", {}), ("'ds'", "kb4")),
         (f"1 FOV 1024 768 {AT_CORNER} 0.9\n", ("'FOV'", "OPENCV_FISHEYE")),
         (f"1 PINHOLE 1024 768 {AT_CORNER}\n2 PINHOLE 1024 768 {AT_CORNER}\n", ("2 cameras",)),
+        ("1 PINHOLE 1024\n", ("camera 1 could not be read", "'1024'", "width and height")),
+        ("1 PINHOLE 1024 768 1.2.3 1 5 5\n", ("'1.2.3'", "parameters of PINHOLE")),
+        (f"1 PINHOLE 1024 - {AT_CORNER}\n", ("'-'", "COLMAP's cameras.txt")),
+        (f"1 PINHOLE 1e400 768 {AT_CORNER}\n", ("'1e400'", "COLMAP's cameras.txt")),
+        *((MATLAB | {key: rows}, (f"{key} could not be used", "three rows of three numbers"))
+          for key in ("K", "IntrinsicMatrix")
+          for rows in (5, [1, 2, 3], [[1.0, 0.0, 0.0], [0.0, 1.0], [1.0]], 3 * [[1.0, 2.0]])),
         (kalibr(camera_model="omni", intrinsics=[0.8, *FOUR]), ("'omni'", "pinhole-radtan")),
         (kalibr(distortion_model="fov", distortion_coeffs=[0.9]), ("'fov'", "equidistant")),
         (ros(distortion_model="plumb_bob", D=RATIONAL), ("8 coefficients", "name the lens")),
         (ros(distortion_model="rational_polynomial", D=[*PRISM, 0.1, 0.0]), ("tilt",)),
+        (FULL | {"binning_x": 2}, ("binning_x", "found 2", "0 or 1")),
+        (FULL | {"roi": ROI | {"y_offset": 8, "height": 760}}, ("roi", "1024 x 760 px at (0, 8)")),
         (echoed(MESSAGE | {"k": K.ravel().tolist(), "d": FISHEYE},
                 MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}), ("different cameras",)),
     ],
@@ -368,11 +395,24 @@ def test_cameras_are_written_for_other_programs(
         np.testing.assert_array_equal(camera.distortion[: len(D)], D)
 
 
+def test_the_covariance_of_a_converted_camera_is_kept_where_it_can_be(tmp_path: Path) -> None:
+    block = {"version": 1, "sigma": {"fx": 2.0}, "names": ["fx"], "covariance": [[4.0]]}
+    source = write(tmp_path, camera_info(PLAIN, "any", {"legcal_camera": block}))
+    assert len(convert_camera(source, "ros", tmp_path / "ros.yaml")) == 1
+    assert yaml.safe_load((tmp_path / "ros.yaml").read_text())["legcal_camera"] == block
+    covariance = read_camera(tmp_path / "ros.yaml").covariance
+    assert covariance is not None
+    assert covariance[0, 0] == 4.0
+    _, note = convert_camera(source, "mrcal", tmp_path / "mrcal.txt")
+    assert "files of mrcal do not hold it" in note
+
+
 @pytest.mark.parametrize(
     ("name", "model", "written", "D"),
     [
         ("radtan", "plumb_bob", PLUMB_BOB[:4], PLUMB_BOB[:4]),
         ("equidistant", "equidistant", FISHEYE, FISHEYE),
+        ("equi", "equidistant", FISHEYE, FISHEYE),
         ("none", "plumb_bob", [], []),
         ("none", "plumb_bob", ..., []),
         ("none", "plumb_bob", [0.0] * 4, []),
@@ -383,6 +423,20 @@ def test_kalibr_files_are_read(
 ) -> None:
     path = write(tmp_path, kalibr(distortion_model=name, distortion_coeffs=written))
     assert_camera(read_camera(path), model, D, skew=0.0)
+
+
+@pytest.mark.parametrize(("k1", "part"), [(0.0, 1.0), (-0.9, 0.855), (-3.0, 0.0)])
+def test_the_compared_part_of_the_image_is_said_and_one_below_half_refused(
+    k1: float, part: float
+) -> None:
+    folded = Camera(STRAIGHT, *SIZE, np.array([k1, 0.0, 0.0, 0.0]))
+    if part == 0.0:
+        with pytest.raises(UsageError, match="% of the image that the lens model"):
+            compare_cameras(folded, PLAIN)
+        return
+    comparison = compare_cameras(folded, PLAIN)
+    assert comparison.reached == comparison.document()["reached"] == pytest.approx(part, abs=0.01)
+    assert (comparison.reached < 1.0) == (k1 < 0.0)
 
 
 # A cylinder in the camera frame.

@@ -19,6 +19,7 @@ from legcal.cli.options import (
     WorkersOption,
     check_page,
     image_workers,
+    print_table,
     show,
     write_page,
 )
@@ -73,14 +74,18 @@ def camera(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
+    from rich.text import Text
+
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.calibration.camera_calibration.projection import compare_cameras
     from legcal.report.images import camera_table, comparison_table
+    from legcal.report.render import report
     from legcal.vision.camera_export import convert_camera
     from legcal.vision.camera_file import read_camera
 
     if compare:
-        if len(images) != 2 or board is not None or output is not None:
+        others = board, output, model, picture, to
+        if len(images) != 2 or any(other is not None for other in others):
             raise UsageError(
                 "The cameras could not be compared: found other arguments than two camera files, "
                 "needed legcal camera A B --compare; leave out the others."
@@ -94,12 +99,15 @@ def camera(
             "camera_info.yaml."
         )
     if to is not None:
-        if len(images) != 1 or board is not None or as_json:
+        calibrating = board is not None or model is not None or picture is not None
+        if len(images) != 1 or calibrating or as_json:
             raise UsageError(
-                "The camera could not be converted: found photographs, --board or --json with "
-                "--to, needed a single camera file; calibrate first, and convert the result."
+                "The camera could not be converted: found photographs, --board, --model, --picture "
+                "or --json with --to, needed a single camera file; calibrate first, and convert "
+                "the result."
             )
-        convert_camera(Path(images[0]), to, output)
+        lines = convert_camera(Path(images[0]), to, output)
+        print_table(report([Text(line, overflow="fold") for line in lines]))
         return
     if board is None:
         raise UsageError(

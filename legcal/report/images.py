@@ -76,13 +76,17 @@ def comparison_table(comparison: CameraComparison) -> Report:
             rms = [f"{np.sqrt(np.mean(length[inside] ** 2)):.3f} px" for length in lengths]
             rows.append((name, *rms, *[""] * (2 - len(rms))))
     u, v = pixels[worst]
+    compared = f"{100.0 * comparison.reached:.3g} % of the image compared"
+    if comparison.reached < 1.0:
+        compared += ", as the lens model of the first camera does not reach the rest"
     return report(
         heading("difference", f": {np.sqrt(np.mean(px**2)):.3f} px (rms) over the image"),
         table("part of the image", ">difference", ">sigma", rows=rows),
         [
             f"At most {px[worst]:.3f} px, at ({u:.0f}, {v:.0f}); {1e3 * comparison.off.max():.2g} "
             f"mm at 1 m. A turn of {np.degrees(comparison.turn):.3f} deg is taken out, as the pose "
-            "of a camera takes it up."
+            "of a camera takes it up.",
+            f"{compared}.",
         ],
     )
 

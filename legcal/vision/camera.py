@@ -101,7 +101,12 @@ DISTORTION_MODELS: Mapping[DistortionModel, Distortion] = {
         *_POLYNOMIAL,
     ),
     "equidistant": Distortion(
-        ("k1", "k2", "k3", "k4"), (4,), 100.0, *_FISHEYE, aliases=("fisheye",), is_fisheye=True
+        ("k1", "k2", "k3", "k4"),
+        (4,),
+        100.0,
+        *_FISHEYE,
+        aliases=("fisheye", "equi"),
+        is_fisheye=True,
     ),
 }
 

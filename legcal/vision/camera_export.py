@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +13,13 @@ import yaml
 from legcal.errors import UsageError
 from legcal.files.folder import OutputFile
 from legcal.vision.camera import Camera
-from legcal.vision.camera_file import PARAMETERS, camera_info, read_camera
+from legcal.vision.camera_file import (
+    CALIBRATED,
+    PARAMETERS,
+    calibrated_block,
+    camera_info,
+    read_camera,
+)
 from legcal.vision.distortion import CameraProgram
 
 _MARK = "# camera converted by legcal\n"
@@ -20,8 +28,10 @@ CONVERTED = OutputFile(
 )
 
 
-def convert_camera(path: Path, program: CameraProgram, output: Path) -> None:
-    """Write a camera file in the form of a program; its covariance is left out.
+def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str]:
+    """Write a camera file in the form of a program; return lines that say what was done.
+
+    The covariance of a camera that legcal calibrated is kept for ros, which alone can hold it.
 
     Raises
     ------
@@ -31,17 +41,28 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> None:
         If the program has no such lens, or if another file stands there.
     """
     CONVERTED.check_place(output)
-    text = camera_text(read_camera(path), program, output.stem)
+    camera, block = read_camera(path), calibrated_block(path)
+    more = {CALIBRATED: block} if block and program == "ros" else None
+    text = camera_text(camera, program, output.stem, more)
     CONVERTED.write(output, text.replace("\n", f"\n{_MARK}", 1))
+    lines = [f"written: {output}"]
+    if block and not more:
+        lines.append(
+            f"The covariance of the camera is left out, as files of {program} do not hold it; a "
+            f"session that is to use it needs {path}."
+        )
+    return lines
 
 
-def camera_text(camera: Camera, program: CameraProgram, name: str) -> str:
-    """Return the text of a camera file in the form of a program.
+def camera_text(
+    camera: Camera, program: CameraProgram, name: str, more: Mapping[str, Any] | None = None
+) -> str:
+    """Return the text of a camera file in the form of a program; only ros has more entries.
 
     Raises UsageError if the program has no such lens.
     """
     if program == "ros":
-        return camera_info(camera, name)
+        return camera_info(camera, name, more)
     D = camera.distortion.tolist()
     if camera.K[0, 1] != 0.0:
         raise _no_such_lens(camera, program, "a camera without skew")

@@ -5,6 +5,7 @@ numbers of a camera in one row.
 """
 
 import ast
+import codecs
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -122,6 +123,15 @@ class RosEntry(_OpenSchema):
     legcal_camera: CalibratedEntry | None = None
 
 
+class RoiEntry(_OpenSchema):
+    """The part of the sensor in the images of a ROS message; all zeros are the full image."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
 class MessageEntry(_OpenSchema):
     """A ROS message of a camera, as ``ros2 topic echo`` prints it."""
 
@@ -130,6 +140,9 @@ class MessageEntry(_OpenSchema):
     distortion_model: LensName
     d: list[float]
     k: Annotated[list[float], Field(min_length=9, max_length=9)]
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: RoiEntry = Field(default_factory=RoiEntry)
 
 
 class KalibrEntry(_OpenSchema):
@@ -163,13 +176,37 @@ class BasaltEntry(_OpenSchema):
     resolution: Annotated[list[Size], Field(min_length=1)]
 
 
-class MatlabEntry(_OpenSchema):
-    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+def _as_3x3(rows: object) -> object:
+    """Refuse what is not three rows of three entries."""
+    lists = rows if isinstance(rows, list) else []
+    if [len(row) if isinstance(row, list) else 0 for row in lists] != [3, 3, 3]:
+        raise BadValue(
+            describe(rows), "three rows of three numbers", "copy the matrix from the calibration"
+        )
+    return rows
 
-    K: Annotated[list[list[float]], Field(min_length=3, max_length=3)]
+
+_Rows = Annotated[list[list[float]], BeforeValidator(_as_3x3)]
+
+
+class _MatlabLens(_OpenSchema):
+    """The image and the lens in the struct of MATLAB's camera parameters."""
+
     ImageSize: Size  # rows, columns
     RadialDistortion: Annotated[list[float], Field(min_length=2, max_length=3)]
     TangentialDistortion: Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class MatlabEntry(_MatlabLens):
+    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+
+    K: _Rows
+
+
+class OldMatlabEntry(_MatlabLens):
+    """The struct of MATLAB before R2022b: with the transpose of K."""
+
+    IntrinsicMatrix: _Rows
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
@@ -180,11 +217,14 @@ _OPENCV_KEYS = {
     "distortion_model": ("distortion_model",),
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
     "fisheye_model": ("fisheye_model",),
+    "camera_model": ("camera_model", "Camera_Model", "cameraModel"),
 }
 _YAML_HEADER = re.compile(rb"\A\s*%YAML[^\n]*\n")
 _SEPARATOR = re.compile(rb"^---[^\n]*$", re.MULTILINE)  # of messages
 _LAST_SEPARATOR = re.compile(rb"(?<=\n)---\s*\Z")
-_COLMAP = re.compile(rb"^[ \t]*(\d+)[ \t]+([A-Z][A-Z_]+)[ \t]+([\d.eE+\- \t]+)$", re.MULTILINE)
+_COLMAP = re.compile(rb"(\d+)\s+([A-Z][A-Z0-9_]+)(?:\s+(.*))?")  # one line
+_OLD_LENSMODEL = "lens_model"  # the key lensmodel in older files of mrcal
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _PINHOLE = "fx fy cx cy"
 _OPENCV4, _FISHEYE = f"{_PINHOLE} k1 k2 p1 p2", f"{_PINHOLE} k1 k2 k3 k4"
 PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
@@ -232,11 +272,19 @@ def read_camera(path: Path) -> Camera:
     )
 
 
+def calibrated_block(path: Path) -> Mapping[str, Any] | None:
+    """Return what legcal adds to a camera that it calibrated, as it stands in a camera file."""
+    block = _document(content_of(path, "camera file"), path).get(CALIBRATED)
+    return block if isinstance(block, dict) else None
+
+
 def _document(content: bytes, path: Path) -> Mapping[str, Any]:
     """Return the mapping in a camera file of any syntax."""
     if b"LENSMODEL_" in content and (literal := _literal(content)):
+        if _OLD_LENSMODEL in literal:
+            literal.setdefault("lensmodel", literal.pop(_OLD_LENSMODEL))
         return literal
-    if rows := _COLMAP.findall(content):
+    if rows := _colmap_rows(content):
         return {"colmap": rows}
     bare = _YAML_HEADER.sub(b"", content)
     if _OPENCV_MARKS.search(content):
@@ -258,6 +306,19 @@ def _document(content: bytes, path: Path) -> Mapping[str, Any]:
             "needed one camera; copy one message into a file of its own."
         )
     return first
+
+
+def _colmap_rows(content: bytes) -> list[tuple[str, str, str]]:
+    """Return number, lens and the rest of the lines of a cameras.txt; none of another file."""
+    lines = [line.strip() for line in content.removeprefix(codecs.BOM_UTF8).splitlines()]
+    rows = [_COLMAP.fullmatch(line) for line in lines if line and not line.startswith(b"#")]
+    found = [row.groups(default=b"") for row in rows if row]
+    if len(found) < len(rows):
+        return []
+    return [
+        (number.decode(), lens.decode(), rest.decode(errors="replace"))
+        for number, lens, rest in found
+    ]
 
 
 def _literal(content: bytes) -> dict[str, Any]:
@@ -364,6 +425,25 @@ def _from_message(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of a ROS message; ROS 1 has capital letters."""
     small = {"d": document.get("D", []), "k": document.get("K"), "distortion_model": ""}
     entry = validate(MessageEntry, {**small, **document}, path)
+    part = entry.roi
+    problems = [
+        f"{path}: {key} could not be used: found {binning}, needed 0 or 1, as k is for images that "
+        "are not binned; calibrate the camera at the size of the images."
+        for key, binning in (("binning_x", entry.binning_x), ("binning_y", entry.binning_y))
+        if binning not in (0, 1)
+    ]
+    if (
+        (part.x_offset, part.y_offset) != (0, 0)
+        or part.width not in (0, entry.width)
+        or part.height not in (0, entry.height)
+    ):
+        problems.append(
+            f"{path}: roi could not be used: found {part.width} x {part.height} px at "
+            f"({part.x_offset}, {part.y_offset}), needed the full image of {entry.width} x "
+            f"{entry.height} px; calibrate the camera at the size of the images."
+        )
+    if problems:
+        raise DatasetError(problems)
     K = np.reshape(entry.k, (3, 3))
     return _checked(path, K, (entry.width, entry.height), entry.distortion_model, entry.d)
 
@@ -414,13 +494,21 @@ def _from_mrcal(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _from_colmap(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the only camera of a cameras.txt of COLMAP: the corner of the image is its origin."""
-    rows = [[part.decode() for part in row] for row in document["colmap"]]
+    rows = document["colmap"]
     _only([f"camera {number}" for number, _, _ in rows], path)
-    _, lens, numbers = rows[0]
-    width, height, *parameters = (float(number) for number in numbers.split())
-    return _of_parameters(
-        path, "COLMAP", lens, parameters, (int(width), int(height)), first_pixel=0.5
-    )
+    number, lens, listed = rows[0]
+    words = listed.split()
+    values = [float(word) if _NUMBER.fullmatch(word) else np.nan for word in words]
+    size = [int(value) for value in values[:2] if value > 0.0 and value.is_integer()]
+    wrong = [word for word, value in zip(words, values, strict=True) if not np.isfinite(value)]
+    if len(size) < 2 or wrong:
+        found = wrong[0] if wrong else " ".join(words[:2])
+        raise DatasetError(
+            f"{path}: camera {number} could not be read: found {describe(found)}, needed the "
+            f"width and height of the image [px] and the parameters of {lens}; copy the line from "
+            "COLMAP's cameras.txt."
+        )
+    return _of_parameters(path, "COLMAP", lens, values[2:], (size[0], size[1]), first_pixel=0.5)
 
 
 def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
@@ -435,10 +523,14 @@ def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of MATLAB's struct: its first pixel is (1, 1)."""
-    transposed = document.get("IntrinsicMatrix")
-    by_rows = [list(row) for row in zip(*transposed, strict=True)] if transposed else None
-    entry = validate(MatlabEntry, {"K": by_rows, **document}, path)
-    K = np.array(entry.K) - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    entry: MatlabEntry | OldMatlabEntry
+    if "K" not in document and "IntrinsicMatrix" in document:
+        entry = validate(OldMatlabEntry, document, path)
+        by_rows = np.transpose(entry.IntrinsicMatrix)
+    else:
+        entry = validate(MatlabEntry, document, path)
+        by_rows = np.array(entry.K)
+    K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     height, width = entry.ImageSize
     k1, k2, *k3 = entry.RadialDistortion
     coefficients = [k1, k2, *entry.TangentialDistortion, *(k3 or [0.0])]
@@ -488,14 +580,7 @@ def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
                 if node is not None
             }
             document = {name: _node_value(node) for name, node in nodes.items()}
-            fisheye, D = (
-                document.pop("fisheye_model", None),
-                document.get("distortion_coefficients"),
-            )
-            if fisheye is not None and isinstance(D, dict):
-                lens = "equidistant" if fisheye else _counted(D["data"])
-                document.setdefault("distortion_model", lens)
-            return document
+            return _with_lens(document, path)
     except UnicodeDecodeError:
         reason = "bytes that are not UTF-8 text"
     except (cv2.error, SystemError):
@@ -503,6 +588,33 @@ def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
     raise DatasetError(
         f"{path}: the camera file could not be read: found {reason}, needed an OpenCV FileStorage "
         "in YAML, XML or JSON; write it again with cv2.FileStorage."
+    )
+
+
+def _with_lens(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the entries of a storage with the lens that its other keys name as its distortion."""
+    fisheye, camera = (document.pop(key, None) for key in ("fisheye_model", "camera_model"))
+    D = document.get("distortion_coefficients")
+    if fisheye is not None and isinstance(D, dict):
+        lens = "equidistant" if fisheye else _counted(D["data"])
+        document.setdefault("distortion_model", lens)
+    name = str(camera or "pinhole").lower()
+    if name == "pinhole":  # with any distortion
+        return document
+    start = f"{path}: camera_model could not be used: found {describe(camera)}"
+    for model, kind in DISTORTION_MODELS.items():
+        names = (model, *kind.aliases)
+        if name not in names:
+            continue
+        if (stated := document.setdefault("distortion_model", model)) not in names:
+            raise DatasetError(
+                f"{start} beside the distortion {describe(stated)}, needed one lens model; correct "
+                "the one that is wrong."
+            )
+        return document
+    raise DatasetError(
+        f"{start}, needed pinhole or a lens that legcal reads ({', '.join(DISTORTION_MODELS)}); "
+        f"{_CALIBRATE}."
     )
 
 

@@ -19,6 +19,7 @@ from legcal.vision.camera import Camera, intrinsic_names, project_with_derivativ
 
 GRID = 17, 13  # places along both sides of the image
 _TURNS = 10  # Gauss-Newton steps of the turn between two cameras
+_LEAST_REACHED = 0.5  # of the image, for a comparison of cameras
 _FOLDED_PX = 0.1  # error of undistortion at a pixel that the lens model does not reach
 
 
@@ -85,6 +86,8 @@ class CameraComparison:
         Standard deviation of the difference by the covariances of both; None without these.
     turn : float
         Angle of the turn [rad].
+    reached : float
+        Part of the image that is compared: of the rest the first camera has no rays.
     """
 
     pixels: Array
@@ -92,6 +95,7 @@ class CameraComparison:
     off: Array
     sigma_px: Array | None
     turn: float
+    reached: float
 
     @property
     def px(self) -> Array:
@@ -107,6 +111,7 @@ class CameraComparison:
             largest_px=float(self.px.max()),
             largest_mm_per_m=float(1e3 * self.off.max()),
             turn_rad=self.turn,
+            reached=self.reached,
             places=[
                 ComparedPlace(u=u, v=v, du=du, dv=dv, sigma_px=sigma)
                 for (u, v), (du, dv), sigma in zip(
@@ -139,13 +144,15 @@ class CameraComparisonDocument(Document):
     largest_px: float
     largest_mm_per_m: float
     turn_rad: float
+    reached: float
     places: list[ComparedPlace]
 
 
 def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
     """Compare two calibrations of one camera over the image.
 
-    Raises UsageError if their images differ in size.
+    Raises UsageError if their images differ in size, or if the lens of the first folds back before
+    half of the image.
     """
     sizes = [f"{camera.width} x {camera.height} px" for camera in (first, second)]
     if sizes[0] != sizes[1]:
@@ -155,6 +162,13 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
         )
     pixels = grid(first)
     rays, reached = _rays(first, pixels)
+    share = float(np.mean(reached))
+    if share < _LEAST_REACHED:
+        raise UsageError(
+            f"The cameras could not be compared: found {100.0 * share:.0f} % of the image that the "
+            f"lens model of the first one reaches, needed {100.0 * _LEAST_REACHED:.0f} %; name the "
+            "other camera first, or calibrate with corners all over the image."
+        )
     pixels, rays = pixels[reached], rays[reached]
     sigma_px = None
     if first.covariance is not None and second.covariance is not None:
@@ -171,4 +185,4 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
     by_xy = first.pixels_per_unit(rays[:, :2])
     beside = np.linalg.norm(np.linalg.solve(by_xy, off_px[..., None])[..., 0], axis=1)
     off = beside / np.linalg.norm(rays, axis=1)
-    return CameraComparison(pixels, off_px, off, sigma_px, turn.magnitude())
+    return CameraComparison(pixels, off_px, off, sigma_px, turn.magnitude(), share)
