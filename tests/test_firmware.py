@@ -110,6 +110,13 @@ HOME_OFFSET = -31
 [JOINT_2]
 HOME_OFFSET = -29.5
 """
+DUET_AS_MARLIN = """
+M555 P2 ; set output to look like Marlin
+M569 P0 S1
+M584 X0 Y1 Z2
+M665 R124.3 L250.4 B85 H252.7
+M666 X-0.4 Y0 Z-0.75
+"""
 CONFIGURATIONS = {
     "klipper": KLIPPER,
     "klipper-arms": KLIPPER_ARMS,
@@ -148,6 +155,16 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> None:
+    duet, marlin = Path("config"), DUET_AS_MARLIN.partition("M665")
+    np.testing.assert_allclose(numbers_in(DUET_AS_MARLIN)[-3:], [252.3, 252.7, 251.95])
+    np.testing.assert_allclose(
+        numbers_in(f"echo:Marlin 2.1\nM665{marlin[2]}")[-3:], [253.1, 252.7, 253.45]
+    )
+    _, notes = firmware_table(duet, f"; Marlin\nM665{marlin[2]}") or ({}, ())
+    assert "radius of the bed" in notes[0]
 
 
 DOCUMENTED = {
@@ -364,6 +381,8 @@ REFUSED = [
     (DUET, {"unit": "in"}, ("--unit in and mm", "leave out --unit")),
     (DUET_ARMS.replace("A-40:62", ""), {}, ("no A of M669", "highest angle")),
     (DUET_ARMS.replace("K10", "K4"), {}, ("K4", "K10")),
+    (DUET_AS_MARLIN.replace("M569 P0 S1", "; Marlin\nM569 P0 S1"), {}, ("both Marlin", "M584")),
+    (MARLIN.replace("B-0.3", "B80"), {}, ("B of M665", "80 mm", "12.52 mm")),
     ("M665 L250 R124 H250\nM666 X-0.5", {}, ("M666", "'; Marlin'")),
     (without(MARLIN_HEADER, "DELTA_RADIUS 1"), {}, ("no R of M665",)),
     (MARLIN_HEADER.replace("#define DELTA\n", "//#define DELTA\n"), {}, ("commented out",)),

@@ -40,6 +40,7 @@ ROD = 0.01  # typical radius of a rod, in its length
 PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers, or in arms
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
+LARGEST_TRIM = 0.05  # of a rod, in its length
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 
@@ -209,6 +210,12 @@ def _g_code(path: Path, text: str) -> Configuration | None:
     if not any(key.startswith(("M665", "M669")) for key in values):
         return None
     name = _speaker(path, text, values)
+    notes = []
+    if name == "marlin" and not {"M665 A", "M665 C"} & values.keys() and values.pop("M665 B", 0.0):
+        notes.append(
+            "B of M665 is taken for the radius of the bed, because no A or C is beside it; write "
+            "A0 and C0 beside it if it corrects a rod."
+        )
     kinematics = values.get("M669 K")
     turns = kinematics == 10.0 or (kinematics is None and "M669 U" in values)
     if kinematics not in (None, 3.0, 10.0):
@@ -228,6 +235,7 @@ def _g_code(path: Path, text: str) -> Configuration | None:
         unit,
         lowest=values.get("M669 A0"),
         printable=values.get("M669 B" if turns else "M665 B") if name != "marlin" else None,
+        notes=notes,
     )
     if not turns and name != "marlin" and (values.get("M666 A") or values.get("M666 B")):
         read.notes.append(
@@ -237,14 +245,29 @@ def _g_code(path: Path, text: str) -> Configuration | None:
     return read
 
 
+_MARLIN = re.compile(
+    r"^\s*;+\s*Marlin\b|^\s*echo:\s*;?\s*Marlin\b|FIRMWARE_NAME:\s*Marlin",
+    re.IGNORECASE | re.MULTILINE,
+)
+_DUET = re.compile(
+    r"^\s*;[^\n]*(reprap ?firmware|\bduet|\brrf)|FIRMWARE_NAME:\s*(RepRapFirmware|Duet)",
+    re.IGNORECASE | re.MULTILINE,
+)
+_DUET_CODES = re.compile(  # that Marlin does not have
+    r"^\s*(?:M(?:584|558|563|98)(?![\d.])|M569(?![\d.])[^;\n]*P\d)", re.IGNORECASE | re.MULTILINE
+)
+
+
 def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
-    """Return the firmware that reads some G-code: by its name, or by parameters of it alone."""
+    """Return the firmware that reads some G-code: by its name in a header, or by its own codes."""
+    lines = [line for line in text.splitlines() if "M555" not in line.upper()]  # looks like others
+    text = "\n".join(lines)
     ends = [values.get(f"M666 {letter}", 0.0) for letter in "XYZ"]
     lists = any(re.fullmatch(r"M66[59] [A-Z]1", key) for key in values)
     known = {
-        "marlin": bool(re.search(r"marlin", text, re.IGNORECASE))
+        "marlin": bool(_MARLIN.search(text))
         or any(key in values for key in ("M665 S", "M665 A", "M665 C")),
-        "reprapfirmware": bool(re.search(r"reprap ?firmware|\bduet|\brrf", text, re.IGNORECASE))
+        "reprapfirmware": bool(_DUET.search(text) or _DUET_CODES.search(text))
         or lists
         or any(key in values for key in ("M669 K", "M669 U", "M666 A", "M666 B"))
         or max(ends) > 0.0,
@@ -252,13 +275,19 @@ def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
     named = [name for name, is_so in known.items() if is_so]
     if len(named) == 1:
         return named[0]
-    if not any(ends):
+    if not any(ends) and not named:
         return "reprapfirmware"  # both read the rest alike
+    if named:
+        raise ModelError(
+            f"{path}: the firmware could not be told: found lines of both Marlin (its name, or A, "
+            "C or S of M665) and RepRapFirmware (its name, lists with ':', M584, M569 P, M558, "
+            "M563, M98, or M666 above zero), needed one, because they count the endstops in M666 "
+            "downwards and upwards; give the lines of the firmware in use alone."
+        )
     raise ModelError(
-        f"{path}: the endstops could not be read: found M666 lines that may be of "
-        f"{'both ' * bool(named)}Marlin {'and' if named else 'or'} RepRapFirmware, which count "
-        "them downwards and upwards, needed one of them; write the comment '; Marlin' or "
-        "'; RepRapFirmware' in the file."
+        f"{path}: the endstops could not be read: found M666 lines that may be of Marlin or "
+        "RepRapFirmware, which count them downwards and upwards, needed one of them; write the "
+        "comment '; Marlin' or '; RepRapFirmware' in a line of its own."
     )
 
 
@@ -346,6 +375,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     firmware = read.firmware
     ideal = firmware.ideal(_completed(path, read))
     _check(path, firmware, ideal, unit)
+    _check_trims(path, read, unit)
     at_stops = ideal.at_stops
     size = float(np.mean(ideal.arm if ideal.turns else ideal.radius))
     stated = effector if effector is not None else read.effector
@@ -461,6 +491,21 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             "in one unit."
         )
     if problems:
+        raise ModelError(problems)
+
+
+def _check_trims(path: Path, read: Configuration, unit: str) -> None:
+    """Refuse corrections of Marlin's rods that are none."""
+    if read.firmware.name != "marlin":
+        return
+    largest = LARGEST_TRIM * read.values["M665 L"]
+    if problems := [
+        f"{path}: the Marlin configuration could not be used: found {letter} of M665, the "
+        f"correction of a rod, of {trim:g} {unit}, needed at most {largest:.4g} {unit} (5 % of the "
+        "rod); correct it."
+        for letter in "ABC"
+        if not abs(trim := read.values.get(f"M665 {letter}", 0.0)) <= largest
+    ]:
         raise ModelError(problems)
 
 
