@@ -353,6 +353,26 @@ def test_a_rig_of_flypt_is_written_as_it_was_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(lengths, 0.86)
 
 
+RIG = "L1: 103\nL2: 9.5\nL3: 13\nL4: 110\nRange: 15\nMiddle: 86\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "metres"),
+    [
+        (RIG, None, 1e-3),
+        (RIG, "cm", 1e-2),
+        (RIG.replace("\n", " in\n"), None, 0.0254),
+        (RIG.replace(": ", " (inch): "), None, 0.0254),
+    ],
+)
+def test_lengths_of_a_rig_have_the_unit_that_is_stated(
+    text: str, unit: str | None, metres: float, tmp_path: Path
+) -> None:
+    machine = machine_of(text, tmp_path, unit=unit)
+    side = np.linalg.norm(machine.B_platform[1] - machine.B_platform[2])
+    assert side == pytest.approx(103 * metres)
+
+
 # --- mistakes -----------------------------------------------------------------------------------
 
 
@@ -397,6 +417,10 @@ REFUSED = [
     (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
     (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),
     (FLYPT.replace("<NUDMiddle>860", "<NUDMiddle>33"), {}, ("Middle 33", "all in mm")),
+    (RIG.replace("L1: 103", "L1: 1,030"), {}, ("L1 could not be read", "'1,030'", "1030 mm")),
+    (RIG.replace("L1: 103", "L1: 103 cm"), {}, ("L1 in cm", "L2 in no unit", "one unit")),
+    (RIG.replace("L1:", "L1 [ells]:"), {}, ("L1 could not be read", "'[ells] 103'")),
+    (RIG.replace(": ", " [mm]: "), {"unit": "in"}, ("--unit in and mm",)),
     ("<robot name='x'/>", {}, ("found XML", "legcal inspect")),
 ]  # fmt: skip
 

@@ -79,11 +79,11 @@ def firmware_table(
         if (read := reads(path, text)) is not None:
             unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
             return _table_of_delta(path, read, unit, effector)
-    for makes in (linuxcnc_table, flypt_table):
-        if (hexapod := makes(path, text, given)) is not None:
-            table, notes = hexapod
-            return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
-    return None
+    hexapod = linuxcnc_table(path, text, given) or flypt_table(path, text, given, unit)
+    if hexapod is None:
+        return None
+    table, notes = hexapod
+    return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
 
 
 def read_delta(path: Path, text: str) -> IdealDelta:
