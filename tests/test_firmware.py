@@ -89,6 +89,9 @@ MARLIN_HEADER = """
 #endif
 """
 LINUXCNC = """
+[TRAJ]
+LINEAR_UNITS = mm
+[HAL]
 setp lineardeltakins.R 130.25
 setp lineardeltakins.L 269.5
 [JOINT_0]
@@ -99,6 +102,9 @@ HOME_OFFSET = 413.0
 HOME_OFFSET = 411.75
 """
 LINUXCNC_ARMS = """
+[TRAJ]
+LINEAR_UNITS = mm
+[HAL]
 setp rotarydeltakins.platformradius 40.5
 setp rotarydeltakins.footradius 0
 setp rotarydeltakins.thighlength 160
@@ -413,6 +419,9 @@ REFUSED = [
     (INI.replace("inch", "cubits") + pins(), {}, ("LINEAR_UNITS = cubits",)),
     (INI.replace("inch", "mm") + pins() + "\n" + joints(380.0, (400.0, 700.0)), {},
      ("limits of 400 to 700", "one unit")),
+    (LINUXCNC.replace("= mm", "= cubits"), {}, ("LINEAR_UNITS = cubits", "mm or inch")),
+    (without(LINUXCNC, "UNITS"), {}, ("no unit", "LINEAR_UNITS", "--unit mm or in")),
+    (LINUXCNC, {"unit": "in"}, ("--unit in and mm",)),
     (LINUXCNC.partition("[JOINT_1]")[0], {}, ("no HOME_OFFSET in [JOINT_1]", "home switch")),
     (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
     (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),

@@ -26,12 +26,12 @@ from legcal.geometry.types import Array
 from legcal.machine.description_csv import MAX_NUMBER
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
 from legcal.machine.hexapod_files import (
-    LINEAR_UNITS,
     NUMBER,
     Table,
     flypt_table,
     ini_entries,
     linuxcnc_table,
+    linuxcnc_unit,
 )
 
 EFFECTOR = 0.25  # typical radius of the joints on an effector, in radii of towers, or in arms
@@ -77,7 +77,9 @@ def firmware_table(
     """
     for reads in _DELTAS:
         if (read := reads(path, text)) is not None:
-            unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
+            if read.unit is None and read.firmware.name != "linuxcnc":
+                unit = unit or "mm"
+            unit = _unit(path, read.unit, unit)
             return _table_of_delta(path, read, unit, effector)
     hexapod = linuxcnc_table(path, text, given) or flypt_table(path, text, given, unit)
     if hexapod is None:
@@ -101,7 +103,7 @@ def _unit(path: Path, stated: str | None, given: str | None) -> str:
     if stated is None and given is None:
         raise ModelError(
             f"{path}: the lengths could not be read: found no unit, needed that of the machine; "
-            "give the INI file with LINEAR_UNITS in place of the HAL file, or --unit mm or in."
+            "write [TRAJ] and LINEAR_UNITS of the INI file into it, or give --unit mm or in."
         )
     return str(stated or given)
 
@@ -304,7 +306,7 @@ def _linuxcnc(path: Path, text: str) -> Configuration | None:
     return Configuration(
         _named("linuxcnc", turns=found[0][1] == "rotary"),
         values,
-        unit=LINEAR_UNITS.get(entries.get("TRAJ.LINEAR_UNITS", "mm").lower()),
+        unit=linuxcnc_unit(path, entries),
         effector=values.get("rotarydeltakins.footradius") or None,
         lowest=-values.get("JOINT_0.MAX_LIMIT", DOWN) if found[0][1] == "rotary" else None,
     )

@@ -84,13 +84,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
             + ", needed x, y, z of six joints of base and platform; give the INI file that names "
             "the HAL file with these lines, or add them."
         )
-    unit_word = entries.get("TRAJ.LINEAR_UNITS", "").split()
-    unit = LINEAR_UNITS.get(unit_word[0].lower()) if unit_word else None
-    if unit_word and unit is None:
-        raise ModelError(
-            f"{path}: the unit could not be read: found LINEAR_UNITS = {unit_word[0]}, needed mm "
-            "or inch; correct it."
-        )
+    unit = linuxcnc_unit(path, entries)
     notes = [_UNSEEN] * ("radius" not in given)
     if numbers.get("screw-lead"):
         notes.append("The correction of screw-lead is left out: readings are lengths of struts.")
@@ -122,6 +116,18 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
         )
         notes += _set_lengths(path, table, entries, at_home, given)
     return table, tuple(notes)
+
+
+def linuxcnc_unit(path: Path, entries: Mapping[str, str]) -> str | None:
+    """Return the unit of lengths of an INI file, None where it is not stated."""
+    words = entries.get("TRAJ.LINEAR_UNITS", "").split()
+    unit = LINEAR_UNITS.get(words[0].lower()) if words else None
+    if words and unit is None:
+        raise ModelError(
+            f"{path}: the unit could not be read: found LINEAR_UNITS = {words[0]}, needed mm or "
+            "inch; correct it."
+        )
+    return unit
 
 
 def ini_entries(text: str) -> dict[str, str]:
