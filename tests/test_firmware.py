@@ -173,6 +173,10 @@ def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> Non
     assert "radius of the bed" in notes[0]
 
 
+def test_one_length_after_a_list_counts_for_all_rods() -> None:
+    assert numbers_in(f"{DUET}M665 L290\n")[6:9] == [290.0] * 3
+
+
 DOCUMENTED = {
     # angles of towers, radius, rods and the centred nozzle at each endstop, from the documentation
     "klipper": ([209.6, 330, 90.45], 168.2, [330.25, 330.75, 330.25], [301.35, 300.9, 300.6]),

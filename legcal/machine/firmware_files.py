@@ -206,6 +206,8 @@ def _g_code(path: Path, text: str) -> Configuration | None:
             rf"([A-Z])\s*({NUMBER}(?:\s*:\s*{NUMBER})*)", " ".join(words[1:])
         ):
             of_letter = [float(x) for x in numbers.split(":")]
+            stated = re.compile(rf"{words[0]} {letter}\d*")
+            values = {key: value for key, value in values.items() if not stated.fullmatch(key)}
             for i, value in enumerate(of_letter):
                 values[f"{words[0]} {letter}{i}"] = value
             values[f"{words[0]} {letter}"] = of_letter[0]
