@@ -125,6 +125,9 @@ M666 X-0.4 Y0 Z-0.75
 """
 CONFIGURATIONS = {
     "klipper": KLIPPER,
+    "klipper-clockwise": KLIPPER.replace("[stepper_c]\n", "[stepper_c]\nangle: 330\n", 1)
+    .replace("arm_length = 330.75", "arm_length = 330.75\nangle: 90.45")
+    .replace("#*# angle = 90.45\n", ""),
     "klipper-arms": KLIPPER_ARMS,
     "reprapfirmware": DUET,
     "reprapfirmware-arms": DUET_ARMS,
