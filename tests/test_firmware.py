@@ -418,6 +418,8 @@ REFUSED = [
     (MARLIN.replace("B-0.3", "B80"), {}, ("B of M665", "80 mm", "12.52 mm")),
     ("M665 L250 R124 H250\nM666 X-0.5", {}, ("M666", "'; Marlin'")),
     (without(MARLIN_HEADER, "DELTA_RADIUS 1"), {}, ("no R of M665",)),
+    (MARLIN_HEADER.replace("#endif", "#else\n#define DELTA_HEIGHT 300\n#endif"), {},
+     ("'DELTA_HEIGHT 252.7' in line 6", "'DELTA_HEIGHT 300' in line 13", "one value")),
     (MARLIN_HEADER.replace("#define DELTA\n", "//#define DELTA\n"), {}, ("commented out",)),
     (without(INI, "HALFILE") + joints(), {}, ("genhexkins.base.0.x' and 35 more", "HAL file")),
     (pins(), {"height": 20.0}, ("no unit", "--unit mm or in")),

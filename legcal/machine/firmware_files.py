@@ -166,14 +166,27 @@ _DEFINES = {
 
 def _marlin_header(path: Path, text: str) -> Configuration | None:
     """Return the numbers of the #define lines of a Configuration.h."""
-    values = dict[str, float]()
-    plain = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
-    for name, rest in re.findall(r"^\s*#\s*define\s+(\w+)[ \t]+([^\n]*)", plain, re.MULTILINE):
-        keys = _DEFINES.get(name.removeprefix("DEFAULT_"), ())
-        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", rest)
-        if numbers:
-            of_name = map(float, re.findall(NUMBER, numbers[1]))
-            values |= dict(zip(keys, of_name, strict=False))
+    values, before = dict[str, float](), dict[str, tuple[object, str]]()
+    plain = re.sub(
+        r"/\*.*?\*/|//[^\n]*", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.DOTALL
+    )
+    for i, line in enumerate(plain.splitlines(), start=1):
+        match = re.match(r"\s*#\s*define\s+(\w+)\s+(.*)", line)
+        name = match[1].removeprefix("DEFAULT_") if match else ""
+        if match is None or name not in _DEFINES:
+            continue
+        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", match[2])
+        of_name = [float(x) for x in re.findall(NUMBER, numbers[1])] if numbers else []
+        of_line = dict(zip(_DEFINES[name], of_name, strict=False))
+        shown = f"'{match[1]} {match[2].strip()}' in line {i}"
+        for key, value in {name: of_name or match[2].split(), **of_line}.items():
+            one, there = before.setdefault(key, (value, shown))
+            if one != value:
+                raise ModelError(
+                    f"{path}: the Marlin configuration could not be read: found {there} and "
+                    f"{shown}, needed one value; put // before the line that is not in use."
+                )
+        values |= of_line
     if not re.search(r"^\s*#\s*define\s+(DEFAULT_)?DELTA_\w", plain, re.MULTILINE):
         return None
     switch = re.compile(r"^\s*(//)?\s*#\s*define\s+DELTA\s*$", re.MULTILINE)
