@@ -54,7 +54,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     if not re.search(r"^\s*#?\s*\[(KINS|TRAJ|JOINT_\d)\]|^\s*setp\s+genhex", text, re.MULTILINE):
         return None
     entries = ini_entries(text)
-    kinematics = entries.get("KINS.KINEMATICS", "genhexkins").split()[0]
+    kinematics = next(iter(entries.get("KINS.KINEMATICS", "genhexkins").split()), "nothing")
     if kinematics != "genhexkins":
         raise ModelError(
             f"{path}: the LinuxCNC configuration could not be used: found KINEMATICS = "
@@ -159,7 +159,14 @@ def _set_lengths(
         ]
         for key in ("HOME_OFFSET", "MIN_LIMIT", "MAX_LIMIT")
     }
-    if len(stated["HOME_OFFSET"]) == STRUTS:
+    has_offsets = any(f"JOINT_{j}.HOME_OFFSET" in entries for j in range(STRUTS))
+    if has_offsets and len(stated["HOME_OFFSET"]) < STRUTS:
+        raise ModelError(
+            f"{path}: the struts could not be used: found a HOME_OFFSET of "
+            f"{len(stated['HOME_OFFSET'])} joints, needed a number in each of [JOINT_0] to "
+            f"[JOINT_{STRUTS - 1}]; write the others, or leave out all."
+        )
+    if has_offsets:
         table["offsets"] = stated["HOME_OFFSET"]
     unit = table.get("unit", "machine units")
     limits = [np.array(stated[key]) for key in ("MIN_LIMIT", "MAX_LIMIT")]
