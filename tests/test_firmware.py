@@ -125,6 +125,7 @@ M666 X-0.4 Y0 Z-0.75
 """
 CONFIGURATIONS = {
     "klipper": KLIPPER,
+    "klipper-capitals": KLIPPER.replace("arm_length", "Arm_Length").replace("delta_r", "Delta_R"),
     "klipper-clockwise": KLIPPER.replace("[stepper_c]\n", "[stepper_c]\nangle: 330\n", 1)
     .replace("arm_length = 330.75", "arm_length = 330.75\nangle: 90.45")
     .replace("#*# angle = 90.45\n", ""),
@@ -174,6 +175,10 @@ def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> Non
     )
     _, notes = firmware_table(duet, f"; Marlin\nM665{marlin[2]}") or ({}, ())
     assert "radius of the bed" in notes[0]
+
+
+def test_a_byte_order_mark_is_no_part_of_a_configuration(tmp_path: Path) -> None:
+    assert machine_of("\ufeff" + KLIPPER.lstrip(), tmp_path).n_legs == 6
 
 
 def test_one_length_after_a_list_counts_for_all_rods() -> None:
@@ -399,6 +404,8 @@ REFUSED = [
     (without(KLIPPER, "arm_length: 330"), {}, ("no arm_length in [stepper_a]", "rods")),
     (without(KLIPPER, "delta_radius"), {}, ("no delta_radius in [printer]", "carriage")),
     (without(KLIPPER_ARMS, "shoulder_height"), {}, ("no shoulder_height in [printer]",)),
+    (f"[include delta.cfg]\n{without(KLIPPER, 'delta_radius')}", {},
+     ("no delta_radius in [printer]", "[include delta.cfg] is not followed: give its sections")),
     (without(KLIPPER, "kinematics"), {}, ("kinematics nowhere", "section [printer]")),
     (KLIPPER.replace("delta\n", "corexy\n"), {}, ("corexy", "delta or rotary_delta")),
     (KLIPPER.replace("330.25", "long"), {}, ("arm_length in [stepper_a]", "'long'")),

@@ -113,13 +113,14 @@ def _unit(path: Path, stated: str | None, given: str | None) -> str:
 
 def _klipper(path: Path, text: str) -> Configuration | None:
     """Return the numbers of a printer.cfg; those of its SAVE_CONFIG block count."""
-    section, values, words = "", dict[str, float](), dict[str, str]()
+    section, values, words, includes = "", dict[str, float](), dict[str, str](), list[str]()
     for line in text.splitlines():
         line = re.split(r"[#;]", line.removeprefix("#*#"), maxsplit=1)[0].strip()
         if match := re.fullmatch(r"\[(.+)\]", line):
             section = match[1].strip()
+            includes += [f"[{section}]"] * section.startswith("include ")
         elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
-            key = f"{section}.{match[1]}"
+            key = f"{section}.{match[1].lower()}"
             words[key] = match[2]
             if re.fullmatch(NUMBER, match[2]):
                 values[key] = float(match[2])
@@ -127,12 +128,14 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 values.pop(key, None)
     if not any(key.startswith(("printer.", "stepper_a.")) for key in words):
         return None
+    left_out = [f"{', '.join(includes)} is not followed: give its sections."] if includes else []
     kinematics = words.get("printer.kinematics")
     if kinematics not in ("delta", "rotary_delta"):
         raise ModelError(
             f"{path}: the Klipper configuration could not be used: found kinematics "
             f"{kinematics or 'nowhere'}, needed delta or rotary_delta; give the file with the "
             "section [printer] and the sections [stepper_a] to [stepper_c] of a Delta."
+            + "".join(f" {sentence}" for sentence in left_out)
         )
     firmware = _named("klipper", turns=kinematics == "rotary_delta")
     for p in firmware.parameters:
@@ -141,7 +144,8 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 f"{path}: {_shown(p.key)} could not be read: found '{words[p.key]}', needed a "
                 "number; correct it."
             )
-    return Configuration(firmware, values, printable=values.get("printer.print_radius"))
+    printable = values.get("printer.print_radius")
+    return Configuration(firmware, values, printable=printable, notes=left_out)
 
 
 def _named(name: str, *, turns: bool = False) -> Firmware:
@@ -372,6 +376,7 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
                 f"{path}: the {read.firmware.title} configuration could not be read: found no "
                 f"{_shown(p.key)}, needed {_needed(read.firmware, p)}; write it, or give the file "
                 "that has it."
+                + "".join(f" {note}" for note in read.notes if "not followed" in note)
                 for p in missing
             ]
         )
