@@ -415,6 +415,8 @@ REFUSED = [
     (KLIPPER.replace("168.2", "368.2"), {}, ("longer than the radius", "one unit")),
     (KLIPPER.replace("330.25", "13.0"), {}, ("13", "330.75", "one unit")),
     (KLIPPER.replace("300.6", "11.8"), {}, ("endstops 11.8 mm", "the unit of the rods")),
+    (KLIPPER, {"platform_radius": -30.0}, ("--platform-radius", "-30 mm", "below 134.6 mm")),
+    (KLIPPER, {"platform_radius": 150.0}, ("--platform-radius", "150 mm", "below 134.6 mm")),
     (KLIPPER, {"unit": "in"}, ("330.25 in", "30 to 5000 mm")),
     (DUET.replace("R131.15", ""), {}, ("no R of M665",)),
     (DUET.replace("L289.1:288.7:289.4", "L289:289:289:289"), {}, ("more than three towers",)),

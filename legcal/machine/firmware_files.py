@@ -40,6 +40,7 @@ ROD = 0.01  # typical radius of a rod, in its length
 PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers, or in arms
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
+LARGEST_EFFECTOR = 0.8  # as EFFECTOR
 LARGEST_TRIM = 0.05  # of a rod, in its length
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
@@ -400,6 +401,14 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     _check_trims(path, read, unit)
     at_stops = ideal.at_stops
     size = float(np.mean(ideal.arm if ideal.turns else ideal.radius))
+    if effector is not None and not 0.0 < effector < LARGEST_EFFECTOR * size:
+        raise ModelError(
+            f"{path}: --platform-radius could not be used: found {effector:g} {unit}, needed the "
+            "radius of the joints on the effector, above 0 and below "
+            f"{LARGEST_EFFECTOR * size:.4g} {unit} ({LARGEST_EFFECTOR:g} of the "
+            f"{'arms' if ideal.turns else 'radius of the towers'}); correct it, or write it in the "
+            "unit of the file."
+        )
     stated = effector if effector is not None else read.effector
     r = float(np.round(EFFECTOR * size, 1)) if stated is None else stated
     pair = 0.5 * SPACING * r
