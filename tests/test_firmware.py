@@ -133,6 +133,7 @@ CONFIGURATIONS = {
     "reprapfirmware": DUET,
     "reprapfirmware-arms": DUET_ARMS,
     "marlin": MARLIN,
+    "marlin-beside-duet": MARLIN.replace("from M503", "of a former Duet"),
     "marlin-header": MARLIN_HEADER,
     "linuxcnc": LINUXCNC,
     "linuxcnc-arms": LINUXCNC_ARMS,
