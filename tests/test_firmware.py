@@ -89,6 +89,9 @@ MARLIN_HEADER = """
 #endif
 """
 LINUXCNC = """
+[TRAJ]
+LINEAR_UNITS = mm
+[HAL]
 setp lineardeltakins.R 130.25
 setp lineardeltakins.L 269.5
 [JOINT_0]
@@ -99,6 +102,9 @@ HOME_OFFSET = 413.0
 HOME_OFFSET = 411.75
 """
 LINUXCNC_ARMS = """
+[TRAJ]
+LINEAR_UNITS = mm
+[HAL]
 setp rotarydeltakins.platformradius 40.5
 setp rotarydeltakins.footradius 0
 setp rotarydeltakins.thighlength 160
@@ -110,12 +116,24 @@ HOME_OFFSET = -31
 [JOINT_2]
 HOME_OFFSET = -29.5
 """
+DUET_AS_MARLIN = """
+M555 P2 ; set output to look like Marlin
+M569 P0 S1
+M584 X0 Y1 Z2
+M665 R124.3 L250.4 B85 H252.7
+M666 X-0.4 Y0 Z-0.75
+"""
 CONFIGURATIONS = {
     "klipper": KLIPPER,
+    "klipper-capitals": KLIPPER.replace("arm_length", "Arm_Length").replace("delta_r", "Delta_R"),
+    "klipper-clockwise": KLIPPER.replace("[stepper_c]\n", "[stepper_c]\nangle: 330\n", 1)
+    .replace("arm_length = 330.75", "arm_length = 330.75\nangle: 90.45")
+    .replace("#*# angle = 90.45\n", ""),
     "klipper-arms": KLIPPER_ARMS,
     "reprapfirmware": DUET,
     "reprapfirmware-arms": DUET_ARMS,
     "marlin": MARLIN,
+    "marlin-beside-duet": MARLIN.replace("from M503", "of a former Duet"),
     "marlin-header": MARLIN_HEADER,
     "linuxcnc": LINUXCNC,
     "linuxcnc-arms": LINUXCNC_ARMS,
@@ -148,6 +166,24 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
+
+
+def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> None:
+    duet, marlin = Path("config"), DUET_AS_MARLIN.partition("M665")
+    np.testing.assert_allclose(numbers_in(DUET_AS_MARLIN)[-3:], [252.3, 252.7, 251.95])
+    np.testing.assert_allclose(
+        numbers_in(f"echo:Marlin 2.1\nM665{marlin[2]}")[-3:], [253.1, 252.7, 253.45]
+    )
+    _, notes = firmware_table(duet, f"; Marlin\nM665{marlin[2]}") or ({}, ())
+    assert "radius of the bed" in notes[0]
+
+
+def test_a_byte_order_mark_is_no_part_of_a_configuration(tmp_path: Path) -> None:
+    assert machine_of("\ufeff" + KLIPPER.lstrip(), tmp_path).n_legs == 6
+
+
+def test_one_length_after_a_list_counts_for_all_rods() -> None:
+    assert numbers_in(f"{DUET}M665 L290\n")[6:9] == [290.0] * 3
 
 
 DOCUMENTED = {
@@ -336,6 +372,26 @@ def test_a_rig_of_flypt_is_written_as_it_was_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(lengths, 0.86)
 
 
+RIG = "L1: 103\nL2: 9.5\nL3: 13\nL4: 110\nRange: 15\nMiddle: 86\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "metres"),
+    [
+        (RIG, None, 1e-3),
+        (RIG, "cm", 1e-2),
+        (RIG.replace("\n", " in\n"), None, 0.0254),
+        (RIG.replace(": ", " (inch): "), None, 0.0254),
+    ],
+)
+def test_lengths_of_a_rig_have_the_unit_that_is_stated(
+    text: str, unit: str | None, metres: float, tmp_path: Path
+) -> None:
+    machine = machine_of(text, tmp_path, unit=unit)
+    side = np.linalg.norm(machine.B_platform[1] - machine.B_platform[2])
+    assert side == pytest.approx(103 * metres)
+
+
 # --- mistakes -----------------------------------------------------------------------------------
 
 
@@ -349,6 +405,8 @@ REFUSED = [
     (without(KLIPPER, "arm_length: 330"), {}, ("no arm_length in [stepper_a]", "rods")),
     (without(KLIPPER, "delta_radius"), {}, ("no delta_radius in [printer]", "carriage")),
     (without(KLIPPER_ARMS, "shoulder_height"), {}, ("no shoulder_height in [printer]",)),
+    (f"[include delta.cfg]\n{without(KLIPPER, 'delta_radius')}", {},
+     ("no delta_radius in [printer]", "[include delta.cfg] is not followed: give its sections")),
     (without(KLIPPER, "kinematics"), {}, ("kinematics nowhere", "section [printer]")),
     (KLIPPER.replace("delta\n", "corexy\n"), {}, ("corexy", "delta or rotary_delta")),
     (KLIPPER.replace("330.25", "long"), {}, ("arm_length in [stepper_a]", "'long'")),
@@ -358,26 +416,42 @@ REFUSED = [
     (KLIPPER.replace("168.2", "368.2"), {}, ("longer than the radius", "one unit")),
     (KLIPPER.replace("330.25", "13.0"), {}, ("13", "330.75", "one unit")),
     (KLIPPER.replace("300.6", "11.8"), {}, ("endstops 11.8 mm", "the unit of the rods")),
+    (KLIPPER, {"platform_radius": -30.0}, ("--platform-radius", "-30 mm", "below 134.6 mm")),
+    (KLIPPER, {"platform_radius": 150.0}, ("--platform-radius", "150 mm", "below 134.6 mm")),
     (KLIPPER, {"unit": "in"}, ("330.25 in", "30 to 5000 mm")),
     (DUET.replace("R131.15", ""), {}, ("no R of M665",)),
     (DUET.replace("L289.1:288.7:289.4", "L289:289:289:289"), {}, ("more than three towers",)),
     (DUET, {"unit": "in"}, ("--unit in and mm", "leave out --unit")),
     (DUET_ARMS.replace("A-40:62", ""), {}, ("no A of M669", "highest angle")),
     (DUET_ARMS.replace("K10", "K4"), {}, ("K4", "K10")),
+    (DUET_AS_MARLIN.replace("M569 P0 S1", "; Marlin\nM569 P0 S1"), {}, ("both Marlin", "M584")),
+    (MARLIN.replace("B-0.3", "B80"), {}, ("B of M665", "80 mm", "12.52 mm")),
     ("M665 L250 R124 H250\nM666 X-0.5", {}, ("M666", "'; Marlin'")),
     (without(MARLIN_HEADER, "DELTA_RADIUS 1"), {}, ("no R of M665",)),
+    (MARLIN_HEADER.replace("#endif", "#else\n#define DELTA_HEIGHT 300\n#endif"), {},
+     ("'DELTA_HEIGHT 252.7' in line 6", "'DELTA_HEIGHT 300' in line 13", "one value")),
     (MARLIN_HEADER.replace("#define DELTA\n", "//#define DELTA\n"), {}, ("commented out",)),
     (without(INI, "HALFILE") + joints(), {}, ("genhexkins.base.0.x' and 35 more", "HAL file")),
     (pins(), {"height": 20.0}, ("no unit", "--unit mm or in")),
     (pins(), {"unit": "in"}, ("no HOME in [TRAJ]", "--height")),
     (INI.replace("genhexkins", "trivkins"), {}, ("trivkins", "genhexkins")),
+    (INI.replace("= genhexkins", "="), {}, ("KINEMATICS = nothing", "genhexkins")),
+    (INI + pins() + "\n" + joints().replace("HOME_OFFSET = 15.3\n", ""), {},
+     ("HOME_OFFSET of 5 joints", "[JOINT_5]")),
     (INI.replace("inch", "cubits") + pins(), {}, ("LINEAR_UNITS = cubits",)),
     (INI.replace("inch", "mm") + pins() + "\n" + joints(380.0, (400.0, 700.0)), {},
      ("limits of 400 to 700", "one unit")),
+    (LINUXCNC.replace("= mm", "= cubits"), {}, ("LINEAR_UNITS = cubits", "mm or inch")),
+    (without(LINUXCNC, "UNITS"), {}, ("no unit", "LINEAR_UNITS", "--unit mm or in")),
+    (LINUXCNC, {"unit": "in"}, ("--unit in and mm",)),
     (LINUXCNC.partition("[JOINT_1]")[0], {}, ("no HOME_OFFSET in [JOINT_1]", "home switch")),
     (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
     (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),
     (FLYPT.replace("<NUDMiddle>860", "<NUDMiddle>33"), {}, ("Middle 33", "all in mm")),
+    (RIG.replace("L1: 103", "L1: 1,030"), {}, ("L1 could not be read", "'1,030'", "1030 mm")),
+    (RIG.replace("L1: 103", "L1: 103 cm"), {}, ("L1 in cm", "L2 in no unit", "one unit")),
+    (RIG.replace("L1:", "L1 [ells]:"), {}, ("L1 could not be read", "'[ells] 103'")),
+    (RIG.replace(": ", " [mm]: "), {"unit": "in"}, ("--unit in and mm",)),
     ("<robot name='x'/>", {}, ("found XML", "legcal inspect")),
 ]  # fmt: skip
 

@@ -138,7 +138,7 @@ def number_text(value: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Mounted:
-    """A machine in a frame with z up, its towers counterclockwise."""
+    """A machine in a frame with z up, its towers in the order of the firmware's angles."""
 
     machine: Machine
     frame: Array  # (3, 3) rotation of the frame in the base link
@@ -225,7 +225,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         rows.append(_Row.of(actuator, A @ frame, B @ frame, rod, frame))
     places = np.array([row.across for row in rows])
     angles = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
-    if ((angles[1] - angles[0]) % 360.0) > 180.0:
+    if "angle" in firmware.nominal and ((angles[1] - angles[0]) % 360.0) > 180.0:
         rows = [rows[0], rows[2], rows[1]]
     angles = np.array([np.degrees(np.arctan2(row.across[1], row.across[0])) for row in rows])
     nominal = np.array(firmware.nominal.get("angle", angles))

@@ -55,7 +55,7 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     stroke = np.ptp([leg.travel for leg in machine.legs], axis=1).min()
     numbers["Range"] = 0.5 * _MM * stroke
     text = "".join(f"{key}: {number_text(float(value))}\n" for key, value in numbers.items())
-    rig, centre, _ = rig_in(path, text)
+    rig, centre = rig_in(path, text)[:2]
     written = np.array([*(getattr(rig, side) for side in SIDES), rig.Middle, *centre])
     after = places.placed(written)
     figures = {"remaining_mm": figures_of(after)}

@@ -360,7 +360,7 @@ def read_description(
     """
     given = {} if given is None else given
     try:
-        content = content_of(path, FILE_KIND).decode(errors="replace")
+        content = content_of(path, FILE_KIND).decode("utf-8-sig", errors="replace")
     except DatasetError as error:
         raise ModelError(error.facts) from error
     if (of_firmware := firmware_table(path, content, unit, given, effector)) is not None:

@@ -26,12 +26,12 @@ from legcal.geometry.types import Array
 from legcal.machine.description_csv import MAX_NUMBER
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta, Parameter
 from legcal.machine.hexapod_files import (
-    LINEAR_UNITS,
     NUMBER,
     Table,
     flypt_table,
     ini_entries,
     linuxcnc_table,
+    linuxcnc_unit,
 )
 
 EFFECTOR = 0.25  # typical radius of the joints on an effector, in radii of towers, or in arms
@@ -40,6 +40,8 @@ ROD = 0.01  # typical radius of a rod, in its length
 PRINTABLE = 0.6  # radius of the bed where it is not stated, in radii of towers, or in arms
 MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
+LARGEST_EFFECTOR = 0.8  # as EFFECTOR
+LARGEST_TRIM = 0.05  # of a rod, in its length
 DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 
@@ -76,13 +78,15 @@ def firmware_table(
     """
     for reads in _DELTAS:
         if (read := reads(path, text)) is not None:
-            unit = _unit(path, read.unit, unit or ("mm" if read.unit is None else None))
+            if read.unit is None and read.firmware.name != "linuxcnc":
+                unit = unit or "mm"
+            unit = _unit(path, read.unit, unit)
             return _table_of_delta(path, read, unit, effector)
-    for makes in (linuxcnc_table, flypt_table):
-        if (hexapod := makes(path, text, given)) is not None:
-            table, notes = hexapod
-            return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
-    return None
+    hexapod = linuxcnc_table(path, text, given) or flypt_table(path, text, given, unit)
+    if hexapod is None:
+        return None
+    table, notes = hexapod
+    return {**table, "unit": _unit(path, table.get("unit"), unit)}, notes
 
 
 def read_delta(path: Path, text: str) -> IdealDelta:
@@ -100,7 +104,7 @@ def _unit(path: Path, stated: str | None, given: str | None) -> str:
     if stated is None and given is None:
         raise ModelError(
             f"{path}: the lengths could not be read: found no unit, needed that of the machine; "
-            "give the INI file with LINEAR_UNITS in place of the HAL file, or --unit mm or in."
+            "write [TRAJ] and LINEAR_UNITS of the INI file into it, or give --unit mm or in."
         )
     return str(stated or given)
 
@@ -110,13 +114,14 @@ def _unit(path: Path, stated: str | None, given: str | None) -> str:
 
 def _klipper(path: Path, text: str) -> Configuration | None:
     """Return the numbers of a printer.cfg; those of its SAVE_CONFIG block count."""
-    section, values, words = "", dict[str, float](), dict[str, str]()
+    section, values, words, includes = "", dict[str, float](), dict[str, str](), list[str]()
     for line in text.splitlines():
         line = re.split(r"[#;]", line.removeprefix("#*#"), maxsplit=1)[0].strip()
         if match := re.fullmatch(r"\[(.+)\]", line):
             section = match[1].strip()
+            includes += [f"[{section}]"] * section.startswith("include ")
         elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
-            key = f"{section}.{match[1]}"
+            key = f"{section}.{match[1].lower()}"
             words[key] = match[2]
             if re.fullmatch(NUMBER, match[2]):
                 values[key] = float(match[2])
@@ -124,12 +129,14 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 values.pop(key, None)
     if not any(key.startswith(("printer.", "stepper_a.")) for key in words):
         return None
+    left_out = [f"{', '.join(includes)} is not followed: give its sections."] if includes else []
     kinematics = words.get("printer.kinematics")
     if kinematics not in ("delta", "rotary_delta"):
         raise ModelError(
             f"{path}: the Klipper configuration could not be used: found kinematics "
             f"{kinematics or 'nowhere'}, needed delta or rotary_delta; give the file with the "
             "section [printer] and the sections [stepper_a] to [stepper_c] of a Delta."
+            + "".join(f" {sentence}" for sentence in left_out)
         )
     firmware = _named("klipper", turns=kinematics == "rotary_delta")
     for p in firmware.parameters:
@@ -138,7 +145,8 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 f"{path}: {_shown(p.key)} could not be read: found '{words[p.key]}', needed a "
                 "number; correct it."
             )
-    return Configuration(firmware, values, printable=values.get("printer.print_radius"))
+    printable = values.get("printer.print_radius")
+    return Configuration(firmware, values, printable=printable, notes=left_out)
 
 
 def _named(name: str, *, turns: bool = False) -> Firmware:
@@ -163,14 +171,27 @@ _DEFINES = {
 
 def _marlin_header(path: Path, text: str) -> Configuration | None:
     """Return the numbers of the #define lines of a Configuration.h."""
-    values = dict[str, float]()
-    plain = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
-    for name, rest in re.findall(r"^\s*#\s*define\s+(\w+)[ \t]+([^\n]*)", plain, re.MULTILINE):
-        keys = _DEFINES.get(name.removeprefix("DEFAULT_"), ())
-        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", rest)
-        if numbers:
-            of_name = map(float, re.findall(NUMBER, numbers[1]))
-            values |= dict(zip(keys, of_name, strict=False))
+    values, before = dict[str, float](), dict[str, tuple[object, str]]()
+    plain = re.sub(
+        r"/\*.*?\*/|//[^\n]*", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.DOTALL
+    )
+    for i, line in enumerate(plain.splitlines(), start=1):
+        match = re.match(r"\s*#\s*define\s+(\w+)\s+(.*)", line)
+        name = match[1].removeprefix("DEFAULT_") if match else ""
+        if match is None or name not in _DEFINES:
+            continue
+        numbers = re.fullmatch(rf"[\s{{(]*({NUMBER}(?:\s*,\s*{NUMBER})*)f?[\s}})]*", match[2])
+        of_name = [float(x) for x in re.findall(NUMBER, numbers[1])] if numbers else []
+        of_line = dict(zip(_DEFINES[name], of_name, strict=False))
+        shown = f"'{match[1]} {match[2].strip()}' in line {i}"
+        for key, value in {name: of_name or match[2].split(), **of_line}.items():
+            one, there = before.setdefault(key, (value, shown))
+            if one != value:
+                raise ModelError(
+                    f"{path}: the Marlin configuration could not be read: found {there} and "
+                    f"{shown}, needed one value; put // before the line that is not in use."
+                )
+        values |= of_line
     if not re.search(r"^\s*#\s*define\s+(DEFAULT_)?DELTA_\w", plain, re.MULTILINE):
         return None
     switch = re.compile(r"^\s*(//)?\s*#\s*define\s+DELTA\s*$", re.MULTILINE)
@@ -203,12 +224,20 @@ def _g_code(path: Path, text: str) -> Configuration | None:
             rf"([A-Z])\s*({NUMBER}(?:\s*:\s*{NUMBER})*)", " ".join(words[1:])
         ):
             of_letter = [float(x) for x in numbers.split(":")]
+            stated = re.compile(rf"{words[0]} {letter}\d*")
+            values = {key: value for key, value in values.items() if not stated.fullmatch(key)}
             for i, value in enumerate(of_letter):
                 values[f"{words[0]} {letter}{i}"] = value
             values[f"{words[0]} {letter}"] = of_letter[0]
     if not any(key.startswith(("M665", "M669")) for key in values):
         return None
     name = _speaker(path, text, values)
+    notes = []
+    if name == "marlin" and not {"M665 A", "M665 C"} & values.keys() and values.pop("M665 B", 0.0):
+        notes.append(
+            "B of M665 is taken for the radius of the bed, because no A or C is beside it; write "
+            "A0 and C0 beside it if it corrects a rod."
+        )
     kinematics = values.get("M669 K")
     turns = kinematics == 10.0 or (kinematics is None and "M669 U" in values)
     if kinematics not in (None, 3.0, 10.0):
@@ -228,6 +257,7 @@ def _g_code(path: Path, text: str) -> Configuration | None:
         unit,
         lowest=values.get("M669 A0"),
         printable=values.get("M669 B" if turns else "M665 B") if name != "marlin" else None,
+        notes=notes,
     )
     if not turns and name != "marlin" and (values.get("M666 A") or values.get("M666 B")):
         read.notes.append(
@@ -237,14 +267,30 @@ def _g_code(path: Path, text: str) -> Configuration | None:
     return read
 
 
+_MARLIN = re.compile(
+    r"^\s*;+\s*Marlin\b|^\s*echo:\s*;?\s*Marlin\b|FIRMWARE_NAME:\s*Marlin",
+    re.IGNORECASE | re.MULTILINE,
+)
+_DUET = re.compile(
+    r"^\s*;+\s*(?:Configuration file for |generated by )?(?:RepRap ?Firmware|Duet|RRF)|"
+    r"FIRMWARE_NAME:\s*(?:RepRapFirmware|Duet)",
+    re.IGNORECASE | re.MULTILINE,
+)
+_DUET_CODES = re.compile(  # that Marlin does not have
+    r"^\s*(?:M(?:584|558|563|98)(?![\d.])|M569(?![\d.])[^;\n]*P\d)", re.IGNORECASE | re.MULTILINE
+)
+
+
 def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
-    """Return the firmware that reads some G-code: by its name, or by parameters of it alone."""
+    """Return the firmware that reads some G-code: by its name in a header, or by its own codes."""
+    lines = [line for line in text.splitlines() if "M555" not in line.upper()]  # looks like others
+    text = "\n".join(lines)
     ends = [values.get(f"M666 {letter}", 0.0) for letter in "XYZ"]
     lists = any(re.fullmatch(r"M66[59] [A-Z]1", key) for key in values)
     known = {
-        "marlin": bool(re.search(r"marlin", text, re.IGNORECASE))
+        "marlin": bool(_MARLIN.search(text))
         or any(key in values for key in ("M665 S", "M665 A", "M665 C")),
-        "reprapfirmware": bool(re.search(r"reprap ?firmware|\bduet|\brrf", text, re.IGNORECASE))
+        "reprapfirmware": bool(_DUET.search(text) or _DUET_CODES.search(text))
         or lists
         or any(key in values for key in ("M669 K", "M669 U", "M666 A", "M666 B"))
         or max(ends) > 0.0,
@@ -252,13 +298,19 @@ def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
     named = [name for name, is_so in known.items() if is_so]
     if len(named) == 1:
         return named[0]
-    if not any(ends):
+    if not any(ends) and not named:
         return "reprapfirmware"  # both read the rest alike
+    if named:
+        raise ModelError(
+            f"{path}: the firmware could not be told: found lines of both Marlin (its name, or A, "
+            "C or S of M665) and RepRapFirmware (its name, lists with ':', M584, M569 P, M558, "
+            "M563, M98, or M666 above zero), needed one, because they count the endstops in M666 "
+            "downwards and upwards; give the lines of the firmware in use alone."
+        )
     raise ModelError(
-        f"{path}: the endstops could not be read: found M666 lines that may be of "
-        f"{'both ' * bool(named)}Marlin {'and' if named else 'or'} RepRapFirmware, which count "
-        "them downwards and upwards, needed one of them; write the comment '; Marlin' or "
-        "'; RepRapFirmware' in the file."
+        f"{path}: the endstops could not be read: found M666 lines that may be of Marlin or "
+        "RepRapFirmware, which count them downwards and upwards, needed one of them; write the "
+        "comment '; Marlin' or '; RepRapFirmware' in a line of its own."
     )
 
 
@@ -275,7 +327,7 @@ def _linuxcnc(path: Path, text: str) -> Configuration | None:
     return Configuration(
         _named("linuxcnc", turns=found[0][1] == "rotary"),
         values,
-        unit=LINEAR_UNITS.get(entries.get("TRAJ.LINEAR_UNITS", "mm").lower()),
+        unit=linuxcnc_unit(path, entries),
         effector=values.get("rotarydeltakins.footradius") or None,
         lowest=-values.get("JOINT_0.MAX_LIMIT", DOWN) if found[0][1] == "rotary" else None,
     )
@@ -326,6 +378,7 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
                 f"{path}: the {read.firmware.title} configuration could not be read: found no "
                 f"{_shown(p.key)}, needed {_needed(read.firmware, p)}; write it, or give the file "
                 "that has it."
+                + "".join(f" {note}" for note in read.notes if "not followed" in note)
                 for p in missing
             ]
         )
@@ -346,8 +399,17 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     firmware = read.firmware
     ideal = firmware.ideal(_completed(path, read))
     _check(path, firmware, ideal, unit)
+    _check_trims(path, read, unit)
     at_stops = ideal.at_stops
     size = float(np.mean(ideal.arm if ideal.turns else ideal.radius))
+    if effector is not None and not 0.0 < effector < LARGEST_EFFECTOR * size:
+        raise ModelError(
+            f"{path}: --platform-radius could not be used: found {effector:g} {unit}, needed the "
+            "radius of the joints on the effector, above 0 and below "
+            f"{LARGEST_EFFECTOR * size:.4g} {unit} ({LARGEST_EFFECTOR:g} of the "
+            f"{'arms' if ideal.turns else 'radius of the towers'}); correct it, or write it in the "
+            "unit of the file."
+        )
     stated = effector if effector is not None else read.effector
     r = float(np.round(EFFECTOR * size, 1)) if stated is None else stated
     pair = 0.5 * SPACING * r
@@ -461,6 +523,21 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
             "in one unit."
         )
     if problems:
+        raise ModelError(problems)
+
+
+def _check_trims(path: Path, read: Configuration, unit: str) -> None:
+    """Refuse corrections of Marlin's rods that are none."""
+    if read.firmware.name != "marlin":
+        return
+    largest = LARGEST_TRIM * read.values["M665 L"]
+    if problems := [
+        f"{path}: the Marlin configuration could not be used: found {letter} of M665, the "
+        f"correction of a rod, of {trim:g} {unit}, needed at most {largest:.4g} {unit} (5 % of the "
+        "rod); correct it."
+        for letter in "ABC"
+        if not abs(trim := read.values.get(f"M665 {letter}", 0.0)) <= largest
+    ]:
         raise ModelError(problems)
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import ModelError
+from legcal.files.quantity import LENGTH, split_quantity
 from legcal.files.schema import content_of
 from legcal.geometry.types import Array
 from legcal.machine.description_csv import MAX_NUMBER
@@ -30,8 +31,22 @@ STRUTS = 6
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 Table = tuple[dict[str, Any], tuple[str, ...]]
 _TRAVEL = (0.8, 1.2)  # of the length at home, where limits are not stated
-LINEAR_UNITS = {"mm": "mm", "metric": "mm", "cm": "cm", "in": "in", "inch": "in", "imperial": "in"}
+LINEAR_UNITS = {
+    "mm": "mm",
+    "metric": "mm",
+    "cm": "cm",
+    "in": "in",
+    "inch": "in",
+    "inches": "in",
+    "imperial": "in",
+}
 _UNSEEN = "No radius of the legs is stated: give --leg-radius, without which legs are invisible."
+
+
+def length_unit(word: str) -> str | None:
+    """Return the unit of lengths that a word means, None for others."""
+    word = word.lower()
+    return word if word in LENGTH else LINEAR_UNITS.get(word)
 
 
 def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | None:
@@ -39,7 +54,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     if not re.search(r"^\s*#?\s*\[(KINS|TRAJ|JOINT_\d)\]|^\s*setp\s+genhex", text, re.MULTILINE):
         return None
     entries = ini_entries(text)
-    kinematics = entries.get("KINS.KINEMATICS", "genhexkins").split()[0]
+    kinematics = next(iter(entries.get("KINS.KINEMATICS", "genhexkins").split()), "nothing")
     if kinematics != "genhexkins":
         raise ModelError(
             f"{path}: the LinuxCNC configuration could not be used: found KINEMATICS = "
@@ -69,13 +84,7 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
             + ", needed x, y, z of six joints of base and platform; give the INI file that names "
             "the HAL file with these lines, or add them."
         )
-    unit_word = entries.get("TRAJ.LINEAR_UNITS", "").split()
-    unit = LINEAR_UNITS.get(unit_word[0].lower()) if unit_word else None
-    if unit_word and unit is None:
-        raise ModelError(
-            f"{path}: the unit could not be read: found LINEAR_UNITS = {unit_word[0]}, needed mm "
-            "or inch; correct it."
-        )
+    unit = linuxcnc_unit(path, entries)
     notes = [_UNSEEN] * ("radius" not in given)
     if numbers.get("screw-lead"):
         notes.append("The correction of screw-lead is left out: readings are lengths of struts.")
@@ -109,6 +118,18 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     return table, tuple(notes)
 
 
+def linuxcnc_unit(path: Path, entries: Mapping[str, str]) -> str | None:
+    """Return the unit of lengths of an INI file, None where it is not stated."""
+    words = entries.get("TRAJ.LINEAR_UNITS", "").split()
+    unit = LINEAR_UNITS.get(words[0].lower()) if words else None
+    if words and unit is None:
+        raise ModelError(
+            f"{path}: the unit could not be read: found LINEAR_UNITS = {words[0]}, needed mm or "
+            "inch; correct it."
+        )
+    return unit
+
+
 def ini_entries(text: str) -> dict[str, str]:
     """Return the entries of an INI file, by section; of a HAL file of legcal those of comments."""
     is_own = "written by legcal" in text
@@ -138,7 +159,14 @@ def _set_lengths(
         ]
         for key in ("HOME_OFFSET", "MIN_LIMIT", "MAX_LIMIT")
     }
-    if len(stated["HOME_OFFSET"]) == STRUTS:
+    has_offsets = any(f"JOINT_{j}.HOME_OFFSET" in entries for j in range(STRUTS))
+    if has_offsets and len(stated["HOME_OFFSET"]) < STRUTS:
+        raise ModelError(
+            f"{path}: the struts could not be used: found a HOME_OFFSET of "
+            f"{len(stated['HOME_OFFSET'])} joints, needed a number in each of [JOINT_0] to "
+            f"[JOINT_{STRUTS - 1}]; write the others, or leave out all."
+        )
+    if has_offsets:
         table["offsets"] = stated["HOME_OFFSET"]
     unit = table.get("unit", "machine units")
     limits = [np.array(stated[key]) for key in ("MIN_LIMIT", "MAX_LIMIT")]
@@ -173,7 +201,7 @@ def _set_lengths(
 
 @dataclass(frozen=True)
 class Rig:
-    """The linear hexapod of FlyPT Mover, in mm: x to the right, y to the front, z up.
+    """The linear hexapod of FlyPT Mover, in one unit: x to the right, y to the front, z up.
 
     A short side of the platform is taken to be in front, and those of the base between those of
     the platform. Struts are counterclockwise from the right one of that side.
@@ -206,30 +234,38 @@ def _hexagon(long: float, short: float, middles: Array, sign: float) -> Array:
 
 SIDES = ("L1", "L2", "L3", "L4")
 _FLYPT = re.compile(
-    rf"<NUD(?:Rig)?(\w+)>\s*({NUMBER})\s*<|"
-    rf"^\W*(?:Rig|Base)?\s*(L[1-4]|Range|Middle|COR ?[XYZ])\b[^:=\n]*[:=]\s*({NUMBER})",
+    r"<NUD(?:Rig)?(\w+)>([^<]*)<|"
+    r"^[^\w\n]*(?:Rig|Base)?\s*(L[1-4]|Range|Middle|COR ?[XYZ])\b([^:=\n]*)[:=]"
+    r"[ \t]*([-+.\d\"'][^\n]*)$",
     re.MULTILINE | re.IGNORECASE,
 )
 
 
-def flypt_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | None:
-    """Return the table of a rig of FlyPT Mover: its XML, or ``L1: 1030`` lines."""
+def flypt_table(
+    path: Path, text: str, given: Mapping[str, Any], unit: str | None = None
+) -> Table | None:
+    """Return the table of a rig of FlyPT Mover: its XML, or ``L1: 1030`` lines.
+
+    *unit* is that of lines without one, mm if None.
+    """
     named = {match[3].upper() for match in _FLYPT.finditer(text) if match[3]}
     if "<RIG>" not in text and not named.issuperset(SIDES):
         return None
-    rig, centre, half = rig_in(path, text)
+    rig, centre, half, stated = rig_in(path, text)
+    unit = stated or unit or "mm"
     across = np.linalg.norm((rig.platform - rig.base)[:, :2], axis=1).max()
     if not (across < rig.Middle and half < 0.8 * rig.Middle):
         raise ModelError(
-            f"{path}: the rig could not be used: found joints {across:.6g} mm apart from above, "
-            f"Middle {rig.Middle:g} and Range {half:g} mm, needed Middle above the first and far "
-            "above Range; write all in mm (L1 and L4 are the long sides, Range half of the stroke)."
+            f"{path}: the rig could not be used: found joints {across:.6g} {unit} apart from "
+            f"above, Middle {rig.Middle:g} and Range {half:g} {unit}, needed Middle above the "
+            f"first and far above Range; write all in {unit} (L1 and L4 are the long sides, Range "
+            "half of the stroke)."
         )
     height = float(np.sqrt(rig.Middle**2 - across**2))
     table = {
         "legcal_table": 1,
         "name": path.stem,
-        "unit": "mm",
+        "unit": unit,
         "type": f"{STRUTS}-UPS",
         "base_joints": rig.base.tolist(),
         "platform_joints": (rig.platform - centre).tolist(),
@@ -245,8 +281,11 @@ def flypt_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | None
     return table, tuple(notes)
 
 
-def rig_in(path: Path, text: str) -> tuple[Rig, Array, float]:
-    """Return the rig in a text, its centre of rotation (3,) and half of its stroke [mm]."""
+def rig_in(path: Path, text: str) -> tuple[Rig, Array, float, str | None]:
+    """Return the rig in a text, its centre of rotation (3,), half of its stroke, and their unit.
+
+    The unit is None where none is stated, as in lines ``L1: 1030``; FlyPT Mover writes mm.
+    """
     types = re.findall(r"Mover\.Rigs\.(\w+)", text)
     if types and "LinearHexapod" not in types:
         raise ModelError(
@@ -257,11 +296,19 @@ def rig_in(path: Path, text: str) -> tuple[Rig, Array, float]:
     rigs = re.findall(r"<RIG>.*?</RIG>", text, re.DOTALL)
     text = next((rig for rig in rigs if "Rigs.LinearHexapod" in rig), text)
     names = {key.upper(): key for key in (*SIDES, "Range", "Middle", "CORX", "CORY", "CORZ")}
-    values: dict[str, float] = {}
+    values, units = dict[str, float](), dict[str, str | None]()
     for match in _FLYPT.finditer(text):
-        key = (match[1] or match[3]).upper().replace(" ", "")
-        if key in names:
-            values.setdefault(names[key], float(match[2] or match[4]))
+        key = names.get((match[1] or match[3]).upper().replace(" ", ""))
+        if key is not None and key not in values:
+            label, written = ("", match[2]) if match[1] else (match[4], match[5])
+            values[key], units[key] = _length(path, key, label, written)
+            units[key] = units[key] or ("mm" if match[1] else None)
+    if len(set(units.values())) > 1:
+        found = ", ".join(f"{key} in {unit or 'no unit'}" for key, unit in units.items())
+        raise ModelError(
+            f"{path}: the rig could not be read: found {found}, needed one unit for all; write all "
+            "lengths in it."
+        )
     needed = (*SIDES, "Range", "Middle")
     if missing := [key for key in needed if not 0.0 < values.get(key, 0.0) < MAX_NUMBER]:
         raise ModelError(
@@ -269,4 +316,22 @@ def rig_in(path: Path, text: str) -> tuple[Rig, Array, float]:
             "the sides L1 to L4, Middle and Range of the actuators; write them as 'L1: 1030'."
         )
     centre = np.array([values.get(f"COR{axis}", 0.0) for axis in "XYZ"])
-    return Rig(*(values[key] for key in (*SIDES, "Middle"))), centre, values["Range"]
+    rig = Rig(*(values[key] for key in (*SIDES, "Middle")))
+    return rig, centre, values["Range"], units["Middle"]
+
+
+def _length(path: Path, key: str, label: str, written: str) -> tuple[float, str | None]:
+    """Return the number of a line and its unit, stated behind it or in brackets of the label."""
+    written = re.split(r"#|;|//", written)[0].strip().rstrip(",").strip("\"' \t")
+    number, behind = split_quantity(written)
+    within = re.search(r"[\[(]\s*([A-Za-z]+)\s*[\])]", label)
+    words = [word for word in (behind, within[1] if within else "") if word]
+    units = [length_unit(word) for word in words]
+    if np.isnan(number) or None in units or len(set(units)) > 1:
+        found = " ".join([*([within[0]] if within else []), written])
+        raise ModelError(
+            f"{path}: {key} could not be read: found '{found}', needed a number, with a decimal "
+            f"point and no other separators, and a unit ({', '.join(LENGTH)}) or none; write it as "
+            f"'{key}: 1030 mm'."
+        )
+    return number, units[0] if units else None
