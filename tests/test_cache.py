@@ -17,6 +17,7 @@ from outline_tables import assert_same, outlines_of
 from legcal.data.cache import (
     DetectionPlan,
     fingerprint,
+    note_on_missing_photographs,
     plan_dataset,
     plan_detection,
     store_outlines,
@@ -290,6 +291,16 @@ def test_a_folder_that_cannot_be_written_to_is_a_note(
     note = store_outlines(dataset, _hexapod_outlines(), "abc", _mask(()))
     assert note is not None
     assert "found 'Permission denied', needed a folder that can be written to" in note
+
+
+def test_a_photograph_that_is_gone_is_noted_where_its_outlines_are_cached(folder: Folder) -> None:
+    _store(folder)
+    assert note_on_missing_photographs(load_dataset(folder.path)) == []
+    (folder.path / "images" / "c1_1.png").unlink()
+    (note,) = note_on_missing_photographs(load_dataset(folder.path))
+    assert note.endswith("c1_1.png is missing; its cached outlines are used.")
+    (folder.path / CACHE_NAME).unlink()  # outlines of the user
+    assert note_on_missing_photographs(load_dataset(folder.path)) == []
 
 
 def test_rows_with_outlines_need_no_image(folder: Folder) -> None:

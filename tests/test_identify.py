@@ -164,6 +164,8 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
     assert ("smallest sufficient sets of views" in out) == (not views)
+    if "  *" in out:
+        assert "whose own camera places and poses give the error below" in " ".join(out.split())
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:

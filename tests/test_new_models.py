@@ -286,6 +286,13 @@ def test_a_csv_whose_file_name_is_no_name_needs_one(tmp_path: Path) -> None:
     assert read_table(path, "mm", "mine").name == "mine"
 
 
+def test_an_unknown_column_of_a_table_of_joints_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "joints.csv"
+    path.write_text("point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n")
+    with pytest.raises(ModelError, match=r"the unknown column 'zz'.*did you mean 'z'"):
+        read_table(path, "mm")
+
+
 def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:
     path = write_table(tmp_path, unit=None)
     assert read_table(path, "mm").legs[0].offset == 0.38

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -191,6 +192,7 @@ def test_the_command_writes_what_python_plans(
     page = (session / "plan.html").read_text()
     assert "Distances to measure" in page
     assert "Checklist" in page
+    assert re.search(r"Set the tripod to within [\d.]{1,4} cm and 5 deg", page)
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 

@@ -173,9 +173,15 @@ def test_readings_are_taken_by_leg_or_by_motor_and_in_metres_and_radians() -> No
         (hexapod, [70.0] * 6, "probably in mm"),
         (delta, [0.1] * 4, "or \\(3,\\), one for each motor"),
         (hexapod, [0.07] * 3, "needed \\(6,\\), one for each leg;"),
+        (hexapod, [np.nan] * 6, "^The pose could not be computed: found the reading nan"),
+        (hexapod, {}, "found readings in a dict"),
+        (hexapod, ["a"] * 6, "found readings in a list that are no array of numbers"),
+        ("hexapod", [0.07] * 6, "found a str, needed a Machine"),
     ):
         with pytest.raises(UsageError, match=problem):
-            legcal.forward_kinematics(machine, readings)
+            legcal.forward_kinematics(machine, readings)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="found a str, needed a Machine"):
+        legcal.inverse_kinematics("hexapod", hexapod.home)  # type: ignore[arg-type]
 
 
 def test_models_are_written_and_exported_without_the_command_line(

@@ -106,6 +106,22 @@ def test_sliders_move_the_machine(page: Any) -> None:
     assert _errors(page) == []
 
 
+def test_words_of_tables_are_whole_on_a_telephone(page: Any) -> None:
+    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+    try:
+        inside, outside, first = page.execute_script(
+            "const table = document.querySelector('#platform table');"
+            "return [document.documentElement.scrollWidth, table.parentElement.clientWidth,"
+            " table.rows[1].cells[0].offsetWidth]"
+        )
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert inside <= 390
+    assert outside < 390
+    assert first > 80
+
+
 def test_a_scene_is_turned_and_zoomed(page: Any) -> None:
     from selenium.webdriver.common.action_chains import ActionChains
 

@@ -20,6 +20,7 @@ from legcal.calibration.result_folder import write_result
 from legcal.calibration.workspace_errors import platform_map
 from legcal.errors import OutOfResources, UsageError
 from legcal.pages.html import page_html
+from legcal.pages.svg import Points, scatter
 from legcal.perception.overlays import COLOURS
 from legcal.report.page.calibration_page import calibration_page
 from legcal.vision.cylinder import outlines_of_axis
@@ -45,6 +46,17 @@ HOSTILE = "<script>alert(1)</script><b>\x1b[31m\u202e"
 def page(example_run: Run) -> Any:
     path = legcal.write_report(example_run.calibration, example_run.output)
     return html.fromstring(path.read_text("utf-8"))
+
+
+def test_labels_of_a_chart_are_neither_cut_nor_under_the_title_of_their_axis() -> None:
+    few = np.linspace(0.0, 1.0, 3)
+    points = Points(1000.0 * few, 0.00125 * (2.0 * few - 1.0), np.arange(3))
+    drawing = html.fromstring(str(scatter("a chart", [points], "place [px]", "residual [px]")))
+    labels = {text.text: text for text in drawing.iter("text")}
+    ends = {label: float(text.get("x")) for label, text in labels.items() if text.get("x")}
+    width = 6.2  # of a digit, at most [px]
+    assert ends["-0.001"] - width * len("-0.001") > 16.0  # right of the title
+    assert ends["1000"] + 0.5 * width * len("1000") <= 340.0
 
 
 def test_a_page_is_one_file_that_loads_nothing(page: Any) -> None:

@@ -51,6 +51,7 @@ from legcal.calibration.ordered_dataset import (
 )
 from legcal.calibration.pipeline import chosen_parameters, exact_cameras
 from legcal.causes import Cause, by_cause
+from legcal.data.cache import note_on_missing_photographs
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.data.image_causes import images_in_words
@@ -261,6 +262,8 @@ def _look_at_files(checklist: _Checklist, problems: Sequence[tuple[int, Problem]
             of_files = {row: problem for row, problem in of_files.items() if row not in rows}
     for row, problem in of_files.items():
         checklist.add("files", "error", str(problem), [row])
+    for note in note_on_missing_photographs(dataset):
+        checklist.add("files", "note", note)
     return [row for row in range(m.n_rows) if row not in bad]
 
 

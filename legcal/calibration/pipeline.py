@@ -43,7 +43,12 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.calibration.verdict import judge
-from legcal.data.cache import fingerprint, plan_dataset, store_outlines
+from legcal.data.cache import (
+    fingerprint,
+    note_on_missing_photographs,
+    plan_dataset,
+    store_outlines,
+)
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at, split_images
 from legcal.data.image_causes import image_notes
@@ -171,7 +176,7 @@ def calibrate(
     identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
-    key = outline_key(dataset, choices)
+    key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
         estimate = estimate_parameters(data, fitted, Options(choices, criteria))
@@ -186,6 +191,7 @@ def calibrate(
     notes = [
         *Note.about(Topic.DIAGNOSIS, (one.sentence for one in found.diagnosis)),
         *Note.about(Topic.DATASET, dataset.notes),
+        *Note.about(Topic.DATASET, missing),
         *Note.about(Topic.IMAGES, on_images),
         *Note.about(Topic.MODEL, (*choices.notes, *identify_notes)),
         *Note.about(Topic.DATASET, cache_notes),

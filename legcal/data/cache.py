@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
 from legcal.data.image_tables import canonical_order, reorder_measurements
-from legcal.data.measurements import places
+from legcal.data.measurements import few, places
 from legcal.data.outlines import (
     Outlines,
     is_edited,
@@ -100,6 +100,29 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     if entry is None or recorded != current or len(plan.detect):
         return plan
     return replace(plan, notes=entry.notes, is_cached=True)
+
+
+def note_on_missing_photographs(dataset: Dataset) -> list[str]:
+    """Return a note on outlines of earlier detection whose photographs are no longer there."""
+    entry, table = _read_entry(dataset.folder / CACHE_NAME), dataset.observations
+    if entry is None or table is None or dataset.axes is not None:
+        return []
+    m, given = dataset.measurements, set(entry.given)
+    names = places(m)
+    missing = [
+        m.image[row]
+        for row in np.unique(table.row[~is_edited(table)]).tolist()
+        if names[row] not in given
+        and (path := dataset.image_path(row)) is not None
+        and not os.path.exists(path)
+    ]
+    if not missing:
+        return []
+    if len(missing) == 1:
+        return [f"The photograph {missing[0]} is missing; its cached outlines are used."]
+    return [
+        f"{len(missing)} photographs are missing ({few(missing)}); their cached outlines are used."
+    ]
 
 
 def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:

@@ -16,10 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from legcal.errors import DatasetError
+from legcal.errors import Code, DatasetError
 from legcal.files.quantity import LENGTH
-from legcal.files.schema import describe
-from legcal.files.table import Column, Lines, Table, is_number, read_table, split_heading
+from legcal.files.schema import closest, describe
+from legcal.files.table import (
+    Column,
+    Lines,
+    Table,
+    header_problem,
+    is_number,
+    read_table,
+    split_heading,
+)
 
 FILE_KIND = "table"
 MAX_NUMBER = 1e9  # largest number, in any unit
@@ -228,7 +236,7 @@ def _unit(table: Table, given: str | None) -> str:
     return stated
 
 
-def _one_row_a_leg(lines: Lines, names: Sequence[str], path: object) -> Lines:
+def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     """Return a table with a row for each leg under the names of its columns.
 
     ``names`` are the names of the columns. Unknown headings stay, in lower case, and a column
@@ -332,7 +340,7 @@ def _from_one_row(
     return _rows(joints, others, (number, rows[0][0]))
 
 
-def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
+def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
     """Return a row for each leg, from a table with a row for each joint.
 
     A joint is named in one column, or in two: side and number of the leg.
@@ -342,6 +350,18 @@ def _from_points(lines: Lines, keys: Sequence[str], path: object) -> Lines:
     of_name = [i for i, key in enumerate(keys) if key in _POINT] or [
         i for i, key in enumerate(keys) if key not in (*_XYZ, *_OTHER["unit"])
     ]
+    known = {*axes.values(), *of_name[:2]}
+    for i, (key, text) in enumerate(zip(keys, header, strict=True)):
+        if i not in known and key not in _OTHER["unit"]:
+            raise DatasetError(
+                header_problem(
+                    path,
+                    f"the unknown column {describe(text)}",
+                    "those of a table with a row for each joint",
+                    closest(key, ["point", *_XYZ, "unit"]),
+                    Code.UNKNOWN_COLUMN,
+                )
+            )
     named = []
     for _, cells in lines[1:]:
         if len(cells) != len(header):

@@ -89,6 +89,7 @@ def forward_kinematics(
     UsageError
         If the readings are too few, not finite, or so large that their unit must be wrong.
     """
+    _check_machine(mechanism)
     start = None if start is None else pose_of(start)
     # Continue from the last configuration if this call starts at the last pose.
     T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
@@ -180,7 +181,7 @@ class Follower:
         UsageError
             If the readings are too few, not finite, or of a wrong unit.
         """
-        readings = _readings(self._machine, np.asarray(q, dtype=np.float64)[None])[0]
+        readings = _readings(self._machine, _numbers(q)[None], single=True)[0]
         reached = follow(self._machine, self.configuration, readings)
         pose = platform_pose(self._machine, reached)
         failure = _disagreement(self._machine, pose, readings)
@@ -219,7 +220,7 @@ def followed_poses(
     If a row is not reached, its failure comes with the pose of the nearest reached row, or home.
     Arguments and other exceptions as in :func:`forward_kinematics_many`.
     """
-    readings = _readings(machine, np.asarray(q, dtype=np.float64))
+    readings = _readings(machine, _numbers(q))
     reached = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
     if not on_the_chain:
         poses, part = follow_poses(machine, machine.home, reached[0], readings, LONG_STEP)
@@ -284,6 +285,7 @@ def inverse_kinematics(mechanism: Machine, T_base_platform: Pose) -> Array:
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
+    _check_machine(mechanism)
     T_base_platform = pose_of(T_base_platform)
     away = float(np.linalg.norm(T_base_platform.translation - mechanism.home.translation))
     if away > MAX_AWAY * mechanism.size:
@@ -322,8 +324,31 @@ def _disagreement(
     )
 
 
-def _readings(machine: Machine, q: Array) -> Array:
-    """Return the readings of the motors, (n_rows, n_motors), checked."""
+def _check_machine(machine: object) -> None:
+    """Raise UsageError unless it is a machine."""
+    if not isinstance(machine, Machine):
+        raise UsageError(
+            f"The machine could not be used: found a {type(machine).__name__}, needed a Machine; "
+            "load it with legcal.load_mechanism."
+        )
+
+
+def _numbers(q: ArrayLike) -> Array:
+    """Return readings as an array."""
+    try:
+        return np.asarray(q, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(
+            f"The pose could not be computed: found readings in a {type(q).__name__} that are no "
+            "array of numbers, needed one number for each leg or motor [m, rad]; convert them."
+        ) from None
+
+
+def _readings(machine: Machine, q: Array, *, single: bool = False) -> Array:
+    """Return the readings of the motors, (n_rows, n_motors), checked.
+
+    Messages do not number the row of a *single* pose.
+    """
     motors = list(machine.motors)
     if q.ndim != 2 or q.shape[1] not in {machine.n_legs, len(motors)}:
         of_motors = f", or ({len(motors)},), one for each motor" * (len(motors) < machine.n_legs)
@@ -341,7 +366,7 @@ def _readings(machine: Machine, q: Array) -> Array:
         row, column = far[0]
         unit, other = ("rad", "degrees") if legs[column].reads_angle else ("m", "mm")
         raise UsageError(
-            f"The pose of row {row + 1} could not be computed: found the reading "
+            f"{_which(row, single)} could not be computed: found the reading "
             f"{readings[row, column]:g} {unit} of leg '{machine.leg_names[motors[column]]}', which "
             f"reads {home[column]:.3g} {unit} at home, probably in {other}; convert the readings."
         )
@@ -351,11 +376,16 @@ def _readings(machine: Machine, q: Array) -> Array:
         row, column = wrong[0]
         name = machine.leg_names[machine.motors[column]]
         raise UsageError(
-            f"The pose of row {row + 1} could not be computed: found the reading "
+            f"{_which(row, single)} could not be computed: found the reading "
             f"{readings[row, column]:g} of leg '{name}', needed a finite number above a leg length "
             "of zero; correct the reading."
         )
     return readings
+
+
+def _which(row: int, single: bool) -> str:
+    """Return the pose of a row in words."""
+    return "The pose" if single else f"The pose of row {row + 1}"
 
 
 def _check_determined(machine: Machine) -> None:

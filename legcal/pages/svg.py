@@ -335,9 +335,12 @@ def scatter(
 
     *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y.
     """
-    left, top, width, height = 52.0, 8.0, 340.0, 290.0
+    top, width, height = 8.0, 340.0, 290.0
     x, y = (np.concatenate([points[k] for points in groups]) for k in range(2))
     (x_low, x_high), (y_low, y_high) = _limits(x), _limits(y)
+    y_ticks = [(tick, f"{tick:g}") for tick in ticks(y_low, y_high, 5)]
+    # The title of the axis stands beside the longest label.
+    left = max(52.0, 28.0 + 6.6 * max((len(label) for _, label in y_ticks), default=0))
     names = [shortened(word, 14) for word in words]
     upwards = sum(map(len, names)) > 34
     bottom = height - (44.0 if not upwards else 26.0 + 6.5 * max(map(len, names)))
@@ -350,10 +353,10 @@ def scatter(
         return [[u, v] for u, v in uv.tolist()]
 
     canvas = Canvas(width, height, title)
-    for tick in ticks(y_low, y_high, 5):
+    for tick, word in y_ticks:
         v = bottom - sy * (tick - y_low)
         canvas.line(left, v, width - 6.0, v, GREY if tick == 0.0 else RULE)
-        canvas.text(left - 6.0, v + 4.0, f"{tick:g}", anchor="end", size=11, colour=DIM)
+        canvas.text(left - 6.0, v + 4.0, word, anchor="end", size=11, colour=DIM)
     every = -(-len(names) // 24)
     marks = list(zip(range(len(names)), names, strict=True))[::every] if words else [
         (tick, f"{tick:g}") for tick in ticks(x_low, x_high, 5)
@@ -367,7 +370,8 @@ def scatter(
                 u + 4.0, bottom + 6.0, word, anchor="end", size=11, colour=DIM, upwards=True
             )
         else:
-            canvas.text(u, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
+            at = min(u, width - 3.3 * len(word))  # so that the last one is not cut
+            canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
     canvas.line(left, top, left, bottom, GREY)
     if diagonal:
         ends = np.array([max(x_low, y_low), min(x_high, y_high)])

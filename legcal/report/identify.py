@@ -90,7 +90,10 @@ def _recommendation(report: Identifiability) -> list[Part]:
         words = f"{number} view{'s' * (number != 1)}: {views}"
         rows.append((words, str(view_set.legs_a_view), sigma + judged))
     columns = ("smallest sufficient sets of views", ">legs each", "sigma [mm]")
-    legend = "sigma: predicted error of the platform; *: the set of this report"
+    legend = "sigma: predicted error of the platform, all sets at the same poses; *: the set of "
+    legend += "this report"
+    if report.platform_sigma is not None:
+        legend += ", whose own camera places and poses give the error below"
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 

@@ -125,6 +125,7 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
         for name, view in views.items()
     ]
     folder = shlex.quote(document["dataset"])
+    length = f"--length {to_measure}=MEASURED±SIGMAmm"
     return report(
         heading(
             document["mechanism"],
@@ -140,8 +141,8 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
             "travel.",
             Text(
                 "Readings of motors that turn carry no length, and nothing else in this dataset "
-                "does: simulate with --board charuco, or calibrate with --length "
-                f"{to_measure}=MEASURED±SIGMAmm.",
+                "does: simulate with --board charuco, or measure a rod and calibrate with its "
+                "length, as below.",
                 style="yellow",
             )
             if to_measure
@@ -152,7 +153,8 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
             for line in (
                 f"written: {document['dataset']}",
                 f"the true model: {document['truth']}",
-                f"calibrate with: legcal calibrate {folder} -o OUT",
+                f"calibrate with: legcal calibrate {folder} -o OUT"
+                + (f" {length}" if to_measure else ""),
                 f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
             )
         ],

@@ -169,8 +169,8 @@ with {plan.camera.width} x {plan.camera.height} px and a focal length of \
     place = (
         "Take each image from about the position in poses.csv; the whole board must be in it."
         if hand_held
-        else f"Set the tripod to {cm:g} cm and {deg:g} deg: measure the distances from the lens, "
-        "then turn the camera until the picture looks as its preview."
+        else f"Set the tripod to within {float(f'{cm:.2g}'):g} cm and {deg:.3g} deg: measure the "
+        "distances from the lens, then turn the camera until the picture looks as its preview."
     )
     items = [
         first,
