@@ -18,7 +18,12 @@ from legcal.calibration.identify.remedies import (
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
-from legcal.calibration.identify.scale import is_scale_open, refusal_of_scale, scale_sources
+from legcal.calibration.identify.scale import (
+    is_scale_open,
+    n_open_with_radii,
+    refusal_of_scale,
+    scale_sources,
+)
 from legcal.calibration.identify.session import (
     THIN,
     Session,
@@ -239,7 +244,8 @@ def check_identifiable(
     analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
     is_open = bool(analysis.session.actuators) and is_scale_open(analysis)
-    if is_open and sum(not direction.harmless for direction in full.weak) <= 1:  # nothing else
+    n_harmless = sum(direction.harmless for direction in full.weak)
+    if is_open and n_open_with_radii(analysis) <= n_harmless:  # nothing else is open
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     if not full.complete:
         raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))

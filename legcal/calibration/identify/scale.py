@@ -66,7 +66,7 @@ def is_scale_open(analysis: Analysis) -> bool:
     """
     analysis = replace(analysis, noise=WHITE)  # what is known of lengths, and not of edges
     stated = _stated_radii(analysis)
-    if _n_open(analysis, stated) > _n_open(analysis, _all_known(analysis)):
+    if _n_open(analysis, stated) > n_open_with_radii(analysis):
         return True
     if not analysis.choices.priors:
         return False
@@ -82,6 +82,11 @@ def is_scale_open(analysis: Analysis) -> bool:
 def _n_open(analysis: Analysis, sigma_radii: Mapping[str, float]) -> int:
     """Count the open directions for standard deviations of radii [m]."""
     return len(undetermined(analysis.session, _information(analysis, sigma_radii)))
+
+
+def n_open_with_radii(analysis: Analysis) -> int:
+    """Count the directions that stay open where radii are known exactly."""
+    return _n_open(analysis, _all_known(analysis))
 
 
 def _all_known(analysis: Analysis) -> dict[str, float]:
@@ -104,7 +109,7 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
     mean = np.zeros(len(session.unit))  # of the relative errors of lengths
     mean[columns] = 1.0 / (len(columns) * lengths)
     undetermined_directions = undetermined(session, information)
-    leaves_more = len(undetermined_directions) > _n_open(analysis, _all_known(analysis))
+    leaves_more = len(undetermined_directions) > n_open_with_radii(analysis)
     if leaves_more or np.linalg.norm(undetermined_directions @ mean) > _OPEN * np.linalg.norm(mean):
         return None
     _, singular, basis = np.linalg.svd(information, full_matrices=False)
