@@ -53,7 +53,7 @@ def test_labels_of_a_chart_are_neither_cut_nor_under_the_title_of_their_axis() -
     points = Points(1000.0 * few, 0.00125 * (2.0 * few - 1.0), np.arange(3))
     drawing = html.fromstring(str(scatter("a chart", [points], "place [px]", "residual [px]")))
     labels = {text.text: text for text in drawing.iter("text")}
-    ends = {label: float(text.get("x")) for label, text in labels.items() if text.get("x")}
+    ends = {label: float(text.get("x") or "nan") for label, text in labels.items()}
     width = 6.2  # of a digit, at most [px]
     assert ends["-0.001"] - width * len("-0.001") > 16.0  # right of the title
     assert ends["1000"] + 0.5 * width * len("1000") <= 340.0

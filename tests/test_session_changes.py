@@ -47,7 +47,8 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Start]:
     folder = tmp_path_factory.mktemp("shared") / "set"
     dataset = load_dataset(simulated(folder, "hexapod", poses=12, shared_poses=True).folder)
     m = dataset.measurements
-    dataset = replace(dataset, measurements=replace(m, time=10.0 * m.pose + m.view))
+    time = np.asarray(10.0 * m.pose + m.view, dtype=np.float64)
+    dataset = replace(dataset, measurements=replace(m, time=time))
     solution = calibrate(dataset).solution
     return dataset, Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "nominal")
 
