@@ -49,6 +49,23 @@ CAMERAS = {
 }
 
 
+def _with_noise(
+    image: list[Array],
+    points: list[Array],
+    px: list[Array],
+    noise: float,
+    rng: np.random.Generator,
+) -> BoardImages:
+    """Return the corners of images, each list one entry an image, with noise [px]."""
+    exact = np.concatenate(px)
+    return BoardImages(
+        np.concatenate(image).astype(np.intp),
+        np.concatenate(points),
+        exact + noise * rng.standard_normal(exact.shape),
+        np.full(len(exact), noise),
+    )
+
+
 def seen_corners(
     camera: Camera,
     n_images: int,
@@ -96,13 +113,7 @@ def seen_corners(
         points.append(BOARD.points[inside])
         error = root @ rng.standard_normal(at.shape) if smooth else np.zeros(at.shape)
         px.append((at + error)[inside])
-    exact = np.concatenate(px)
-    return BoardImages(
-        np.concatenate(image).astype(np.intp),
-        np.concatenate(points),
-        exact + noise * rng.standard_normal(exact.shape),
-        np.full(len(exact), noise),
-    )
+    return _with_noise(image, points, px, noise, rng)
 
 
 def wide_camera(model: DistortionModel) -> Camera:
@@ -146,13 +157,7 @@ def corners_at_the_edge(
         image.append(np.full(np.count_nonzero(inside), len(image)))
         points.append(_WIDE_BOARD.points[inside])
         px.append(seen[inside])
-    exact = np.concatenate(px)
-    return BoardImages(
-        np.concatenate(image).astype(np.intp),
-        np.concatenate(points),
-        exact + NOISE_PX * rng.standard_normal(exact.shape),
-        np.full(len(exact), NOISE_PX),
-    )
+    return _with_noise(image, points, px, NOISE_PX, rng)
 
 
 def projection_errors(truth: Camera, camera: Camera, covariance: Array) -> Array:

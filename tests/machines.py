@@ -9,13 +9,14 @@ import yaml
 from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
+import legcal
 from legcal.geometry.types import Array
 from legcal.machine.description_table import described_machine
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.family import description_of
 from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
+from legcal.machine.model_builder import Created, create_model
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -164,6 +165,20 @@ def regular(legs: str, platform_radius: float = 150.0) -> Any:
         low, high = (100, 300) if flat else (350, 530)
         table |= {"min_length": low, "max_length": high}
     return described_machine(table, Path("regular"))
+
+
+def created_hexapod(folder: Path) -> Created:
+    """Return a hexapod as ``legcal new --family hexapod`` writes it."""
+    return legcal.new(
+        output=folder,
+        family="hexapod",
+        unit="mm",
+        base_radius=200,
+        platform_radius=100,
+        height=300,
+        min_length=250,
+        max_length=420,
+    )
 
 
 def with_round_arms(name: str, radius: float = 8.0) -> Any:

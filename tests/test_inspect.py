@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import yaml
 from csv_rows import read_rows, write_rows
-from machines import regular
+from machines import created_hexapod, regular
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from simulated import simulated
 
-import legcal
 from legcal import evaluate, load_mechanism
 from legcal.calibration.evaluation import Evaluation
 from legcal.errors import DidNotConverge, ModelError
@@ -171,16 +170,7 @@ def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good
     tmp_path: Path,
 ) -> None:
     """A hexapod whose platform is turned by 90 degrees can turn with all motors locked."""
-    made = legcal.new(
-        output=tmp_path,
-        family="hexapod",
-        unit="mm",
-        base_radius=200,
-        platform_radius=100,
-        height=300,
-        min_length=250,
-        max_length=420,
-    ).machine
+    made = created_hexapod(tmp_path).machine
     content = yaml.safe_load(made.yaml_path.read_text())
     turned = made.home.rotation * Rotation.from_euler("z", 90, degrees=True)
     content["legcal"]["home"]["quat_xyzw"] = turned.as_quat().tolist()

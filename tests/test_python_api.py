@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hexapod_example import ROOT, Run
+from machines import created_hexapod
 from matplotlib import pyplot
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
@@ -187,16 +188,7 @@ def test_readings_are_taken_by_leg_or_by_motor_and_in_metres_and_radians() -> No
 def test_models_are_written_and_exported_without_the_command_line(
     example_run: Run, tmp_path: Path
 ) -> None:
-    created = legcal.new(
-        output=tmp_path,
-        family="hexapod",
-        unit="mm",
-        base_radius=200,
-        platform_radius=100,
-        height=300,
-        min_length=280,
-        max_length=420,
-    )
+    created = created_hexapod(tmp_path)
     assert isinstance(created.machine, legcal.Machine)
     assert created.yaml_path.is_file()
     with pytest.raises(UsageError, match="found the dimension 'radius', needed some of family"):

@@ -143,7 +143,8 @@ def doubts_of(
     if mistakes := _mistakes(diagnosis):
         return tuple(mistakes)
     changes = _Changes.of(dataset, solution)
-    course = _changes(dataset, solution, platform, session)
+    noise = _noise(solution, session, platform)
+    course = _changes(dataset, solution, platform, session, scatters=bool(noise))
     # A scale that all motors share is one witness of the scale against the others
     is_of_scale = any(one.kind == "pitch" for one in session.findings)
     scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
@@ -156,7 +157,7 @@ def doubts_of(
     symptoms = (
         []
         if causes
-        else _symptoms(dataset, solution, platform, changes, held_out, session, predicted)
+        else [*_symptoms(dataset, solution, platform, changes, held_out, predicted), *noise]
     )
     if session.findings and any(one.code in OF_SCATTER for one in symptoms):
         # Certain changes, too small to count by themselves, are what makes outlines scatter
@@ -185,7 +186,6 @@ def _symptoms(
     platform: PlatformAccuracy | None,
     changes: _Changes,
     held_out: HeldOut | None,
-    session: SessionTests,
     predicted: CrossValidation | None,
 ) -> list[Doubt]:
     """Return the doubts that a change in the course of a session, or two scales, cause as well."""
@@ -194,7 +194,6 @@ def _symptoms(
         *_held_out(held_out),
         *_cameras(solution, platform),
         *_left_out(predicted, platform),
-        *_noise(solution, session, platform),
     ]
 
 
@@ -412,6 +411,8 @@ def _changes(
     solution: Solution,
     platform: PlatformAccuracy | None,
     session: SessionTests,
+    *,
+    scatters: bool,
 ) -> list[Doubt]:
     """Return what changed in the course of the session, and readings that do not follow motors.
 
@@ -419,12 +420,13 @@ def _changes(
     also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
     """
     doubts = []
-    scatters = READING_NOISE if _noise(solution, session, platform) else ""
     for finding in session.findings:
         effect = None if platform is None else _effect_of(finding, dataset, solution)
         if platform is None or effect is None:
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
-        elif effect[0] > platform.sigma.mean_displacement or finding.kind == scatters:
+        elif effect[0] > platform.sigma.mean_displacement or (
+            scatters and finding.kind == READING_NOISE
+        ):
             doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
     return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
 

@@ -16,11 +16,11 @@ import numpy as np
 from legcal.exports.firmware import firmware_files, firmware_refusal
 from legcal.exports.identifiers import comment
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
+from legcal.machine.hexapod_files import STRUTS
 from legcal.machine.leg import LegKind
 from legcal.machine.model import readings_at
 from legcal.version import __version__
 
-N_STRUTS = 6
 _MM = 1e3
 
 
@@ -38,7 +38,7 @@ def hexapod_refusal(subject: Subject) -> str | None:
     if machine.actuators:
         motor = machine.actuators[0]
         return f"found that the motor '{motor.joint}' moves joints at A, {needed}"
-    if len(legs) != N_STRUTS:
+    if len(legs) != STRUTS:
         return f"found {len(legs)} legs, {needed}"
     others = [
         f"'{leg.name}' of type {leg.type}{'' if leg.is_motor else ' without motor'}"
