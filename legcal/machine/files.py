@@ -32,49 +32,48 @@ def find_model(model: str | Path) -> Path:
     """
     path = Path(model)
     names = shipped_names()
-    is_shipped = str(model) in names
-    if os.path.isdir(path) and not is_shipped:
-        if (path / FOLDER_YAML).is_file():
-            return path / FOLDER_YAML
-        if (path / RESULT_YAML).is_file():
-            if RESULT.is_in(path):
-                return path / RESULT_YAML
-            raise ModelError(
-                "the mechanism could not be read",
-                f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
-                "both",
-                f"copy the result folder again, or give {path / RESULT_YAML} if it is the "
-                "model that you mean",
-                path,
-            )
-        if (path / DATASET_YAML).is_file():
-            raise ModelError(what_a_dataset_is_for(path))
-        raise ModelError(
-            "the mechanism could not be read",
-            f"a folder without {FOLDER_YAML}",
-            "a folder with it, a result folder, or a YAML, URDF or MJCF file",
-            "give the file",
-            path,
-        )
-    if os.path.exists(path) and not os.path.isdir(path):
-        if path.suffix.lower() == ".csv":
-            raise ModelError(
-                "the mechanism could not be read: found a CSV file, needed a mechanism YAML, "
-                f"URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR",
-                file=path,
-            )
-        return path
-    if is_shipped:
-        return shipped_folder("models") / f"{model}.yaml"
-    raise ModelError(
-        Problem(
-            "the mechanism could not be read",
+    refused = "the mechanism could not be read"
+    if str(model) in names:
+        return path if os.path.isfile(path) else shipped_folder("models") / f"{model}.yaml"
+    if not os.path.exists(path):
+        bad = Problem(
+            refused,
             "no such file and no shipped model of that name",
             f"a mechanism YAML, its URDF, or one of {', '.join(names)}",
             "check the path",
             str(path),
             code=Code.MISSING_FILE,
         )
+        raise ModelError(bad)
+    if not os.path.isdir(path):
+        if path.suffix.lower() == ".csv":
+            raise dimensions_alone("a CSV file", path)
+        return path
+    if (path / FOLDER_YAML).is_file():
+        return path / FOLDER_YAML
+    if RESULT.is_in(path) and (path / RESULT_YAML).is_file():
+        return path / RESULT_YAML
+    if (path / RESULT_YAML).is_file():
+        raise ModelError(
+            refused,
+            f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
+            "both",
+            f"copy the result folder again, or give {path / RESULT_YAML} if it is the model that "
+            "you mean",
+            path,
+        )
+    if (path / DATASET_YAML).is_file():
+        raise ModelError(what_a_dataset_is_for(path))
+    needed = "a folder with it, a result folder, or a YAML, URDF or MJCF file"
+    raise ModelError(refused, f"a folder without {FOLDER_YAML}", needed, "give the file", path)
+
+
+def dimensions_alone(kind: str, path: Path) -> ModelError:
+    """Return the refusal of a file that holds dimensions of a machine but is no model."""
+    return ModelError(
+        f"the mechanism could not be read: found {kind}, needed a mechanism YAML, URDF or MJCF "
+        f"file; make a model of its dimensions with: legcal new {path} -o DIR",
+        file=path,
     )
 
 
@@ -98,14 +97,15 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
     for path in near:
         if path.is_file():
             return path
-    raise ModelError(
-        Problem(
-            f"the URDF of the mechanism could not be found: looked for {near[0]} and "
-            f"{near[1]}, needed one of them; write its path in legcal.urdf.",
-            file=str(yaml_path),
-            code=Code.MISSING_FILE,
-        )
+    bad = Problem(
+        "the URDF of the mechanism could not be found",
+        f"neither {near[0]} nor {near[1]}",
+        "one of them",
+        "write its path in legcal.urdf",
+        str(yaml_path),
+        code=Code.MISSING_FILE,
     )
+    raise ModelError(bad)
 
 
 def read_file(path: Path, kind: str) -> bytes:

@@ -256,22 +256,13 @@ class MjcfReader:
         centred = not np.asarray(T_body_joint.translation).any()
         child = part.body if last and centred else self._unused(f"{name}_link")
         if kind == "ball":
-            self._ball(name, at, child, T_at_body * T_body_joint)
+            axes = dict(zip("xyz", np.eye(3), strict=True))
+            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes, self._names)
         else:
             self._one_axis(part, attributes, name, kind, (at, child), T_at_body * T_body_joint)
         if child != part.body:
             self.tree.link(child)
         return child, EYE if child == part.body else T_body_joint.inv()
-
-    def _ball(self, name: str, at: str, child: str, T_at_joint: RigidTransform) -> None:
-        """Write a ball joint as three revolutes, perpendicular in the configuration of the file."""
-        for axis, letter in zip(np.eye(3), "xyz", strict=True):
-            after = child if letter == "z" else self._unused(f"{name}_{letter}_link")
-            if after != child:
-                self.tree.link(after)
-            joint = self._unused(f"{name}_{letter}")
-            self.tree.joint(joint, "revolute", at, after, T_at_joint, axis)
-            at, T_at_joint = after, EYE
 
     def _one_axis(
         self,

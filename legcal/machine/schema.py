@@ -1,14 +1,14 @@
 """The YAML of a mechanism: its schema, strict reading, and writing."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from legcal.errors import BadValue, DatasetError, ModelError, Problem
+from legcal.errors import BadValue, DatasetError, ModelError, Problems
 from legcal.files.motions import MotionEntry
 from legcal.files.published import with_schema
 from legcal.files.schema import (
@@ -21,7 +21,12 @@ from legcal.files.schema import (
     validate,
 )
 from legcal.machine.actuator import Actuator
-from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
+from legcal.machine.files import (
+    DATASET_YAML,
+    dimensions_alone,
+    read_file,
+    what_a_dataset_is_for,
+)
 from legcal.machine.tolerance import BuiltEntry
 
 FILE_KIND = "mechanism file"
@@ -89,16 +94,23 @@ class MechanismFile(BaseModel):
 def read_mechanism_file(path: Path) -> MechanismFile:
     """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
     content = read_file(path, FILE_KIND)
-    _refuse_other_text(content, path)
+    lines = (line.strip() for line in content.splitlines())
+    first = next((line for line in lines if line and line[:1] not in b"#;"), b"")
+    for kind, pattern in _OTHER_TEXT.items():
+        if pattern.match(first):
+            raise dimensions_alone(kind, path)
     try:
         document = parse_yaml(content, path, FILE_KIND)
-        _check_kind(document, path)
-        file = validate(MechanismFile, _without_nulls(document), path)
+        if "legcal_table" in document:
+            raise dimensions_alone("a table of legs (legcal_table)", path)
+        if path.name == DATASET_YAML:
+            raise ModelError(what_a_dataset_is_for(path))
+        optional = ("joint_name", "joint_type")  # YAML reads an empty list as null
+        stated = {k: v for k, v in document.items() if v is not None or k not in optional}
+        file = validate(MechanismFile, stated, path)
     except DatasetError as error:
         raise ModelError(error.facts) from error
-    problems = _contradictions(file, path)
-    if problems:
-        raise ModelError(problems)
+    _check_contradictions(file, path)
     return file
 
 
@@ -109,121 +121,40 @@ _OTHER_TEXT = {  # kinds of files of other programs, by the first line that is n
 }
 
 
-def _refuse_other_text(content: bytes, path: Path) -> None:
-    """Refuse files of other programs that hold dimensions but are no model."""
-    lines = (line.strip() for line in content.splitlines())
-    first = next((line for line in lines if line and line[:1] not in b"#;"), b"")
-    kind = next((kind for kind, pattern in _OTHER_TEXT.items() if pattern.match(first)), None)
-    if kind is not None:
-        raise ModelError(
-            f"the {FILE_KIND} could not be read",
-            kind,
-            "a mechanism YAML, URDF or MJCF file",
-            f"make a model of it with: legcal new {path} -o DIR",
-            path,
-        )
-
-
-def _check_kind(document: Mapping[str, Any], path: Path) -> None:
-    """Refuse other YAML files of legcal, with the command for each."""
-    if "legcal_table" in document:
-        raise ModelError(
-            f"the {FILE_KIND} could not be read: found a table of legs (legcal_table), needed "
-            f"a model; write the model of the table with: legcal new {path} -o DIR",
-            file=path,
-        )
-    if path.name == DATASET_YAML:
-        raise ModelError(what_a_dataset_is_for(path))
-
-
-def _without_nulls(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the mapping without empty optional lists, which YAML reads as null."""
-    return {
-        k: v for k, v in document.items() if v is not None or k not in ("joint_name", "joint_type")
-    }
-
-
-def _contradictions(file: MechanismFile, path: Path) -> list[Problem]:
-    """Return the contradictions within the file."""
-    problems = []
-    if len(file.type) != len(file.closed_loop):
-        problems.append(
-            Problem(
-                "the loops could not be closed",
-                f"{len(file.closed_loop)} pairs in closed_loop and {len(file.type)} "
-                "entries in type",
-                "equal numbers",
-                "write one type for each pair",
-                str(path),
-            )
-        )
-    problems += [
-        Problem(
-            f"type.{i} could not be used",
-            f"'{kind}'",
-            "'3d' (points coincide) or '6d' (frames coincide)",
-            "correct it",
-            str(path),
-        )
-        for i, kind in enumerate(file.type)
-        if kind not in ("3d", "6d")
-    ]
-    if len(file.closed_loop) > MAX_LOOPS:
-        problems.append(
-            Problem(
-                "the loops could not be closed",
-                f"{len(file.closed_loop)} pairs in closed_loop",
-                f"at most {MAX_LOOPS}",
-                "give one mechanism",
-                str(path),
-            )
-        )
-    if not file.closed_loop:
-        problems.append(
-            Problem(
-                "the mechanism could not be closed",
-                "no pair in closed_loop",
-                "the loops of a parallel mechanism",
-                "write the pairs of frames that coincide",
-                str(path),
-            )
+def _check_contradictions(file: MechanismFile, path: Path) -> None:
+    """Refuse contradictions within the file."""
+    problems, n_pairs = Problems(path), len(file.closed_loop)
+    refused = "the loops could not be closed"
+    if len(file.type) != n_pairs:
+        counts = f"{n_pairs} pairs in closed_loop and {len(file.type)} entries in type"
+        problems.add(refused, counts, "equal numbers", "write one type for each pair")
+    needed = "'3d' (points coincide) or '6d' (frames coincide)"
+    for i, kind in enumerate(file.type):
+        if kind not in ("3d", "6d"):
+            problems.add(f"type.{i} could not be used", f"'{kind}'", needed, "correct it")
+    if n_pairs > MAX_LOOPS:
+        at_most = f"at most {MAX_LOOPS}"
+        problems.add(refused, f"{n_pairs} pairs in closed_loop", at_most, "give one mechanism")
+    if not n_pairs:
+        problems.add(
+            "the mechanism could not be closed",
+            "no pair in closed_loop",
+            "the loops of a parallel mechanism",
+            "write the pairs of frames that coincide",
         )
     if len(file.joint_name) != len(file.joint_type):
-        problems.append(
-            Problem(
-                "joint_name could not be used",
-                f"{len(file.joint_name)} names and {len(file.joint_type)} entries in joint_type",
-                "equal numbers",
-                "write one type for each joint",
-                str(path),
-            )
-        )
-    repeated = sorted({name for name in file.name_mot if file.name_mot.count(name) > 1})
-    problems += [
-        Problem(
-            "name_mot could not be used",
-            f"'{name}' more than once",
-            "each motor once",
-            "remove the repetition",
-            str(path),
-        )
-        for name in repeated
-    ]
-    block = file.legcal
-    if block is None:
-        return problems
-    problems += [
-        Problem(
-            "legcal.base_frame could not be used",
-            f"'{name}', which is not a leg",
-            "",
-            closest(name, block.legs),
-            str(path),
-        )
-        for name in block.base_frame or ()
-        if name not in block.legs
-    ]
-    return problems
+        counts = f"{len(file.joint_name)} names and {len(file.joint_type)} entries in joint_type"
+        refused, remedy = "joint_name could not be used", "write one type for each joint"
+        problems.add(refused, counts, "equal numbers", remedy)
+    for name in sorted({name for name in file.name_mot if file.name_mot.count(name) > 1}):
+        refused, remedy = "name_mot could not be used", "remove the repetition"
+        problems.add(refused, f"'{name}' more than once", "each motor once", remedy)
+    legs = file.legcal.legs if file.legcal else {}
+    for name in (file.legcal and file.legcal.base_frame) or ():
+        if name not in legs:
+            refused, remedy = "legcal.base_frame could not be used", closest(name, legs)
+            problems.add(refused, f"'{name}', which is not a leg", remedy=remedy)
+    problems.raise_if_any()
 
 
 def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:

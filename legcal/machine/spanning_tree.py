@@ -98,6 +98,25 @@ class UrdfBuilder:
             f"<child link={child}/>{inside}</joint>"
         )
 
+    def turns(
+        self,
+        name: str,
+        parent: str,
+        child: str,
+        T_parent_origin: RigidTransform,
+        axes: Mapping[str, Array],
+        taken: Set[str] = frozenset(),
+    ) -> None:
+        """Add a ball or universal joint as revolutes, by their letters, with links between them."""
+        last = [*axes][-1]
+        for letter, axis in axes.items():
+            after = child if letter == last else self.unused(f"{name}_{letter}_link", taken)
+            if after != child:
+                self.link(after)
+            joint = self.unused(f"{name}_{letter}", taken)
+            self.joint(joint, "revolute", parent, after, T_parent_origin, axis)
+            parent, T_parent_origin = after, EYE
+
     def body(self) -> str:
         """Return the lines of all links and joints."""
         return "\n".join([*self.links.values(), *self.joints.values()])
