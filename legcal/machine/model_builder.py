@@ -274,7 +274,7 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
             "--output, or --force to replace them."
         )
     try:
-        return replace(_write(machine, described.source, output), notes=tuple(described.notes))
+        return _write(machine, output)
     except OSError as error:
         raise OutOfResources(
             f"{output}: the model could not be written: found '{error.strerror}', needed a folder "
@@ -287,7 +287,7 @@ def model_paths(name: str, output: Path) -> tuple[Path, Path]:
     return output / "models" / f"{name}.yaml", output / "urdf" / f"{name}.urdf"
 
 
-def _write(machine: Assembled, source: str, output: Path) -> Created:
+def _write(machine: Assembled, output: Path) -> Created:
     """Write and load the files in a temporary folder, then move them to their places."""
     made = [path for path in (output, *output.parents) if not path.exists()]
     output.mkdir(parents=True, exist_ok=True)
@@ -297,7 +297,7 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
             for path, text in zip(written, (yaml_text(machine), urdf_text(machine)), strict=True):
                 path.parent.mkdir()
                 path.write_bytes(text.encode())
-            _load(written[0], temporary, source)
+            _load(written[0], temporary, machine.source)
             places = model_paths(machine.name, output)
             for path in places:
                 if not path.parent.is_dir():
@@ -311,7 +311,7 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
             if folder.is_dir() and not os.listdir(folder):
                 folder.rmdir()
         raise
-    return Created(load_mechanism(places[0]), *places)
+    return Created(load_mechanism(places[0]), *places, machine.notes)
 
 
 def _load(path: Path, temporary: Path, source: str) -> None:
