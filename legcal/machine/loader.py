@@ -30,9 +30,9 @@ from legcal.machine.classification import (
 )
 from legcal.machine.cylinders import (
     at_visible_heights,
-    visual_cylinders,
     with_arms,
     with_cylinders,
+    with_mesh_cylinders,
 )
 from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import (
@@ -53,7 +53,6 @@ from legcal.machine.leg import (
     LegChain,
     redirected,
 )
-from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
@@ -225,7 +224,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     _check_legs(chains, spatial=normals is None, path=yaml_path)
     check_plane(block, bodies, urdf, normals, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
-    shown = visual_cylinders(urdf)
+    solids = visual_solids(urdf)
+    shown = [solid.cylinder for solid in solids if solid.cylinder is not None]
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
@@ -250,7 +250,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     frame_legs = tuple(names.index(name) for name in base_frame)
     legs = redirected(legs, frame_legs) if normals is None else legs
     legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
-    solids = visual_solids(urdf)
     occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
     machine = Machine(
         name=urdf.name,

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
@@ -31,7 +30,7 @@ from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
 from legcal.machine.schema import mechanism_yaml, motor_entries
-from legcal.machine.urdf import UrdfPatch, parse_robot
+from legcal.machine.urdf import UrdfPatch, written
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
@@ -103,15 +102,13 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
 
 def _with_paths(machine: Machine, destination: Path) -> bytes:
     """Return the URDF of a mechanism; meshes not found from a destination get absolute paths."""
-    robot, changed = parse_robot(machine.urdf.path, machine.urdf.content), False
+    robot, changed = machine.urdf.robot(), False
     for mesh in robot.iterfind("link/*/geometry/mesh"):
         file = mesh_file(machine.urdf.path, mesh.get("filename", ""))
         if file is not None and mesh_file(destination, mesh.get("filename", "")) is None:
             mesh.set("filename", file.resolve().as_posix())
             changed = True
-    if not changed:
-        return machine.urdf.content
-    return etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    return written(robot) if changed else machine.urdf.content
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:

@@ -336,7 +336,6 @@ class Urdf:
     links: tuple[str, ...]  # link names in the order of the file
     joints: dict[str, UrdfJoint]  # joints by name in the order of the file
     root: str  # the link without a parent
-    has_cylinders: bool  # whether any visual is a cylinder
     wording: Wording = BLOCK  # words for messages about the mechanism
 
     @property
@@ -420,7 +419,6 @@ def checked_tree(
         links=tuple(str(e.get("name")) for e in links),
         joints=tree,
         root=root,
-        has_cylinders=any(e.find("visual/geometry/cylinder") is not None for e in links),
     )
 
 
