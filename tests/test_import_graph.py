@@ -62,6 +62,7 @@ PUBLIC: dict[str, set[str]] = {
         "occluders",
         "parameter_id",
         "parameters",
+        "picture",
         "redundancy",
         "rods",
         "solved_poses",

@@ -12,8 +12,8 @@ from hexapod_example import ROOT
 from lxml import etree
 
 from legcal import load_mechanism
-from legcal.machine.drawing import draw_machine
 from legcal.machine.model import Machine, readings_at
+from legcal.machine.picture import draw_machine
 
 BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
         (289.8, -77.6)]  # fmt: skip

@@ -25,7 +25,7 @@ from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.drawing import draw_machine, joint_letter
+from legcal.machine.picture import draw_machine, joint_letter
 from legcal.pages.document import (
     MAX_ROWS,
     Cell,

@@ -340,10 +340,10 @@ def inspect(
     ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
-    from legcal.machine.drawing import MACHINE_PICTURE, draw_machine
     from legcal.machine.inspection import machine_document
     from legcal.machine.loader import load_mechanism
     from legcal.machine.model_writer import write_model
+    from legcal.machine.picture import MACHINE_PICTURE, draw_machine
     from legcal.report.machine import inspect_table
 
     if picture is not None:

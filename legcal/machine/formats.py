@@ -21,9 +21,17 @@ from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link, rigid_bodies
 from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
-from legcal.machine.files import find_model, find_urdf, is_xml, read_file, yaml_of_urdf
+from legcal.machine.files import (
+    MAX_LOOPS,
+    MechanismFile,
+    find_model,
+    find_urdf,
+    is_xml,
+    read_file,
+    read_mechanism_file,
+    yaml_of_urdf,
+)
 from legcal.machine.mjcf import read_mjcf_source
-from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.spanning_tree import (
     Loop,
     LoopKind,

@@ -40,6 +40,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
+from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.leg import (
@@ -64,7 +65,6 @@ from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
-from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent

@@ -22,7 +22,7 @@ from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
-from legcal.machine.schema import MAX_LOOPS, MechanismFile
+from legcal.machine.files import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
     EYE,
     FULL_TURN,

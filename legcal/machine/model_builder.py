@@ -15,10 +15,10 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
+from legcal.machine.files import mechanism_yaml, motor_entries
 from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.spanning_tree import (
     UrdfBuilder,
     axis_xml,

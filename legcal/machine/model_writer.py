@@ -21,7 +21,7 @@ from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.files import FOLDER_YAML, is_xml, read_file
+from legcal.machine.files import FOLDER_YAML, is_xml, mechanism_yaml, motor_entries, read_file
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -29,7 +29,6 @@ from legcal.machine.meshes import mesh_file
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
-from legcal.machine.schema import mechanism_yaml, motor_entries
 from legcal.machine.urdf import UrdfPatch, written
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML

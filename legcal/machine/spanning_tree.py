@@ -22,7 +22,7 @@ from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.chain import Closure
-from legcal.machine.schema import MechanismFile
+from legcal.machine.files import MechanismFile
 from legcal.machine.urdf import Urdf
 
 

@@ -30,9 +30,9 @@ from legcal.machine.classification import (
     parallel,
     undirected,
 )
+from legcal.machine.files import LegcalBlock
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.schema import LegcalBlock
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.urdf import Urdf
 
