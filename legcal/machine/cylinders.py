@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -26,15 +26,12 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, m
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
-from legcal.machine.bodies import Bodies, rigid_bodies
+from legcal.machine.bodies import Bodies
 from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.meshes import mesh_file, read_mesh
 from legcal.machine.spanning_tree import origin_xml, visual_xml
 from legcal.machine.urdf import Urdf
-
-if TYPE_CHECKING:
-    from legcal.machine.model import Machine
 
 PARALLEL = 1e-6
 COAXIAL = 10.0  # largest offset of the ends of a coaxial cylinder, in tolerances of joints
@@ -243,14 +240,14 @@ class Axis(NamedTuple):
     end: float
 
 
-def with_mesh_cylinders(machine: Machine, radius: float | None = None) -> tuple[Urdf, list[str]]:
+def with_mesh_cylinders(
+    urdf: Urdf, bodies: Bodies, legs: Sequence[Leg], base: str, radius: float | None = None
+) -> tuple[Urdf, list[str]]:
     """Return the tree with a cylinder for each leg and arm that is drawn as a mesh, and notes.
 
     With a *radius* [m] each leg without a cylinder of its own gets one of it.
     """
-    urdf = machine.urdf
-    bodies = rigid_bodies(urdf, machine.chain.closures, machine.platform_joint)
-    axes = _axes(machine, bodies)
+    axes = _axes(legs, bodies, base)
     added: dict[str, list[str]] = {}
     parts: dict[tuple[str, str, float], list[str]] = {}  # legs by mesh, diameter, length
     for link in urdf.robot().findall("link"):
@@ -272,7 +269,7 @@ def with_mesh_cylinders(machine: Machine, radius: float | None = None) -> tuple[
             parts.setdefault(key, []).append(axis.leg)
     if radius is not None:
         seen = {name for names in parts.values() for name in names}
-        for leg in machine.legs:
+        for leg in legs:
             if not leg.cylinders and leg.name not in seen:
                 for link_name, axis in _stated(leg, axes, bodies):
                     added.setdefault(link_name, []).append(_drawn(bodies, link_name, axis, radius))
@@ -290,11 +287,11 @@ def with_mesh_cylinders(machine: Machine, radius: float | None = None) -> tuple[
     ]
 
 
-def _axes(machine: Machine, bodies: Bodies) -> dict[str, list[Axis]]:
+def _axes(legs: Sequence[Leg], bodies: Bodies, base: str) -> dict[str, list[Axis]]:
     """Return the axes in each body along which a leg or an arm without a cylinder is drawn."""
     axes: dict[str, list[Axis]] = {}
     arms = set[str]()
-    for leg in machine.legs:
+    for leg in legs:
         chain = leg.urdf_chain
         halves = halves_of_leg(leg, chain)
         drawn = {bodies.body_of[c.link] for c in leg.cylinders}
@@ -310,9 +307,10 @@ def _axes(machine: Machine, bodies: Bodies) -> dict[str, list[Axis]]:
             continue
         arms.add(actuator.joint)
         T = matrix_inverse(chain.poses[1])  # from the base body to that of the arm, at zero
-        base = bodies.T_body_link[machine.base]
         foot = actuator.point + ((leg.A - actuator.point) @ actuator.axis) * actuator.axis
-        near, far = matrix_applied(matrix_product(T, base), np.stack([foot, leg.A]))
+        near, far = matrix_applied(
+            matrix_product(T, bodies.T_body_link[base]), np.stack([foot, leg.A])
+        )
         length = float(np.linalg.norm(far - near))
         axis = Axis(f"the arm of {leg.name}", near, (far - near) / length, 0.0, length)
         axes.setdefault(chain.bodies[0], []).append(axis)

@@ -308,10 +308,7 @@ def read_description(
     them; ``effector`` is the radius of the joints on the effector of a printer, in that unit.
     """
     given = {} if given is None else given
-    try:
-        content = content_of(path, FILE_KIND).decode("utf-8-sig", errors="replace")
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    content = content_of(path, FILE_KIND, ModelError).decode("utf-8-sig", errors="replace")
     if (of_firmware := firmware_table(path, content, unit, given, effector)) is not None:
         table, notes = of_firmware
         stated = {"name": name} if name is not None else {}
@@ -327,25 +324,25 @@ def read_description(
             f"{path}: --platform-radius could not be used: found a table of joints, needed the "
             "configuration of a printer, or --family; write the joints in the table."
         )
-    try:
-        if _is_csv(path, content):
+    if _is_csv(path, content):
+        try:
             table = read_columns(path, unit)
-            table["name"] = name or table["name"]
-            if not is_plain_name(table["name"]) and name is None:
-                raise DatasetError(
-                    f"{path}: the model could not be named after the file: found "
-                    f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
-                    "give it a name with --name NAME."
-                )
-        else:
-            table = read_yaml(path, FILE_KIND)
-            table = {key: value for key, value in table.items() if value is not None}
-            if name is not None:
-                table["name"] = name
-            if unit is not None:
-                table.setdefault("unit", unit)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+        except DatasetError as error:
+            raise ModelError(error.facts) from error
+        table["name"] = name or table["name"]
+        if not is_plain_name(table["name"]) and name is None:
+            raise ModelError(
+                f"{path}: the model could not be named after the file: found "
+                f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
+                "give it a name with --name NAME."
+            )
+    else:
+        table = read_yaml(path, FILE_KIND, ModelError)
+        table = {key: value for key, value in table.items() if value is not None}
+        if name is not None:
+            table["name"] = name
+        if unit is not None:
+            table.setdefault("unit", unit)
     _refuse_twice(path, table, given)
     if "version" in table and "legcal_table" not in table:
         raise ModelError(
@@ -378,10 +375,7 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     ModelError
         With one sentence for each entry that is impossible or contradicts others.
     """
-    try:
-        file = validate(TableFile, table, source)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    file = validate(TableFile, table, source, kind=ModelError)
     problems = _conflicting_entries(file, str(source))
     if problems:
         raise ModelError(problems)

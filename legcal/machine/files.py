@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem, Problems
+from legcal.errors import BadValue, Code, ModelError, Problem, Problems
 from legcal.files.folder import RESULT
 from legcal.files.motions import MotionEntry
 from legcal.files.published import with_schema
@@ -127,17 +127,9 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
     raise ModelError(bad)
 
 
-def read_file(path: Path, kind: str) -> bytes:
-    """Return the bytes of a mechanism file."""
-    try:
-        return content_of(path, kind)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
-
-
 def is_xml(path: Path) -> bool:
     """Return whether a file of a mechanism is XML, by its content."""
-    return read_file(path, "mechanism file").lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    return content_of(path, FILE_KIND, ModelError).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
 def yaml_of_urdf(path: Path) -> Path | None:
@@ -215,23 +207,20 @@ class MechanismFile(BaseModel):
 
 def read_mechanism_file(path: Path) -> MechanismFile:
     """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
-    content = read_file(path, FILE_KIND)
+    content = content_of(path, FILE_KIND, ModelError)
     lines = (line.strip() for line in content.splitlines())
     first = next((line for line in lines if line and line[:1] not in b"#;"), b"")
     for kind, pattern in _OTHER_TEXT.items():
         if pattern.match(first):
             raise dimensions_alone(kind, path)
-    try:
-        document = parse_yaml(content, path, FILE_KIND)
-        if "legcal_table" in document:
-            raise dimensions_alone("a table of legs (legcal_table)", path)
-        if path.name == DATASET_YAML:
-            raise ModelError(what_a_dataset_is_for(path))
-        optional = ("joint_name", "joint_type")  # YAML reads an empty list as null
-        stated = {k: v for k, v in document.items() if v is not None or k not in optional}
-        file = validate(MechanismFile, stated, path)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    document = parse_yaml(content, path, FILE_KIND, ModelError)
+    if "legcal_table" in document:
+        raise dimensions_alone("a table of legs (legcal_table)", path)
+    if path.name == DATASET_YAML:
+        raise ModelError(what_a_dataset_is_for(path))
+    optional = ("joint_name", "joint_type")  # YAML reads an empty list as null
+    stated = {k: v for k, v in document.items() if v is not None or k not in optional}
+    file = validate(MechanismFile, stated, path, kind=ModelError)
     _check_contradictions(file, path)
     return file
 

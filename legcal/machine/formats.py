@@ -17,17 +17,17 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
-from legcal.files.schema import closest
+from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link, rigid_bodies
 from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
 from legcal.machine.files import (
+    FILE_KIND,
     MAX_LOOPS,
     MechanismFile,
     find_model,
     find_urdf,
     is_xml,
-    read_file,
     read_mechanism_file,
     yaml_of_urdf,
 )
@@ -84,6 +84,7 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
     if source.file.legcal is not None:
+        check_one_mechanism(source.urdf, pairs, source.path)
         is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
         return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
@@ -161,7 +162,7 @@ def _read_xml(path: Path) -> Source:
     beside = yaml_of_urdf(path)
     if beside is not None and path.suffix.lower() != ".mjcf":
         return read_yaml_source(beside)
-    content = read_file(path, "mechanism file")
+    content = content_of(path, FILE_KIND, ModelError)
     root = parse_xml(path, content, "mechanism file")
     if root.tag == "mujoco":
         return read_mjcf_source(path, content)

@@ -73,9 +73,8 @@ from legcal.machine.topology import (
     VIRTUAL,
     Normals,
     any_joint,
-    check_bodies,
     check_plane,
-    check_type,
+    check_virtual,
     distinct_joint,
     find_chains,
     normals_in_links,
@@ -155,7 +154,10 @@ def _load(source: Source) -> Machine:
     except OutOfClass:
         _check_plane_of_arms(urdf, source.path)
         raise
-    drawn, round_parts = with_mesh_cylinders(machine, source.leg_radius)
+    bodies = rigid_bodies(source.urdf, closures, block.platform_joint)
+    drawn, round_parts = with_mesh_cylinders(
+        source.urdf, bodies, machine.legs, machine.base, source.leg_radius
+    )
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
         machine = _assemble(source, block, closures)
@@ -208,8 +210,8 @@ def _load(source: Source) -> Machine:
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
     """Return the mechanism, with its chain still open."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
-    check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
+    check_virtual(block, bodies, urdf, yaml_path)
     chains = _legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
         bodies,
@@ -218,7 +220,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         yaml_path,
     )
     _check_motors(file, chains, urdf, yaml_path)
-    check_bodies(block, bodies, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_legs(chains, spatial=normals is None, path=yaml_path)

@@ -17,11 +17,12 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, OutOfResources, UsageError
+from legcal.errors import DidNotConverge, ModelError, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.schema import content_of
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.files import FOLDER_YAML, is_xml, mechanism_yaml, motor_entries, read_file
+from legcal.machine.files import FILE_KIND, FOLDER_YAML, is_xml, mechanism_yaml, motor_entries
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -161,7 +162,7 @@ def write_calibrated_yaml(
         there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
         destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
-    text = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
+    text = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
     if home is not None:
         text = _with_home(text, home)
     if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
@@ -229,7 +230,7 @@ def _is_written_down(machine: Machine) -> bool:
     """Return whether a mechanism has a YAML of our format, for its URDF as it is."""
     if is_xml(machine.yaml_path):
         return False
-    content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
+    content = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
     document = yaml.compose(content, Loader=yaml.SafeLoader)
     stand_ins = _entry(document, "joint_name")
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)

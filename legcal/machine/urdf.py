@@ -14,11 +14,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
 from legcal.errors import Code, ModelError, Problem, Problems
-from legcal.files.schema import NAME_NEEDED, describe, is_name
+from legcal.files.schema import NAME_NEEDED, content_of, describe, is_name
 from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.files import read_file
 
 MAX_ELEMENTS = 50_000
 MAX_LINKS = 1000
@@ -360,7 +359,7 @@ def written(robot: etree._Element) -> bytes:
 
 def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
     """Return the tree of a URDF file."""
-    return parse_urdf(path, read_file(path, "URDF"), travel_needed=travel_needed)
+    return parse_urdf(path, content_of(path, "URDF", ModelError), travel_needed=travel_needed)
 
 
 def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
