@@ -1152,7 +1152,7 @@ def _formats() -> Iterable[Refusal]:
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
         ("no-type", ('type="spherical"', ""), ("line", "the type ''")),
-        ("twice", ('name="loop1"', 'name="loop0"'), ("line", "a name that another one has")),
+        ("twice", ('name="loop1"', 'name="loop0"'), ("line", "'loop0', which another")),
         ("link", (link1, link1.replace("tube", "tub")), ("line", "mean 'leg1_tube'")),
         ("base", (link1, link1.replace("leg1_tube", "base")), ("line", "joins the link 'base' to")),
         ("one-link", (link1, link1.replace("link1", "link9")), ("line", "names 1 links")),

@@ -347,13 +347,10 @@ def read_loop_source(path: Path, content: bytes) -> Source:
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
     """Return the valid loops of a URDF, and note the problems of the others."""
     loops = []
-    seen: set[str] = set()
+    problems.check_unique(elements)
     for i, element in enumerate(elements, start=1):
         n_before = len(problems)
         name = element.get("name", "").strip() or f"{element.tag}_{i}"
-        if name in seen:
-            problems.at(element, "has a name that another one has", "give each its own name")
-        seen.add(name)
         kind = element.get("type", "").strip().lower()
         if kind not in KINDS:
             problems.at(

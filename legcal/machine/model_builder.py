@@ -40,9 +40,9 @@ def urdf_text(machine: Assembled) -> str:
     tree.link("platform")
     if machine.planar:
         height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
-        _joint(tree, "platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
+        tree.connect("platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
-        _joint(tree, "platform_free", "floating", ("base", "platform"))
+        tree.connect("platform_free", "floating", ("base", "platform"))
     _add_actuators(tree, machine)
     for leg in machine.legs:
         _Branch(tree, machine, leg).write()
@@ -93,7 +93,7 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         kind = actuator.kind.value
         moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
         links = "base", actuator.link
-        _joint(tree, actuator.joint, kind, links, actuator.point, moving=moving)
+        tree.connect(actuator.joint, kind, links, actuator.point, moving=moving)
     if on_base:
         tree.link("base", "".join(on_base))
 
@@ -111,22 +111,6 @@ def _joint_of(leg: AssembledLeg) -> str:
     if leg.kind is LegKind.CONSTANT:
         return f"{leg.name}_a1" if _hangs_from_base(leg) else f"{leg.name}_b1"
     return f"{leg.name}_prismatic"
-
-
-def _joint(
-    tree: UrdfBuilder,
-    name: str,
-    kind: str,
-    links: tuple[str, str],
-    xyz: Array | None = None,
-    rotation: Array | None = None,
-    moving: str = "",
-) -> None:
-    """Connect two links; their frames coincide if no numbers are given."""
-    at = origin_xml_at(
-        np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
-    )
-    tree.connect(name, kind, links, at + moving)
 
 
 class _Branch:
@@ -176,7 +160,7 @@ class _Branch:
         if joint is JointType.FIXED:
             root = f"{self._leg.name}_rod"
             self._tree.link(root)
-            _joint(self._tree, f"{root}_frame", "fixed", (self._link, root), at, along)
+            self._tree.connect(f"{root}_frame", "fixed", (self._link, root), at, along)
             self._link = root
             return along
         first = np.column_stack([axis, y, cross(axis, y)]) if joint.inner_is_across else along
@@ -208,11 +192,11 @@ class _Branch:
         end, seat = f"{leg.name}_end", f"{leg.name}_seat"
         tree.link(end)
         tree.link(seat)
-        _joint(tree, f"{end}_frame", "fixed", (self._link, end), self._along)
+        tree.connect(f"{end}_frame", "fixed", (self._link, end), self._along)
         at_base = self._carrier, self._A
         carrier, at = ("platform", leg.B_platform) if self._from_base else at_base
         turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
-        _joint(tree, f"{seat}_frame", "fixed", (carrier, seat), at, turned)
+        tree.connect(f"{seat}_frame", "fixed", (carrier, seat), at, turned)
 
     def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
         """Add a revolute."""
@@ -232,7 +216,7 @@ class _Branch:
         """Add a joint and continue from its child."""
         self._tree.link(child)
         moving = _AXES[axis] + limit_xml(limits)
-        _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
+        self._tree.connect(joint, kind, (self._link, child), at, rotation, moving)
         self._link, self._along = child, np.zeros(3)
 
     def _half(self, *, near: bool) -> None:

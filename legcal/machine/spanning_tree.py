@@ -85,17 +85,27 @@ class UrdfBuilder:
         limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
         """Add a joint; ``axis`` and ``limits`` [rad or m] apply to moving joints."""
-        moving = ""
-        if axis is not None:
-            moving = axis_xml(axis) + limit_xml(limits)
-        self.connect(name, kind, (parent, child), origin_xml(T_parent_origin) + moving)
+        moving = "" if axis is None else axis_xml(axis) + limit_xml(limits)
+        xyz, rotation = np.asarray(T_parent_origin.translation), T_parent_origin.rotation
+        self.connect(name, kind, (parent, child), xyz, rotation.as_matrix(), moving)
 
-    def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
-        """Add a joint between parent and child with its XML elements, the origin first."""
+    def connect(
+        self,
+        name: str,
+        kind: str,
+        links: tuple[str, str],
+        xyz: Array | None = None,
+        rotation: Array | None = None,
+        moving: str = "",
+    ) -> None:
+        """Connect two links, with XML for axis and limits; frames coincide without numbers."""
         parent, child = (_quoted(link) for link in links)
+        at = origin_xml_at(
+            np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
+        )
         self.joints[name] = (
             f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
-            f"<child link={child}/>{inside}</joint>"
+            f"<child link={child}/>{at}{moving}</joint>"
         )
 
     def turns(

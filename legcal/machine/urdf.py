@@ -2,8 +2,7 @@
 
 import math
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -112,6 +111,16 @@ class XmlProblems(Problems):
             )
         )
 
+    def check_unique(self, elements: Iterable[etree._Element], key: str = "name") -> None:
+        """Add a problem of each element with the name of an earlier one."""
+        seen: set[str] = set()
+        for element in elements:
+            name = element.get(key)
+            if name in seen:
+                mistake = f"has the name '{name}', which another {element.tag} has"
+                self.at(element, mistake, "give each its own name")
+            seen |= {name} if name else set()
+
 
 def number_list(text: str, count: int) -> list[float] | None:
     """Return ``count`` finite numbers of plausible size, separated by spaces, or None."""
@@ -189,21 +198,14 @@ def check_tree(
 
 def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
     """Check that every element has a name of its own."""
-    counts = Counter(e.get("name", "") for e in elements)
-    seen: set[str] = set()
     for element in elements:
         name = element.get("name", "")
         if not name.strip():
             problems.at(element, "has no name", "name it")
         elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            problems.at(
-                element, f"has a name that cannot be used, needed {NAME_NEEDED}", "rename it"
-            )
-        elif name in seen:
-            problems.at(
-                element, f"has a name that {counts[name]} of them share", "give each its own name"
-            )
-        seen.add(name)
+            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
+            problems.at(element, mistake, "rename it")
+    problems.check_unique(elements)
 
 
 def _root(
