@@ -255,8 +255,12 @@ class TableFile(FileSchema):
     def per_leg(self, key: str) -> list[Any]:
         """Return the entry of each leg under a key; one value is that of all legs."""
         value = getattr(self, key)
-        one_for_all = not isinstance(value, list) or (key == "travel" and _is_pair(value))
-        return [value] * self.n if one_for_all else value
+        return [value] * self.n if self.is_for_all(key) else value
+
+    def is_for_all(self, key: str) -> bool:
+        """Return whether an entry is one value for all legs."""
+        value = getattr(self, key)
+        return not isinstance(value, list) or (key == "travel" and _is_pair(value))
 
     @property
     def leg_names(self) -> list[str]:
@@ -628,9 +632,7 @@ def _useless_entries(file: TableFile, source: str) -> list[str]:
             for leg, entry, type_ in zip(names, file.per_leg(key), file.leg_types, strict=False)
             if entry is not None and type_.has_slider is not of_sliders
         ]
-        value = getattr(file, key)
-        one_for_all = not isinstance(value, list) or _is_pair(value)
-        if useless and not (one_for_all and len(useless) < len(names)):
+        if useless and not (file.is_for_all(key) and len(useless) < len(names)):
             with_p, without_p = ("with", "without") if of_sliders else ("without", "with")
             problems.append(
                 f"{source}: {key} could not be used: found an entry for leg '{useless[0]}', whose "

@@ -84,13 +84,13 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
     if source.file.legcal is not None:
-        check_one_mechanism(source.urdf, pairs, source.path)
+        check_one_mechanism(source)
         is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
         return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
-    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    check_one_mechanism(source)
     if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
         source = _with_arms_as_motors(source)
     return completed(source)

@@ -190,18 +190,19 @@ def _quoted(text: str) -> str:
     return f'"{escape(text)}"'
 
 
-def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Path) -> None:
+def check_one_mechanism(source: Source) -> None:
     """Check that a file holds one mechanism: all loops share a body other than the ground."""
-    groups = moving_groups(urdf, closures)
+    groups = moving_groups(source.urdf, source.file.closed_loop)
     closed = [links for links, is_closed in groups if is_closed]
-    if len(closed) > 1:
+    block = source.file.legcal  # a platform on the ground is refused later
+    if len(closed) > 1 and (block is None or any(block.platform in links for links in closed)):
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
             "the mechanism could not be read",
             f"{len(closed)} mechanisms, which have no moving body in common (with {names})",
             "one",
             "write each to its own file",
-            path,
+            source.path,
         )
 
 
