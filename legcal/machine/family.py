@@ -175,7 +175,6 @@ def family_table(given: Dimensions) -> dict[str, Any]:
 
 
 def _no_family(family: str) -> str:
-    """Return the message for an unknown family."""
     remedy = (
         "write the joints of any other machine in a table, for which legcal new --template -o DIR "
         "makes one to start from"
@@ -189,7 +188,6 @@ def _no_family(family: str) -> str:
 
 
 def _decimals(unit: str) -> int:
-    """Return the decimals of lengths in a unit."""
     return DIGITS + round(math.log10(LENGTH[unit]))
 
 
@@ -332,7 +330,6 @@ def _yaml(table: dict[str, Any]) -> str:
 
 
 def _csv(table: dict[str, Any]) -> str:
-    """Return the table of a hexapod as CSV."""
     leg_type = table["type"].split("-")[-1]
     lengths = [table.get("min_length", ""), table.get("max_length", "")]
     radii = [table["radius"]["tube"], table["radius"]["rod"]]

@@ -354,7 +354,6 @@ class MjcfReader:
         return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
 
     def _site(self, part: BodyElement) -> None:
-        """Register a site by name."""
         element, name = part.element, str(part.element.get("name"))
         attributes = self._attributes(part)
         T, length = self._between(element, attributes)
@@ -413,7 +412,6 @@ class MjcfReader:
             yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
-        """Return the two sites of a constraint."""
         sites = []
         for key in ("site1", "site2"):
             name = element.get(key, "")
@@ -488,7 +486,6 @@ class MjcfReader:
     def _unknown(
         self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
     ) -> None:
-        """Add the problem of an unknown name in an element."""
         remedy = closest(name, candidates).rstrip(".")
         self.problems.at(element, f"names {reference}, which is not in the file", remedy)
 
@@ -643,7 +640,6 @@ class MjcfReader:
 
 
 def _attributes_of(element: etree._Element) -> dict[str, str]:
-    """Return the attributes of an element itself."""
     return {str(key): str(value) for key, value in element.attrib.items()}
 
 

@@ -186,7 +186,6 @@ def _numbers(values: Array) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a quoted attribute value."""
     return f'"{escape(text)}"'
 
 
