@@ -288,12 +288,12 @@ class TableFile(FileSchema):
         return None if value is None else in_metres(value, self.unit)
 
 
-OPTIONS = {
-    "type": "--type",
-    "min_length": "--min-length",
-    "max_length": "--max-length",
-    "radius": "--leg-radius",
-    "home": "--height",
+BESIDE = {  # options that may be given beside a table, and their entries in it
+    "type": "type",
+    "min_length": "min_length",
+    "max_length": "max_length",
+    "leg_radius": "radius",
+    "height": "home",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
 _SAME = 1e-6  # largest distance of coincident joints, relative to the span of the joints
@@ -394,8 +394,9 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
 
 def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     """Refuse entries that are both in the table and on the command line."""
+    options = {entry: f"--{option.replace('_', '-')}" for option, entry in BESIDE.items()}
     twice = [
-        f"{OPTIONS[key]} beside {key if key in table else other}"
+        f"{options[key]} beside {key if key in table else other}"
         for key in given
         for other in (key, *("types" for _ in [0] if key == "type"))
         if _is_given(table.get(other))

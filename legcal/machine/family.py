@@ -23,7 +23,7 @@ from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
-from legcal.machine.description_table import described_machine, read_description
+from legcal.machine.description_table import BESIDE, described_machine, read_description
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.model_builder import Created, create_model
 
@@ -34,13 +34,6 @@ RADIUS_OF_ROD = 0.0125  # radius of rods of a Delta, relative to their length
 SPACING = 1.2  # distance of the two rods of an arm, in platform radii
 TRAVEL = (-30.0, 70.0)  # travel of arms [deg]
 DIGITS = 12  # decimals of a length in metres
-_BESIDE = {  # options that may be given beside a table, and their entries in it
-    "type": "type",
-    "min_length": "min_length",
-    "max_length": "max_length",
-    "leg_radius": "radius",
-    "height": "home",
-}
 
 
 def new(
@@ -101,11 +94,11 @@ def description_of(table: Path | None, given: Dimensions) -> Description:
     if table is None:
         return described_machine(family_table(given), Path(f"--family {given.family}"))
     entries = {
-        _BESIDE[key]: {"height": value} if key == "height" else value
+        BESIDE[key]: {"height": value} if key == "height" else value
         for key, value in stated.items()
-        if key in _BESIDE
+        if key in BESIDE
     }
-    beside = (*_BESIDE, "unit", "name", "platform_radius")
+    beside = (*BESIDE, "unit", "name", "platform_radius")
     if of_family := [flag(key) for key in stated if key not in beside]:
         raise UsageError(
             f"The model could not be written: found {', '.join(of_family)} beside a table, needed "

@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import ModelError, OutOfClass
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.chain import Closure
-from legcal.machine.files import MechanismFile
+from legcal.machine.files import MAX_LOOPS, MechanismFile
 from legcal.machine.urdf import Urdf
 
 
@@ -261,6 +261,22 @@ class Loop:
     links: tuple[str, str]  # the two links
     T_link_frame: tuple[RigidTransform, RigidTransform]  # frame of the joint in either link
     axes: tuple[Array, Array] = (_X, _X)  # unit axis in either frame
+
+
+def close_loops(
+    loops: Sequence[Loop], text: UrdfBuilder, poses: Mapping[str, RigidTransform], path: Path
+) -> tuple[list[list[str]], list[str]]:
+    """Add the frames of all loops to a tree; return their pairs and kinds for the mechanism."""
+    if len(loops) > MAX_LOOPS:
+        raise ModelError(
+            "the loops could not be closed",
+            f"{len(loops)} of them",
+            f"at most {MAX_LOOPS}",
+            "give one mechanism",
+            path,
+        )
+    closures = [close_loop(loop, text, poses) for loop in loops]
+    return [frames for frames, _ in closures], [kind for _, kind in closures]
 
 
 def close_loop(
