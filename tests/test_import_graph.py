@@ -200,7 +200,6 @@ OUTSIDE = {
     "causes",
     "errors",
     "figures",
-    "option_fields",
     "processors",
     "progress",
     "signals",
