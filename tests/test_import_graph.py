@@ -39,7 +39,6 @@ PUBLIC: dict[str, set[str]] = {
         "coordinates",
         "cylinders",
         "diagnostics",
-        "dimensions",
         "directions",
         "drawing",
         "equations",

@@ -24,7 +24,6 @@ from legcal.files.schema import plain_name
 from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
 from legcal.machine.description_table import BESIDE, described_machine, read_description
-from legcal.machine.dimensions import Dimensions
 from legcal.machine.model_builder import Created, create_model
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
@@ -34,6 +33,32 @@ RADIUS_OF_ROD = 0.0125  # radius of rods of a Delta, relative to their length
 SPACING = 1.2  # distance of the two rods of an arm, in platform radii
 TRAVEL = (-30.0, 70.0)  # travel of arms [deg]
 DIGITS = 12  # decimals of a length in metres
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dimensions:
+    """Numbers given beside a table, or a family and its dimensions; None if not given.
+
+    Lengths are in ``unit``.
+    """
+
+    family: str | None = None  # hexapod or delta, in place of a table
+    unit: str | None = None
+    name: str | None = None  # of the model and its files
+    type: str | None = None  # of the legs: UPS
+    min_length: float | None = None  # of a leg, where readings are zero
+    max_length: float | None = None
+    leg_radius: float | None = None  # of tube and rod
+    height: float | None = None  # of the platform above the base at home
+    base_radius: float | None = None  # of the circle of base joints, or motors
+    platform_radius: float | None = None  # of the circle of platform joints
+    arm_length: float | None = None  # of a delta
+    rod_length: float | None = None  # of a delta
+
+    def stated(self) -> dict[str, Any]:
+        """Return the given dimensions by name."""
+        dimensions = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in dimensions.items() if value is not None}
 
 
 def new(
