@@ -1342,7 +1342,7 @@ def _described() -> Iterable[Refusal]:
     changes: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
         ("no-version", {"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
         ("version-key", {"legcal_table": None, "version": 1},
-         ("version: 1", "write 'legcal_table: 1'")),
+         ("version could not", "unknown key", "add 'legcal_table: 1'")),
         ("version-true", {"legcal_table": True}, ("legcal_table", "true", "needed 1")),
         ("type-number", {"type": 3}, ("type", "found 3", "6-UPS")),
         ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),

@@ -348,12 +348,6 @@ def read_description(
         if unit is not None:
             table.setdefault("unit", unit)
     _refuse_twice(path, table, given)
-    if "version" in table and "legcal_table" not in table:
-        raise ModelError(
-            f"{path}: the table could not be read: found version: {table['version']}, needed "
-            "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
-            "place."
-        )
     if unit is not None and table.get("unit", unit) != unit:
         raise ModelError(
             f"{path}: the unit could not be decided: found --unit {unit} and "

@@ -323,13 +323,14 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         robot[-1].tail = "\n"
     named = closing_frames(robot, path)
     if named:
+        kinds.extend("3d" for _ in named)
         notes.append(
             f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
             "joints."
         )
     file = MechanismFile(
         closed_loop=[*pairs, *named],
-        type=[*kinds, *["3d"] * len(named)],
+        type=kinds,
         name_mot=motors,
     )
     return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
