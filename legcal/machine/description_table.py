@@ -54,6 +54,7 @@ from legcal.machine.description import (
     look_like_base,
 )
 from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, read_columns
+from legcal.machine.files import FrameLegs
 from legcal.machine.firmware_files import firmware_table
 from legcal.machine.leg import MAX_LEGS, LegKind
 
@@ -228,7 +229,7 @@ class TableFile(FileSchema):
     type: Annotated[str | None, BeforeValidator(_type)] = None
     types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
     legs: list[PlainName] | None = None
-    base_joints: list[Point]
+    base_joints: Annotated[list[Point], Field(min_length=2, max_length=MAX_LEGS)]
     platform_joints: list[Point]
     offsets: Lengths | None = None
     lengths: Lengths | None = None
@@ -245,7 +246,7 @@ class TableFile(FileSchema):
     home_readings: dict[PlainName, Number] | None = None  # of carriages, in the unit
     home_readings_deg: dict[PlainName, Number] | None = None  # of arms
     platform_in: Literal["base", "platform"] | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    base_frame: FrameLegs | None = None
 
     @property
     def n(self) -> int:
@@ -436,30 +437,18 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
             f"{int(parts[0])}; correct the type or the rows."
         )
-    if not 2 <= n <= MAX_LEGS:
-        remedy = "add rows" if n < 2 else "leave out passive legs"
-        problems.append(
-            f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
-            f"needed 2 to {MAX_LEGS}; {remedy}."
-        )
     names = file.leg_names
     problems += [
         f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
         for leg in sorted({leg for leg in names if names.count(leg) > 1})
     ]
     problems += _useless_entries(file, source)
-    frame = file.base_frame or []
     problems += [
         f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
         f"{closest(leg, names)}"
-        for leg in frame
+        for leg in file.base_frame or ()
         if leg not in names
     ]
-    if len(set(frame)) != len(frame):
-        problems.append(
-            f"{source}: base_frame could not be used: found a leg twice, needed different legs; "
-            "correct it."
-        )
     problems += _wrong_home(file, source)
     problems += _wrong_actuators(file, source)
     problems += _wrong_home_readings(file, source)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from legcal.errors import BadValue, Code, ModelError, Problem, Problems
 from legcal.files.folder import RESULT
@@ -150,6 +150,16 @@ GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a
 MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
 
 
+def _different(names: list[str]) -> list[str]:
+    for name in names:
+        if names.count(name) > 1:
+            raise BadValue(f"the leg '{name}' more than once", "different legs", "name each once")
+    return names
+
+
+FrameLegs = Annotated[list[str], Field(min_length=2, max_length=3), AfterValidator(_different)]
+
+
 class MotorEntry(FileSchema):
     """Numbers of a motor that carries rods which have no place in a URDF."""
 
@@ -169,23 +179,11 @@ class LegcalBlock(BuiltEntry):
     base: str
     platform: str
     platform_joint: str | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    base_frame: FrameLegs | None = None
     home: MotionEntry | None = None
     home_readings: dict[str, float] | None = None  # readings of actuators at home [m or rad]
     motors: dict[str, MotorEntry] | None = None  # motors that carry rods, by joint
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
-
-    @field_validator("base_frame")
-    @classmethod
-    def _different(cls, value: list[str] | None) -> list[str] | None:
-        if value is None:
-            return None
-        repeated = sorted({name for name in value if value.count(name) > 1})
-        if repeated:
-            raise BadValue(
-                f"the leg '{repeated[0]}' more than once", "different legs", "name each once"
-            )
-        return value
 
 
 def _small_letters(kind: object) -> object:
