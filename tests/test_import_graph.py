@@ -66,7 +66,6 @@ PUBLIC: dict[str, set[str]] = {
         "rods",
         "solved_poses",
         "solver",
-        "table_template",
         "ties",
         "tolerance",
         "urdf",
