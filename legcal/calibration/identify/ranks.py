@@ -1,4 +1,4 @@
-"""The rank of a session in the joint fit, and its weak directions in words."""
+"""The rank of a session in the joint fit, its weak directions in words, and intrinsics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.calibration.identify.report import Ranks, RmsMotion, WeakDirection
+from legcal.calibration.identify.report import CameraIntrinsics, Ranks, RmsMotion, WeakDirection
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.predicted import Contributions
@@ -19,10 +19,14 @@ from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, s
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.vision.board import Link
+from legcal.vision.camera import shared_cameras
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
 _HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
+INTRINSICS = ("fx", "fy", "cx", "cy")
+_MAX_SIGMA_OF_INTRINSICS = 0.1  # focal lengths: above, intrinsics are not determined
+_OPEN = 0.05  # least component of an intrinsic in an open direction
 
 
 def is_of_arm(name: str) -> bool:
@@ -203,3 +207,35 @@ def _direction(
 def _limit(session: Session, sigma: float = _MAX_SIGMA) -> float:
     """Least singular value of a determined direction [1/m]."""
     return 1.0 / (sigma * session.mean_length)
+
+
+def expected_intrinsics(analysis: Analysis) -> tuple[CameraIntrinsics, ...]:
+    """Return the uncertainty of all intrinsics, estimated jointly with all other unknowns."""
+    session, choices = analysis.session, analysis.choices
+    cameras = {view.name: view.camera for view in session.cameras}
+    owners = tuple(dict.fromkeys(shared_cameras(list(cameras), list(cameras.values()))))
+    names = [f"{owner}.{key}" for owner in owners for key in INTRINSICS]
+    estimated = replace(
+        choices,
+        fixed=choices.fixed.difference(names),
+        free=choices.free.union(names),
+        priors={name: prior for name, prior in choices.priors.items() if name not in names},
+    )
+    found = session.contributions(estimated, analysis.noise).of_shared()
+    of_names = {name.removeprefix("camera "): i for i, name in enumerate(found.names)}
+    columns = [of_names[name if name in of_names else name.rpartition(".")[2]] for name in names]
+    focal = np.repeat([np.sqrt(cameras[o].K[0, 0] * cameras[o].K[1, 1]) for o in owners], 4)
+    rows = np.concatenate([found.all_gains(), found.known])
+    _, singular, basis = np.linalg.svd(marginal_rows(rows, np.array(columns)) * focal)
+    is_determined = singular > 1.0 / _MAX_SIGMA_OF_INTRINSICS
+    spread = np.sqrt(np.sum((basis[is_determined].T / singular[is_determined]) ** 2, axis=1))
+    is_open = np.sqrt(np.sum(basis[~is_determined] ** 2, axis=0)) > _OPEN
+    sigmas, opens = (x.reshape(len(owners), -1).tolist() for x in (spread * focal, is_open))
+    return tuple(
+        CameraIntrinsics(
+            owner,
+            not any(open_),
+            {k: None if o else s for k, s, o in zip(INTRINSICS, sigma, open_, strict=True)},
+        )
+        for owner, sigma, open_ in zip(owners, sigmas, opens, strict=True)
+    )
