@@ -11,6 +11,10 @@ import numpy as np
 from legcal.calibration.identify.ranks import (
     Analysis,
     expected_intrinsics,
+    is_scale_open,
+    n_open_with_radii,
+    refusal_of_scale,
+    scale_sources,
     undetermined,
     weak_directions,
 )
@@ -20,12 +24,6 @@ from legcal.calibration.identify.remedies import (
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
-from legcal.calibration.identify.scale import (
-    is_scale_open,
-    n_open_with_radii,
-    refusal_of_scale,
-    scale_sources,
-)
 from legcal.calibration.identify.session import (
     THIN,
     Session,
