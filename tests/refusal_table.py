@@ -666,7 +666,7 @@ def _units() -> Iterable[Refusal]:
     servo = {"unit": "us", "centre_us": 1500, "us_per_deg": 11.1}
     in_us = {"readings": dict.fromkeys(SERVOS, servo)}
     rows: list[tuple[str, np.ndarray, dict[str, Any], tuple[str, ...]]] = [
-        ("degrees", np.degrees(angles), sigma, ("look like degrees", "pi/180", "readings: deg")),
+        ("degrees", np.degrees(angles), sigma, ("look like degrees", "write readings: deg")),
         ("radians", both_ways, degrees,
          ("% of the travel in deg", "in rad", "write readings: rad")),
         ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),
