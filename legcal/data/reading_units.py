@@ -2,8 +2,8 @@
 
 Tables have readings in m, of motors that turn in rad, unless ``readings`` in ``dataset.yaml`` says
 otherwise: another unit of length or angle, or pulses of hobby servos, of which the model or the
-dataset knows the centre and the us for one degree. A table in another unit than stated is recognised
-by the travel of the motors (:func:`meanings`).
+dataset knows the centre and the us for one degree. Another unit than stated is recognised by the
+travel of the motors (:func:`meanings`).
 """
 
 from __future__ import annotations

@@ -28,6 +28,8 @@ PILLOW_ERRORS = (OSError, SyntaxError, ValueError, TypeError, LookupError, Arith
                  AttributeError, EOFError, struct.error)  # fmt: skip
 """The exceptions of Pillow for damaged files."""
 
+Size = tuple[int, int]  # width and height [px]
+
 _MOST_TEXT = 60  # maximum number of characters shown
 # Sum of the steps of table K.1 of ITU-T T.81, which is quality 50 on the scale of the IJG
 _STEPS_AT_50 = 3688.0
@@ -67,7 +69,7 @@ class ImageFacts:
     focus_distance: float | None = None
     digital_zoom: float | None = None
     orientation: int | None = None
-    taken_size: tuple[int, int] | None = None
+    taken_size: Size | None = None
     taken_at: str = ""
 
 
@@ -159,3 +161,14 @@ def _quality(tables: Mapping[int, list[int]]) -> int | None:
         return None
     scale = max(sum(tables[min(tables)]) / _STEPS_AT_50, 1e-3)
     return round(min(max(100.0 - 50.0 * scale if scale < 1.0 else 50.0 / scale, 1.0), 100.0))
+
+
+def size_change(before: Size, after: Size) -> str:
+    """Return in words how an image may have come from one size to another, "" if unknown."""
+    if after == before[::-1]:
+        return "turned by a quarter turn"
+    for (width, height), word in ((after, ""), (after[::-1], "turned and ")):
+        factor = width / before[0]
+        if abs(height - factor * before[1]) <= max(1.0, factor):
+            return f"{word}rescaled by {factor:.4g}"
+    return "cropped" if after[0] <= before[0] and after[1] <= before[1] else ""
