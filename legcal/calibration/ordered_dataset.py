@@ -19,7 +19,7 @@ from legcal.causes import Cause, by_cause
 from legcal.data.axes import LegAxes
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import (
     Order,
     canonical_order,

@@ -33,24 +33,30 @@ from legcal.data.photograph_matching import (
 )
 from legcal.data.reading_units import are_commands, sigma_in, sigma_too_large, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
-from legcal.errors import DatasetError, UsageError
-from legcal.files.folder import OutputKind, check_path, result_folder
+from legcal.errors import DatasetError, OutOfResources, UsageError
+from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
 from legcal.files.published import with_schema
 from legcal.files.quantity import LENGTH, parse_quantity
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
 from legcal.files.table import format_table
-from legcal.machine.files import DATASET_YAML, shipped_names
+from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
+from legcal.vision.camera_export import rough_camera_info
 from legcal.vision.camera_file import read_camera
-from legcal.vision.exif_camera import FOCAL_SIGMA, camera_of_photographs, rough_camera_info
-from legcal.vision.image_facts import read_facts
+from legcal.vision.image_facts import FOCAL_SIGMA, camera_of_photographs, read_facts
 from legcal.vision.image_file import BadImage, image_size, inspect_image
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
+_EXAMPLE = "examples/hexapod"
+_EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
+# Without results of a calibration beside them
+_EXAMPLE_FILES = (
+    "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
+)  # fmt: skip
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
@@ -593,3 +599,33 @@ def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
     if str(model) in shipped_names() and not os.path.isfile(model):
         return str(model)
     return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()
+
+
+def copy_example(destination: Path) -> None:
+    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds files.
+    OutOfResources
+        If it does not take the files, or legcal was installed without them.
+    """
+    check_path(destination, _EXAMPLE_KIND)
+    if destination.is_dir() and holds_files(destination):
+        raise UsageError(
+            f"{destination}: the example could not be written: found a folder with files, needed "
+            "a new or empty one; give another folder with -o."
+        )
+    source = shipped_folder(_EXAMPLE)
+    if not (source / DATASET_YAML).is_file():
+        raise OutOfResources(
+            f"{source}: the example could not be read: found no {DATASET_YAML}, needed the files "
+            "that come with legcal; install it again."
+        )
+    with result_folder(destination, _EXAMPLE_KIND) as folder:
+        for name in _EXAMPLE_FILES:
+            if (source / name).is_dir():
+                shutil.copytree(source / name, folder / name)
+            else:
+                shutil.copyfile(source / name, folder / name)

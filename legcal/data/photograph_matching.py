@@ -16,13 +16,12 @@ from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from legcal.data.image_order import moment_of
+from legcal.data.image_choice import moment_of
 from legcal.data.measurements import few
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
-from legcal.vision.heic import HEIC_SUFFIXES
-from legcal.vision.image_facts import read_facts
+from legcal.vision.image_facts import HEIC_SUFFIXES, read_facts
 from legcal.vision.image_file import CONVERT, CONVERT_HEIC, FOREIGN_SUFFIXES, image_suffixes
 
 MAX_PHOTOGRAPHS = 50_000

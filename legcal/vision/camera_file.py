@@ -1,4 +1,4 @@
-"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB read; ROS written.
+"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB, read.
 
 ``_FORMATS`` lists the forms of mappings, ``PARAMETERS`` the lens models of programs that list all
 numbers of a camera in one row.
@@ -14,11 +14,9 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import BadValue, DatasetError
-from legcal.files.published import with_schema
 from legcal.files.schema import FileSchema, content_of, describe, parse_yaml, validate
 from legcal.geometry.types import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
@@ -770,29 +768,3 @@ _FORMATS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], _Reader], ...] =
         _from_ros,
     ),
 )
-
-
-def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
-    """Return the text of a ROS camera_info file that reads back as the same camera."""
-    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
-    projection = np.column_stack([camera.K, np.zeros(3)])
-    document = {
-        "image_width": camera.width,
-        "image_height": camera.height,
-        "camera_name": name,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
-        # ROS passes on any number of coefficients of this name to OpenCV.
-        "distortion_model": (
-            "rational_polynomial" if camera.model == "thin_prism" else camera.model
-        ),
-        "distortion_coefficients": {
-            "rows": 1,
-            "cols": len(distortion),
-            "data": distortion.tolist(),
-        },
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": projection.ravel().tolist()},
-        **(more or {}),
-    }
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    return with_schema("camera", text)

@@ -22,21 +22,19 @@ from legcal.errors import BadValue, Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
-from legcal.vision.heic import (
-    HEIC_SUFFIXES,
-    UnreadableError,
-    can_read_heic,
-    heic_pixels,
-    heic_size,
-    is_heic,
-)
 from legcal.vision.image_facts import (
+    HEIC_SUFFIXES,
     JPEG_SIGNATURE,
     PILLOW_ERRORS,
     PNG_SIGNATURE,
     TIFF_SIGNATURES,
     ImageFacts,
+    UnreadableError,
+    can_read_heic,
     exif_tags,
+    heic_pixels,
+    heic_size,
+    is_heic,
     quiet_pillow,
     read_facts,
     size_change,
