@@ -101,29 +101,6 @@ def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograp
     return with_views, pattern
 
 
-def columns_by_content(
-    photographs: Sequence[Photograph],
-) -> dict[str, Callable[[Sequence[str]], bool]]:
-    """Return predicates on the cells of a column: whether it names photographs, or views."""
-    stems = {
-        _stem(text)
-        for photograph in photographs
-        for text in (photograph.name, photograph.label)
-        if text
-    }
-    views = {photograph.folder.casefold() for photograph in photographs} - {"."}
-
-    def are_photographs(cells: Sequence[str]) -> bool:
-        named = [_stem(cell) for cell in cells if cell]
-        return bool(named) and not all(map(str.isdecimal, named)) and stems.issuperset(named)
-
-    def are_views(cells: Sequence[str]) -> bool:
-        named = [cell.casefold() for cell in cells]
-        return len(views) > 1 and len(named) > len(views) and set(named) == views
-
-    return {"image": are_photographs, "view": are_views}
-
-
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
     """Return a pattern that splits names in one folder into several views of equal size.
 

@@ -399,7 +399,7 @@ def likely_cause(
                  if m.are_lengths or m.unit != name]  # fmt: skip
     corrected.append(Meaning(tuple(units), -joint_values(values, units), is_reversed=True))
     possible = [m for m in corrected if in_travel(m.q, legs).all()]
-    if possible:
+    if possible and len(values) > 1:
         best = max(possible, key=lambda m: float(m.used(legs).mean()))
         return best.said(legs, name, in_dataset=in_dataset)
     low, high = USUAL_PULSES

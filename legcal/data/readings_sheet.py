@@ -1,21 +1,20 @@
 """A table of readings as its owner keeps it: headings, units, readings or whole lengths.
 
 Columns are identified by their headings: an encoder by the name of its leg or joint, or by a
-number; a column of photographs or views by its cells as well. The unit comes from the headings,
-else it is the unit in which the readings lie in the travel of the legs.
+number. The unit comes from the headings, else it is the one in which the readings lie in the travel
+of the legs.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -51,7 +50,6 @@ _HEADINGS = {
 }  # fmt: skip
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
-ByContent = Mapping[str, Callable[[Sequence[str]], bool]]
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 # Units at the end of a heading without brackets that would else be part of a name
 _FOREIGN = {
@@ -78,9 +76,6 @@ class SheetReadings:
 class ReadingsSheet:
     """A table of readings, one row for each photograph or time (*row_noun*).
 
-    *by_content* has, for image and view, a predicate that recognises such a column by its cells,
-    whatever its heading.
-
     Attributes
     ----------
     motors : list of Leg
@@ -101,11 +96,10 @@ class ReadingsSheet:
         path: Path,
         machine: Machine,
         row_noun: str,
-        by_content: ByContent = MappingProxyType({}),
     ) -> None:
         self.path = path
         self.motors = [machine.legs[j] for j in machine.motors]
-        headings = _Headings(path, self.motors, by_content)
+        headings = _Headings(path, self.motors)
         self._table = read_table(
             path,
             "table of readings",
@@ -228,10 +222,9 @@ class ReadingsSheet:
 class _Headings:
     """The meaning of the headings of a table of readings."""
 
-    def __init__(self, path: Path, motors: Sequence[Leg], by_content: ByContent) -> None:
+    def __init__(self, path: Path, motors: Sequence[Leg]) -> None:
         self.path = path
         self.motors = motors
-        self.by_content = by_content
         self.joints = [column.name for column in reading_columns(motors)]
         self.taken: dict[str, str] = {}  # meaning of each heading that is used
         self.units: dict[str, str] = {}  # unit in the heading of each joint
@@ -265,11 +258,6 @@ class _Headings:
                     clock = {i: _SECONDS[timed[1]]}
         free = [i for i in range(len(header)) if i not in meaning]
         meaning |= self._joints(free, readings, header)
-        for i in [i for i in free if i not in meaning]:
-            cells = [cells[i] for _, cells in lines[1:] if len(cells) == len(header)]
-            for name, holds in self.by_content.items():
-                if name not in meaning.values() and holds(cells):
-                    meaning[i] = name
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self.joints:
