@@ -148,19 +148,17 @@ def places(measurements: Measurements) -> list[tuple[str, str]]:
     return list(zip(views, row_names(measurements), strict=True))
 
 
-def find_rows(table: Table, measurements: Measurements) -> IntArray:
-    """Return for each row of a table the row of the measurements, -1 where unknown."""
-    index = {place: row for row, place in enumerate(places(measurements))}
-    named = zip(table.text("view"), table.text("image"), strict=True)
-    return np.array([index.get(place, -1) for place in named], dtype=np.intp)
+def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) -> IntArray:
+    """Return for each row of a table of images the row of the measurements, -1 where unknown.
 
-
-def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements) -> None:
-    """Refuse rows of a table with an image unknown to :func:`find_rows`."""
+    Unknown views and images are refused, unless said otherwise.
+    """
     names = places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
+    index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
-    for i in np.flatnonzero(row < 0).tolist():
+    rows = np.array([index.get(place, -1) for place in named], dtype=np.intp)
+    for i in np.flatnonzero(rows < 0).tolist() if refuse else ():
         view, image = named[i]
         if view not in views:
             unknown, remedy = f"the unknown view {describe(view)}", closest(view, views)
@@ -169,20 +167,31 @@ def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements)
             near = closest(image, [name for v, name in names if v == view])
             needed = f"an image of view {view} in the measurements"
             table.refuse(i, describe(image), needed, "image", remedy=near)
+    return rows
 
 
-def find_legs(table: Table, leg_names: Sequence[str]) -> IntArray:
-    """Return the leg that each row of a table names, -1 where unknown."""
+def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:
+    """Return the leg that each row of a table names, -1 where unknown; these are refused."""
     index = {name: j for j, name in enumerate(leg_names)}
-    return np.array([index.get(name, -1) for name in table.text("leg")], dtype=np.intp)
-
-
-def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -> None:
-    """Refuse rows of a table with a leg unknown to :func:`find_legs`."""
     names = table.text("leg")
-    for i in np.flatnonzero(leg < 0).tolist():
+    legs = np.array([index.get(name, -1) for name in names], dtype=np.intp)
+    for i in np.flatnonzero(legs < 0).tolist() if refuse else ():
         unknown, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
         table.refuse(i, unknown, "a leg of the mechanism", "leg", remedy=remedy)
+    return legs
+
+
+def refuse_outside(
+    table: Table, rows: IntArray, columns: Sequence[str], measurements: Measurements
+) -> None:
+    """Refuse pixels, in two columns, outside the image of their row of the measurements."""
+    px = table.numbers(columns)
+    cameras = [view.camera for view in measurements.views]
+    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[rows]]
+    outside = ((px < -0.5) | (px > size - 0.5)) & (rows >= 0)[:, None]
+    for i, k in np.argwhere(outside).tolist():
+        needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
+        table.refuse(i, f"{px[i, k]:g} px", needed, columns[k], remedy="correct it")
 
 
 def few(names: Sequence[str]) -> str:

@@ -21,8 +21,6 @@ from legcal.data.measurements import (
     find_legs,
     find_rows,
     places,
-    refuse_unknown_legs,
-    refuse_unknown_rows,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
 from legcal.files.folder import write_atomically
@@ -284,7 +282,8 @@ def read_observations(
     remedy = "delete the file to have it written again"
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:
-        row, leg = find_rows(table, measurements), find_legs(table, leg_names)
+        row = find_rows(table, measurements, refuse=False)
+        leg = find_legs(table, leg_names, refuse=False)
         exists = np.array(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
@@ -292,8 +291,6 @@ def read_observations(
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
         table.keep((exists & (row >= 0)) | ~detected)
     row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-    refuse_unknown_rows(table, row, measurements)
-    refuse_unknown_legs(table, leg, leg_names)
     part = table.text("part")
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]]:
