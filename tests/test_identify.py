@@ -30,7 +30,7 @@ from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
