@@ -266,6 +266,3 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
     json.dumps(found.document(), allow_nan=False)
     assert found.full.rank + len(found.full.weak) == found.full.of
     assert found.identifiable == all(d.harmless for d in found.full.weak)
-
-
-# Words

@@ -468,7 +468,8 @@ def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solut
     return first, trials
 
 
-@pytest.mark.parametrize("lost", thinned([np.inf, 0.15], [0.15]))
+@pytest.mark.system
+@pytest.mark.parametrize("lost", [np.inf, 0.15])
 def test_the_most_likely_gamma_is_that_of_the_same_outlines(
     session: HexapodSession, lost: float
 ) -> None:
