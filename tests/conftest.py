@@ -138,6 +138,15 @@ def without_steps() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def without_remedies() -> Iterator[None]:
+    """Refuse what is not identifiable without trying what would mend it, which takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        name = "legcal.calibration.identify.identifiability.find_remedies"
+        patch.setattr(name, lambda *_: ())
+        yield
+
+
 @pytest.fixture(scope="session")
 def example_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Calibrate a copy of the example once for all tests that look at the result."""

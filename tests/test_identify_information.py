@@ -161,7 +161,7 @@ def test_poses_out_of_reach_are_refused_and_rare_ones_found(
     assert len(planned_session(machine, [range(6)], 60).t) == 60
 
 
-@pytest.mark.parametrize("name", ["planar", "revolute"])
+@pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])
 def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
     """At the same poses, cameras and used outlines, with the noise of the result."""
     _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)
