@@ -24,6 +24,7 @@ import legcal
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
+    ranks_of_dataset,
 )
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
@@ -36,6 +37,8 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
 from legcal.report.identify import identify_table
 from legcal.vision.board import Board, FixedBoard
+
+pytestmark = pytest.mark.usefixtures("without_remedies")  # test_identify_ranks.py has them
 
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 LEGS = tuple(f"leg{j}" for j in range(1, 7))
@@ -237,7 +240,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return identifiability_of_dataset(two_images(), choices).full.rank
+        return ranks_of_dataset(two_images(), choices)[1].rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30
@@ -266,6 +269,3 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
     json.dumps(found.document(), allow_nan=False)
     assert found.full.rank + len(found.full.weak) == found.full.of
     assert found.identifiable == all(d.harmless for d in found.full.weak)
-
-
-# Words

@@ -140,7 +140,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["planar", "revolute"])
+@pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])
 def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
     """At the same poses, cameras and used outlines, with the noise of the result."""
     _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)
