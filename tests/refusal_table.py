@@ -359,7 +359,7 @@ def _options() -> Iterable[Refusal]:
         ("counts", "chessboard:9", ("chessboard:9x6:25mm",)),
         ("few", "chessboard:3x6", ("3 x 6",)),
         ("unit", "chessboard:9x6:25", ("25",)),
-        ("metres", "chessboard:9x6:25m", ("25000 mm",)),
+        ("metres", "chessboard:9x6:25m", ("25 m",)),
         ("dictionary", "charuco:7x5:40mm:29mm", ("charuco:7x5:40mm:29mm:DICT_4X4_50",)),
         ("unknown", "charuco:7x5:40mm:29mm:DICT_4X4_51", ("DICT_4X4_51",)),
         ("exchanged", "charuco:7x5:29mm:40mm:DICT_4X4_50", ("marker", "square")),
@@ -666,7 +666,7 @@ def _units() -> Iterable[Refusal]:
     servo = {"unit": "us", "centre_us": 1500, "us_per_deg": 11.1}
     in_us = {"readings": dict.fromkeys(SERVOS, servo)}
     rows: list[tuple[str, np.ndarray, dict[str, Any], tuple[str, ...]]] = [
-        ("degrees", np.degrees(angles), sigma, ("look like degrees", "pi/180", "readings: deg")),
+        ("degrees", np.degrees(angles), sigma, ("look like degrees", "write readings: deg")),
         ("radians", both_ways, degrees,
          ("% of the travel in deg", "in rad", "write readings: rad")),
         ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),

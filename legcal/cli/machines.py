@@ -490,7 +490,7 @@ def example(
     as_json: JsonOption = False,
 ) -> None:
     """Copy the dataset that comes with legcal: a hexapod, 45 photographs (11 MB)."""
-    from legcal.data.example import copy_example
+    from legcal.data.new_dataset import copy_example
 
     copy_example(output)
     lines = (
