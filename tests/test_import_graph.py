@@ -164,7 +164,6 @@ PUBLIC: dict[str, set[str]] = {
         "notes",
         "location.document",
         "location.locate",
-        "location.urdf",
         "pipeline",
         "quantities",
         "result",
