@@ -190,7 +190,6 @@ def evaluate(
 
 
 def _in_the_order_of(reference: Machine, model: Machine) -> Machine:
-    """Return the reference with legs and frame legs in the model's order."""
     if different := machine_difference(reference, model):
         raise ModelError(
             f"The models could not be compared: found {reference.name} with {different} of "
@@ -255,7 +254,6 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
 
 
 def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
-    """Return the rows that the model or the reference cannot reach, in the order of the file."""
     m = dataset.measurements
     names = row_names(m)
     return tuple(

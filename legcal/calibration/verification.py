@@ -362,7 +362,6 @@ def _compare(
     prior: _EarlierEstimate,
     significance: float,
 ) -> Check:
-    """Return the test of the earlier result by the fit of the new images."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     variance_factor = _earlier_noise(solution, earlier)
@@ -411,7 +410,6 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
-    """Return the parametrization with selected parameters."""
     place = np.full(parametrization.place.shape, -1, dtype=np.intp)
     for new, old in enumerate(columns):
         place[parametrization.place == old] = new

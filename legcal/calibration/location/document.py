@@ -207,12 +207,10 @@ def direction_of(v: Array) -> Direction:
 
 
 def _signed(v: Array) -> Array:
-    """Return a direction with its largest component positive."""
     return np.asarray(v if v[np.argmax(np.abs(v))] > 0.0 else -v)
 
 
 def _rms(vectors: list[tuple[float, float, float]]) -> float:
-    """Return the root mean square of components."""
     return float(np.sqrt(np.mean(np.square(vectors))))
 
 
@@ -234,8 +232,6 @@ class _Determined(FileSchema):
 
 
 class _ResidualsEntry(FileSchema):
-    """Residuals of the measured poses."""
-
     chi2: _Size
     dof: Annotated[int, Field(ge=0)]
     p_value: _Size | None
@@ -252,8 +248,6 @@ class _Tool(FileSchema):
 
 
 class _Covariance(FileSchema):
-    """The covariance of both frames."""
-
     names: list[str]
     matrix: list[list[Number]]
 
