@@ -347,10 +347,8 @@ def _options() -> Iterable[Refusal]:
         ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
         ("sigma", "-o {out} --position-sigma 0.02", ("--position-sigma", "0.02")),
         ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
-        ("link", "-o {out} --world-link room", ("--urdf",)),
         ("folder", "-o none/a.yaml", ("none",)),
         ("no-output", "", ("--output",)),
-        ("links", "-o {out} --urdf {here}/u --world-link a --tool-link a", ("a",)),
     ]
     yield from _worded("locate", "locate hexapod {in}/hexapod.csv", locate, "tool-poses")
 

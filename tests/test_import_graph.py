@@ -155,7 +155,6 @@ PUBLIC: dict[str, set[str]] = {
         "notes",
         "location.document",
         "location.locate",
-        "location.urdf",
         "pipeline",
         "quantities",
         "result",

@@ -331,7 +331,6 @@ def _leaves_out_many(estimate: Estimate) -> bool:
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
-    """Return notes on rough camera poses and on images that contradict the fit."""
     fitted, o = estimate.fitted, estimate.solution.outlines
     shown = set(fitted.measurements.view[o.row[o.used]].tolist())
     views = fitted.measurements.views
@@ -407,7 +406,6 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
 def _fitted_and_held_out(
     dataset: Dataset, left_out: BoolArray | None, holdout: float | None
 ) -> tuple[IntArray, IntArray]:
-    """Return the rows of fitted and of held-out images."""
     rows = np.arange(dataset.measurements.n_rows)
     if left_out is not None:
         rows = rows[~left_out]
@@ -429,7 +427,6 @@ def _fitted_and_held_out(
 
 
 def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> HeldOut:
-    """Compare the held-out images with the prediction of the fit."""
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
@@ -438,7 +435,6 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
 
 
 def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return a note on each zero that an encoder had in some images."""
     posterior, notes = solution.posterior, list[str]()
     sigma = np.sqrt(np.diagonal(posterior.covariance)[posterior.problem.where("own_zeros")])
     zeros = dataset.measurements.own_zeros, posterior.state.own_zeros.tolist(), sigma.tolist()

@@ -169,12 +169,10 @@ class ParameterTable:
 
 
 def _numbers(q: Quantity) -> tuple[Any, ...]:
-    """Return the numbers of the columns of a quantity."""
     return q.nominal, q.value, q.change, q.sigma
 
 
 def _place(q: Quantity) -> tuple[str, ...]:
-    """Return leg, joint or axis, coordinate and link."""
     return q.parameter.owner, q.parameter.kind.replace("_", " "), q.parameter.component, q.frame
 
 
@@ -183,7 +181,6 @@ NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values(
 
 
 def _cell(column: str, x: Any, digits: int) -> str:
-    """Return a number or text of the table."""
     if column == "status":
         return "" if x == "estimated" else str(x)
     if x is None:
@@ -347,7 +344,6 @@ def _observation_lines(result: Result) -> list[str]:
 
 
 def _left_out_lines(seen: Observations) -> list[str]:
-    """Return how many images and views were left out."""
     of_views = Counter(image.view for cause in seen.left_out for image in cause.images)
     if not of_views:
         return []

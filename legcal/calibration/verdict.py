@@ -208,7 +208,6 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
 
 
 def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
-    """Return the verdict that follows from what was found and from doubts, the worst first."""
     if not doubts:
         return Verdict(doubts, f"Calibrated: {found}.", remedy)
     more = len(doubts) - 1

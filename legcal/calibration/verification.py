@@ -25,6 +25,7 @@ from legcal.calibration.documents import (
     FitQuality,
     MovedPlatform,
 )
+from legcal.calibration.evaluation import machine_difference
 from legcal.calibration.joint_fit.held_out import PlatformPair
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -214,11 +215,12 @@ def check(
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     """Return the new images with the calibrated model in place of their own."""
     named, calibrated = dataset.machine, earlier.machine
-    if sorted(named.leg_names) != sorted(calibrated.leg_names):
-        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(named.leg_names)}"
-    else:
+    different = machine_difference(calibrated, named)
+    if not different:
         calibrated = calibrated.with_leg_order(named.leg_names)
-        different = _model_difference(calibrated, named)
+        for leg, other in zip(calibrated.legs, named.legs, strict=True):
+            if leg.prismatic != other.prismatic:
+                different = f"the joint {leg.prismatic}, not {other.prismatic}"
     if different:
         raise DatasetError(
             f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
@@ -226,22 +228,6 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
             "the result that belongs to these images."
         )
     return replace(dataset, machine=calibrated, overrides=())
-
-
-def _model_difference(calibrated: Machine, given: Machine) -> str:
-    """Return the difference of two models with the same legs in words; "" without one."""
-    for calibrated_leg, given_leg in zip(calibrated.legs, given.legs, strict=True):
-        calibrated_in_words, given_in_words = (
-            f"{leg.name} ({leg.kind}, {leg.type})" for leg in (calibrated_leg, given_leg)
-        )
-        if calibrated_in_words != given_in_words:
-            return f"the leg {calibrated_in_words}, not {given_in_words}"
-        if calibrated_leg.prismatic != given_leg.prismatic:
-            return f"the joint {calibrated_leg.prismatic}, not {given_leg.prismatic}"
-    frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
-    if frames[0] != frames[1]:
-        return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
-    return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +362,6 @@ def _compare(
     prior: _EarlierEstimate,
     significance: float,
 ) -> Check:
-    """Return the test of the earlier result by the fit of the new images."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     variance_factor = _earlier_noise(solution, earlier)
@@ -425,7 +410,6 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
-    """Return the parametrization with selected parameters."""
     place = np.full(parametrization.place.shape, -1, dtype=np.intp)
     for new, old in enumerate(columns):
         place[parametrization.place == old] = new

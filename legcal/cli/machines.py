@@ -315,10 +315,6 @@ def locate(
             "0,0,0 by default.",
         ),
     ] = None,
-    world_link: Annotated[str, typer.Option(help="With --urdf: name of the world link.")] = (
-        "world"
-    ),
-    tool_link: Annotated[str, typer.Option(help="With --urdf: name of the tool link.")] = "tool",
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -327,18 +323,12 @@ def locate(
     from legcal.calibration.location.document import (
         LOCATION_FILE,
         location_document,
+        write_located_model,
         write_location,
     )
-    from legcal.calibration.location.urdf import write_located_model
     from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
     from legcal.machine.loader import load_mechanism
     from legcal.report.machine import location_table
-
-    if urdf is None and (world_link, tool_link) != ("world", "tool"):
-        raise UsageError(
-            "The names of the links could not be used: found them without --urdf, needed the "
-            "folder of the model to write; name it or leave the names out."
-        )
 
     def quantity(text: str | None, units: Mapping[str, float], option: str) -> float | None:
         return None if text is None else parse_quantity(text, units, option)
@@ -356,7 +346,7 @@ def locate(
     )
     written = []
     if urdf is not None:
-        paths = write_located_model(machine, location, urdf, world=world_link, tool=tool_link)
+        paths = write_located_model(machine, location, urdf)
         written += [str(path) for path in paths]
     write_location(location, output)
     written.append(str(output))

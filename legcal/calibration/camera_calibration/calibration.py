@@ -170,8 +170,6 @@ def _check_options(
 
 @dataclass(frozen=True, eq=False)
 class _Photographs:
-    """Photographs of one size."""
-
     paths: tuple[Path, ...]
     facts: tuple[ImageFacts, ...]  # metadata of each file
     size: ImageSize
@@ -216,7 +214,6 @@ class _CornerSearch:
 
 
 def _search(board: Board, photographs: _Photographs, run: Run, progress: Report) -> list[SeenBoard]:
-    """Return the board features of every image."""
     n, results = len(photographs.paths), list[SeenBoard]()
     progress(_STAGE, 0, n)
     anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
@@ -267,7 +264,6 @@ def _shown_instead(board: Board, photographs: _Photographs) -> str:
 
 
 def _not_visible(board: Board, instead: str) -> NotVisible:
-    """Return the error for images without the board."""
     hint = ""
     if board.kind == "chessboard":
         hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
@@ -308,7 +304,6 @@ def _copies(
 def _result(
     photographs: _Photographs, board_in_images: _ShownBoard, lens: ChosenLens
 ) -> CameraCalibration:
-    """Return the result with its diagnostics."""
     fitted, paths, facts = lens.fit, photographs.paths, photographs.facts
     adjusted, corners = fitted.adjusted, fitted.corners
     used = {board_in_images.images[k]: i for i, k in enumerate(fitted.images)}
@@ -367,7 +362,6 @@ def _left_out(images: Sequence[ImageResult]) -> list[str]:
 
 
 def _by_reason(left_out: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the names of the left-out images by reason."""
     names_by_reason: dict[str, list[str]] = {}
     for name, reason in left_out:
         names_by_reason.setdefault(reason, []).append(name)

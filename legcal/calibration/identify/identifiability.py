@@ -228,7 +228,6 @@ def ranks_of_dataset(
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
-    """Analysis of the recorded observations of a dataset."""
     chosen = (*choices.free, *choices.priors)
     twists = any(is_held_by_default(name) for name in chosen)
     return Analysis(recorded_session(dataset, twists=twists), choices)
@@ -268,7 +267,6 @@ def _report_on(
     recommendation: tuple[Recommendation, ...] | None,
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
-    """Report on a session."""
     session = analysis.session
     conditions = conditions_of(machine, session)
     board = judge_board(
@@ -325,7 +323,6 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    """Return notes on a machine, independent of the views."""
     hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
     notes = []
     if hidden:

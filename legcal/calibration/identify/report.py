@@ -233,7 +233,6 @@ class IdentifyDocument(SparseDocument):
 
 
 def _condition(condition: Condition, legs: Sequence[str]) -> ConditionBlock:
-    """Return a condition as a document."""
     is_count = condition.equations is not None
     return ConditionBlock(
         name=condition.name,
