@@ -22,7 +22,7 @@ from legcal.errors import OutOfResources, UsageError
 from legcal.pages.html import page_html
 from legcal.pages.svg import Points, scatter
 from legcal.perception.overlays import COLOURS
-from legcal.report.page.calibration_page import calibration_page
+from legcal.report.calibration_page import calibration_page
 from legcal.vision.cylinder import outlines_of_axis
 
 SECTIONS = (
@@ -34,7 +34,6 @@ SECTIONS = (
     "residuals",
     "outlines",
     "identifiability",
-    "correlation",
     "holdout",
     "notes",
     "record",
@@ -51,7 +50,7 @@ def page(example_run: Run) -> Any:
 def test_labels_of_a_chart_are_neither_cut_nor_under_the_title_of_their_axis() -> None:
     few = np.linspace(0.0, 1.0, 3)
     points = Points(1000.0 * few, 0.00125 * (2.0 * few - 1.0), np.arange(3))
-    drawing = html.fromstring(str(scatter("a chart", [points], "place [px]", "residual [px]")))
+    drawing = html.fromstring(scatter("a chart", [points], "place [px]", "residual [px]").markup())
     labels = {text.text: text for text in drawing.iter("text")}
     ends = {label: float(text.get("x") or "nan") for label, text in labels.items()}
     width = 6.2  # of a digit, at most [px]
@@ -80,13 +79,15 @@ def test_a_page_has_the_numbers_of_the_result(example_run: Run, page: Any) -> No
     joints = [
         1e3 * x for side in result["links"].values() for one in side["joints"] for x in one["xyz"]
     ]
-    in_links = [float(row[2].get("data-value")) for row in tables[0].xpath("tbody/tr")]
+    rows = tables[0].xpath("tbody/tr")
+    in_links = [float(row[3].get("data-value")) for row in rows]
     assert in_links[: len(joints)] == pytest.approx(joints, rel=1e-12, abs=1e-12)
-    rows = tables[1].xpath("tbody/tr")
+    others = [
+        row for row in result["parameters"] if row["name"].rpartition(".")[2] not in ("x", "y", "z")
+    ]
     scale = {"m": 1e3, "rad": 180.0 / 3.141592653589793, "px": 1.0, "": 1.0}
-    assert len(rows) == len(result["parameters"])
-    for row, one in zip(rows, result["parameters"], strict=True):
-        name, *numbers = (cell.get("data-value", cell.text_content()) for cell in row)
+    for row, one in zip(rows[len(joints) :], others, strict=True):
+        name, _, *numbers = (cell.get("data-value", cell.text_content()) for cell in row)
         wanted = [one["nominal"], one["value"], one["value"] - one["nominal"], one["sigma"]]
         assert name == one["name"]
         for text, value in zip(numbers, wanted, strict=False):
@@ -260,7 +261,7 @@ def test_a_page_that_fails_loses_nothing_else(
     assert (out / "report.html").exists()
     words = ("calibrate", example_run.folder, "-o", out)
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", example_run.written_again)
-    monkeypatch.setattr("legcal.report.page.calibration_page.verdict_of", fails)
+    monkeypatch.setattr("legcal.report.calibration_page.verdict_of", fails)
     assert run(monkeypatch, *words, "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out) == json.loads((out / "result.json").read_text())

@@ -2,10 +2,8 @@
 
 import io
 import json
-import sys
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 from rich.console import Console
@@ -41,12 +39,9 @@ STUDY = PaperStudy(n_poses=8)
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]:
-    """Run the study once, with a few runs of few poses; its figure needs no display."""
+    """Run the study once, with a few runs of few poses."""
     output = tmp_path_factory.mktemp("study") / "paper"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "matplotlib.pyplot", None)
-        patch.delattr(matplotlib, "pyplot", raising=False)
-        return run_study(STUDY, N_RUNS, output=output), output
+    return run_study(STUDY, N_RUNS, output=output), output
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import Detection, unique_names
@@ -275,7 +274,7 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
             for name, (leg, _) in joints.items()
         ],
         clicks=clicks,
-        drawing=Markup(draw_machine(machine, in_page=True)),
+        drawing=draw_machine(machine, in_page=True).markup(),
         sigma=SIGMA_PX,
         first=min(unplaced, default=0),
         token=token,

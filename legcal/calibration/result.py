@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +43,6 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformErro
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
-from legcal.calibration.plots import plot_residuals
 from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
@@ -59,9 +58,6 @@ from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
 from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -138,10 +134,6 @@ class Calibration(Summarised):
         """How far each outline is from the fit; empty where axes were given."""
         solution = self.solution
         return outline_residuals(solution.posterior, self.dataset, solution.outlines)
-
-    def plot_residuals(self) -> Figure:
-        """Return a figure of how far outlines are from the fit, over the field of each view."""
-        return plot_residuals(self.solution.posterior)
 
     def __repr__(self) -> str:
         return few_lines(f"Calibration of '{self.dataset.machine.name}'", self.result)

@@ -21,7 +21,7 @@ from legcal.calibration.documents import (
     WorkspaceAccuracy,
 )
 from legcal.calibration.link_joints import joints_title, mark_in_words
-from legcal.calibration.plots import plot_uncertainty
+from legcal.calibration.plots import uncertainty_figure
 from legcal.calibration.quantities import (
     FRAMES,
     Quantity,
@@ -33,11 +33,11 @@ from legcal.calibration.quantities import (
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.pages.svg import Figure
 from legcal.vision.board import Link
 
 if TYPE_CHECKING:
     import pandas
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class Summarised:
 
     def plot_uncertainty(self) -> Figure:
         """Return a figure of the standard deviations of parameters, and of the platform."""
-        return plot_uncertainty(self.result)
+        return uncertainty_figure(self.result).markup()
 
     def _repr_html_(self) -> str:
         return summary_html(self.result)

@@ -20,7 +20,7 @@ from legcal.calibration.summary import (
 )
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.parameter_id import ParameterId
-from legcal.pages.document import Table
+from legcal.pages.document import Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
@@ -205,3 +205,10 @@ def _left_out(evaluation: Evaluation) -> list[Text | Table]:
     title = f"{n} of {n + len(evaluation.displacement)} poses are left out"
     cells = [(str(row.row), row.view, row.image, " and ".join(row.by)) for row in rows]
     return [table(">row", "view", "image", "not reached by", rows=cells, title=title)]
+
+
+def check_verdict(check: Check) -> Verdict:
+    """Return whether anything has moved: green or red."""
+    if check.movement.moved:
+        return Verdict("bad", "Something has moved", check.sentence, [])
+    return Verdict("good", "No change was detected", check.sentence, [])

@@ -10,10 +10,10 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
-from legcal.machine.drawing import around, corners_of_base, motor_lines
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, moved_legs, parametrization_of
+from legcal.machine.picture import around, corners_of_base, motor_lines
 from legcal.machine.rods import ends_in_base, first_rods
 from legcal.scene.shapes import ellipsoids
 

@@ -1,0 +1,775 @@
+"""The page of a calibration: ``report.html`` of a result folder."""
+
+from __future__ import annotations
+
+import platform as system
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from legcal.calibration.doubts import Doubt
+from legcal.calibration.evaluation import Evaluation, evaluate
+from legcal.calibration.identify.identifiability import ranks_of_dataset
+from legcal.calibration.joint_fit.scale import single_witness
+from legcal.calibration.notes import Topic, topic_of
+from legcal.calibration.pipeline import exact_cameras
+from legcal.calibration.plots import parameter_charts, platform_chart
+from legcal.calibration.quantities import DIGITS, Quantity, joints_of, mm_deg, parameters_of
+from legcal.calibration.result import Calibration
+from legcal.calibration.result_folder import REPORT_NAME
+from legcal.calibration.workspace_errors import PlatformMap, platform_map
+from legcal.data.dataset import Dataset
+from legcal.data.measurements import row_names
+from legcal.errors import LegcalError, printable
+from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.motions import components
+from legcal.geometry.types import Array
+from legcal.machine.files import RESULT_YAML
+from legcal.machine.loader import load_mechanism
+from legcal.machine.model import Machine
+from legcal.machine.parameters import geometries
+from legcal.pages.document import (
+    Cell,
+    Drawing,
+    Facts,
+    Gallery,
+    Items,
+    Light,
+    Page,
+    Row,
+    Scene,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    number,
+)
+from legcal.pages.html import PAGE, page_html, time_of_page
+from legcal.pages.svg import Bars, log_bars, number_grid
+from legcal.report.identify import CONDITIONS
+from legcal.report.residuals import outline_crops, residual_charts
+from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
+from legcal.scene.shapes import enlargement, pyramid
+from legcal.version import __version__
+
+MAX_POSES = 60  # largest number of poses of the slider
+MAX_CAMERAS = 60
+_RING = 0.06  # size of the median ellipsoid, relative to the machine
+_DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
+_BY_PRIOR = 0.7  # sigma of a parameter that its prior determines, relative to that of the prior
+_PARALLEL = 1e-9
+_STATUS = {
+    "estimated": "estimated",
+    "fixed": "fixed",
+    "weak": "undetermined combination, kept nominal",
+}
+_WORDS: dict[Light, str] = {
+    "good": "Use it",
+    "doubtful": "Do not trust it yet",
+    "bad": "Do not load it into the controller",
+}
+
+
+def write_report(
+    calibration: Calibration,
+    folder: str | Path,
+    command: str = "",
+    *,
+    truth: str | Path | Machine | None = None,
+    into: str | Path | None = None,
+) -> Path:
+    """Write ``report.html`` into the result folder of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The result of :func:`legcal.calibrate`.
+    folder : path
+        The result folder.
+    command : str
+        The command of the calibration, for the record.
+    truth : path, name or Machine, optional
+        The true model of a simulated or measured machine: the page then shows the errors of the
+        nominal and the calibrated model, as Fig. 4 of the paper.
+    into : path, optional
+        The folder with the files of the result while it is being written.
+
+    Returns
+    -------
+    path
+        The page.
+
+    Raises
+    ------
+    UsageError
+        If another file has that name.
+    ModelError
+        If the truth is not a model of the same machine.
+    OutOfResources
+        If it cannot be written.
+    """
+    files = Path(folder if into is None else into)
+    path = files / REPORT_NAME
+    PAGE.check_place(path)
+    against = []
+    if truth is not None:
+        true = truth if isinstance(truth, Machine) else load_mechanism(truth)
+        against = truth_blocks(calibration, true, load_mechanism(files / RESULT_YAML))
+    PAGE.write(path, page_html(calibration_page(calibration, Path(folder), command, against)))
+    return path
+
+
+def calibration_page(
+    calibration: Calibration,
+    folder: Path,
+    command: str = "",
+    against: Sequence[Any] = (),
+) -> Page:
+    """Return the page of a calibration whose result folder this is, made by a command.
+
+    *against* are the blocks of a section on the truth, if it is given.
+    """
+    machine = calibration.dataset.machine
+    when = time_of_page()
+    sections = (
+        ("next", "What to do next", [Items(next_steps(calibration, str(folder), command), True)]),
+        ("platform", "Platform error", platform_blocks(calibration)),
+        ("truth", "Against the truth", against),
+        ("parameters", "Parameters", parameter_blocks(calibration)),
+        ("machine", "The machine", [machine_scene(calibration)]),
+        *_outline_sections(calibration),
+        ("identifiability", "Identifiability", identifiability_blocks(calibration)),
+        ("holdout", "Held-out images", held_out_blocks(calibration)),
+        ("notes", "Diagnosis and notes", note_blocks(calibration)),
+        ("record", "Reproducibility", reproducibility_blocks(calibration, command, when)),
+    )
+    return Page(
+        f"Calibration of {machine.name}",
+        f"{calibration.dataset.folder.name}, {when}",
+        verdict_of(calibration),
+        [Section(*section) for section in sections if section[2]],
+    )
+
+
+# Verdict and next steps
+
+
+def verdict_of(calibration: Calibration) -> Verdict:
+    """Return the verdict: green, amber where something speaks against it, or red."""
+    verdict = calibration.verdict
+    light: Light = "good"
+    if not verdict.trustworthy:
+        light = "bad" if verdict.is_to_be_refused else "doubtful"
+    doubts = [f"{doubt.sentence}{_effect(doubt)}" for doubt in verdict.doubts]
+    return Verdict(light, _WORDS[light], verdict.sentence, [*doubts, *_grounds(calibration)])
+
+
+def _effect(doubt: Doubt) -> str:
+    """Return how far a doubt would move the platform, in words."""
+    if doubt.sigma_dX_m is None or doubt.sigma_dE_rad is None:
+        return ""
+    return f" At the platform: {mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)}."
+
+
+def _grounds(calibration: Calibration) -> list[str]:
+    """Return what the verdict rests on."""
+    result, found = calibration.result, []
+    platform, seen = result.platform, result.observations
+    if platform is not None:
+        ratio = platform.change_dX_m / platform.sigma_dX_m if platform.sigma_dX_m else np.inf
+        found.append(
+            f"The change of the platform is {ratio:.1f} times its standard deviation; above 2 a "
+            "calibration counts as an improvement."
+        )
+    if seen is not None:
+        found.append(f"{seen.used} of {seen.total} {seen.kind} in {seen.images} images were used.")
+    quality = result.residuals
+    if quality.rms_px is not None:
+        found.append(f"Outlines lie {quality.rms_px:.3f} px (rms) from the fit.")
+    held_out = result.holdout
+    if held_out is not None and held_out.rms_px is not None and held_out.expected_px is not None:
+        found.append(
+            f"Images that were kept aside lie {held_out.rms_px:.3f} px off; "
+            f"{held_out.expected_px:.3f} px were expected."
+        )
+    if witness := single_witness(calibration.solution.posterior.problem):
+        found.append(witness)
+    return found
+
+
+def _written_beside(command: str) -> str:
+    """Return a command with another output folder, so that the result of the first stays."""
+    words = shlex.split(command)
+    for k, word in enumerate(words[:-1]):
+        if word in ("-o", "--output"):
+            words[k + 1] = f"{words[k + 1].rstrip('/')}-holdout"
+    return shlex.join(words)
+
+
+def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]:
+    """Return what to do next, the first thing first; *command* has made the result, if any has."""
+    result, steps = calibration.result, list[str]()
+    dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
+    for doubt in calibration.doubts:
+        what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
+        steps.append(f"{what}. {remedy}, and calibrate again.")
+    remedy = calibration.verdict.remedy
+    if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
+        steps.append(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again.")
+    if calibration.verdict.trustworthy:
+        steps.append(
+            "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
+            "move to a few poses whose place you can measure."
+        )
+        if result.holdout is None and calibration.dataset.machine.is_determined:
+            steps.append(
+                "See how well it predicts images that it has not seen: "
+                f"{_written_beside(command or f'legcal calibrate {dataset} -o {out}')} "
+                "--holdout 0.2."
+            )
+        steps.append(
+            "Where the base stands in the cell and the tool on the platform is not seen in "
+            f"photographs of legs: legcal locate {out}/calibrated.yaml POSES -o located.yaml."
+        )
+        steps.append(
+            "In some months, or after a collision, photograph a few poses and ask whether anything "
+            f"moved: legcal calibrate NEW --check {out}."
+        )
+    elif not result.diagnosis:
+        if result.weakest:
+            steps.append(f"More images help where least is known: {result.weakest[0].in_words}.")
+        steps.append(
+            "Look at the worst outlines below: blur, reflections and wrong edges show there."
+        )
+    if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
+        steps.append(
+            "Calibrate the camera with legcal camera: its file then states how well it is known, "
+            "which belongs into the uncertainty of the result."
+        )
+    return steps
+
+
+# Platform error
+
+
+def platform_blocks(calibration: Calibration) -> list[Any]:
+    """Return figures, histograms and maps of the error of the platform."""
+    platform = calibration.result.platform
+    if platform is None or calibration.platform is None:
+        reason = calibration.dataset.machine.undetermined
+        return [Text([f"No error of the platform is predicted, because {reason}."])]
+    change, sigma = calibration.platform.change, calibration.platform.sigma
+    rows = [
+        _figures("before: nominal vs. calibrated model", change.displacement, change.rotation),
+        _figures("after: predicted error of the calibrated model, 1 sigma", sigma.displacement,
+                 sigma.rotation),
+    ]  # fmt: skip
+    workspace = platform_map(calibration)
+    if workspace is not None:
+        n = len(workspace.position)
+        rows += [
+            _figures(f"before, {n} places of the workspace", workspace.change.displacement,
+                     workspace.change.rotation),
+            _figures(f"after, {n} places of the workspace", workspace.sigma.displacement,
+                     workspace.sigma.rotation),
+        ]  # fmt: skip
+    columns = ("", ">mean [mm]", ">largest [mm]", ">mean [deg]", ">largest [deg]")
+    scope = "The first two rows" if workspace is not None else "Both rows"
+    note = (
+        f"{scope} are at the {platform.poses} poses of the images. Both models get the "
+        "same readings; errors of the readings themselves are not in sigma."
+    )
+    charts = [Drawing(chart.markup()) for chart in platform_chart(calibration.result)]
+    blocks: list[Any] = [Table(columns, rows, note=note), *charts]
+    if workspace is not None and workspace.index.size:
+        blocks += _maps(workspace)
+    return blocks
+
+
+def _figures(name: str, displacement: Array, rotation: Array) -> list[Any]:
+    degrees = np.degrees(rotation)
+    return [
+        name,
+        number(1e3 * displacement.mean(), 3),
+        number(1e3 * displacement.max(), 3),
+        number(degrees.mean(), 4),
+        number(degrees.max(), 4),
+    ]
+
+
+def _maps(workspace: PlatformMap) -> list[Any]:
+    """Return slices of constant z, whose colours mean the same before and after."""
+    blocks: list[Any] = []
+    before, after = 1e3 * workspace.change.displacement, 1e3 * workspace.sigma.displacement
+    most = float(max(before.max(), after.max()))
+    for name, values in (("Before", before), ("After, 1 sigma", after)):
+        digits = int(np.clip(np.ceil(1.5 - np.log10(max(values.max(), 1e-9))), 0, 5))
+        slices = [
+            Drawing(
+                number_grid(
+                    (1e3 * workspace.x).tolist(),
+                    (1e3 * workspace.y).tolist(),
+                    np.where(level >= 0, values[level], np.nan),
+                    f"{name} [mm], z = {1e3 * z:z.0f} mm",
+                    most,
+                    digits,
+                ).markup()
+            )
+            for z, level in zip(workspace.z.tolist(), workspace.index, strict=True)
+        ]
+        blocks.append(Row(slices))
+    note = "Slices at the orientation of home; empty cells are out of reach."
+    return [*blocks, Text([note], dim=True)]
+
+
+# Against the truth
+
+
+def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Any]:
+    """Return the errors of the nominal and the calibrated model.
+
+    Raises
+    ------
+    ModelError
+        If the truth is not a model of the same machine.
+    DidNotConverge
+        If the models reach no readings together.
+    """
+    before = evaluate(calibration.dataset.machine, truth)
+    after = evaluate(calibrated, truth)
+    sigma = {row.name: row.sigma for row in calibration.result.parameters}
+    blocks: list[Any] = [Text([_at_the_platform(before, after), _ORIGIN])]
+    for unit_of_chart in ("m", "rad"):
+        # Coordinates that the frame makes zero are not parameters.
+        indices = [
+            i
+            for i, name in enumerate(after.names)
+            if after.units[i] == unit_of_chart and name in sigma
+        ]
+        if not indices:
+            continue
+        scale, unit = SHOWN_IN[unit_of_chart]
+        before_errors, after_errors = (
+            (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
+            for evaluation in (before, after)
+        )
+        names = [after.names[i] for i in indices]
+        chart = log_bars(
+            "Distance from the truth",
+            unit,
+            names,
+            Bars("nominal", before_errors),
+            Bars("calibrated", after_errors),
+            Bars("its sigma as predicted", [scale * (sigma[name] or 0.0) for name in names]),
+        )
+        blocks.append(Drawing(chart.markup(), _CAPTION))
+    return blocks
+
+
+_ORIGIN = "The truth was given for this page alone: the result was computed without it."
+_CAPTION = (
+    "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and R_e."
+)
+
+
+def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
+    """Return the errors of eq (20) as a sentence."""
+    if not len(after.displacement):
+        return (
+            "The motors do not determine the pose of the platform: parameters are compared alone."
+        )
+    errors = [
+        f"{1e3 * evaluation.displacement.mean():.3f} mm and "
+        f"{np.degrees(evaluation.rotation.mean()):.4f} deg by the {name} model"
+        for name, evaluation in (("nominal", before), ("calibrated", after))
+    ]
+    return (
+        f"At the same readings the platform is off by {errors[0]}, and by {errors[1]} (means over "
+        f"{len(after.displacement)} poses of the workspace, eq 20)."
+    )
+
+
+# Parameters
+
+
+def parameter_blocks(calibration: Calibration) -> list[Any]:
+    """Return joints in the links with all other parameters, as a table and as bars."""
+    priors, result = _prior_sigmas(calibration), calibration.result
+    turns: dict[str, Array] = {
+        side: np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
+        for side, block in (result.links or {}).items()
+    }
+    joints, parameters = list(joints_of(result)), parameters_of(result)
+    others = [q for q in parameters if not (joints and q.parameter.is_joint_coordinate)]
+    rows = []
+    for q in (*joints, *others):
+        name, prior = q.parameter, priors.get(q.name)
+        if name.is_joint_coordinate and name.kind in turns:
+            row = turns[name.kind]["xyz".index(name.component)]
+            along = int(row.argmax())  # a prior of one axis of the frame, if parallel
+            prior = None
+            if row[along] > 1.0 - _PARALLEL:
+                prior = priors.get(str(replace(name, component="xyz"[along])))
+        rows.append(_cells(q, prior))
+    machine = calibration.dataset.machine
+    motors = ""
+    if any(motor.turns for motor in machine.actuators):
+        motors = "; axis_point: lateral displacement of the arm axis"
+        if any(motor.arm is not None for motor in machine.actuators):
+            motors += ", arm_point: lateral displacement of the line of the arm"
+    elif machine.actuators:
+        motors = "; directions of carriages too"
+    note = (
+        f"Joints are in the links{machine.at_zero}, as in calibrated.urdf; axes are turns from the "
+        f"nominal ones{motors}. Sigma is one standard deviation; coordinates without sigma fix the "
+        "frame R_b or R_e, which photographs of legs cannot determine. Click a heading to sort."
+    )
+    columns = ("parameter", "of", ">nominal", ">calibrated", ">change", ">sigma", "unit",
+               ">prior sigma", "how determined")  # fmt: skip
+    shown = [q for q in (*joints, *others) if q.parameter.kind != "radius"]
+    charts = [Drawing(chart.markup()) for chart in parameter_charts(shown)]
+    return [Table(columns, rows, note=note), Row(charts)]
+
+
+def _cells(q: Quantity, prior: float | None) -> list[Cell]:
+    """Return the cells of a row."""
+    prior = prior if q.status == "estimated" else None
+    return [
+        q.name,
+        q.frame,
+        number(q.nominal, q.digits),
+        number(q.value, q.digits),
+        number(q.change, q.digits, signed=True),
+        number(q.sigma, q.digits),
+        q.unit,
+        number(prior, q.digits),
+        _determination(q, prior),
+    ]
+
+
+def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
+    """Return the standard deviations of priors by the name of their parameter [mm, deg, px]."""
+    problem = calibration.solution.posterior.problem
+    priors, named = problem.priors, problem.named
+    numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
+    sigma_by_name = {named[i]: sigma for i, sigma in numbers if i < len(named)}
+    sigma_by_name |= dict(calibration.solution.estimates.prior_sigma)
+    units = {row.name: row.unit for row in calibration.result.parameters}
+    return {k: SHOWN_IN[units[k]][0] * sigma for k, sigma in sigma_by_name.items() if k in units}
+
+
+def _determination(q: Quantity, prior: float | None) -> str:
+    if q.status == "frame":
+        return f"the joint defines the {q.defines} of the frame"
+    if q.sigma is None or prior is None:
+        return _STATUS[q.status]
+    if q.sigma > _BY_PRIOR * prior:
+        return "mostly by its prior"
+    return "by images, readings and its prior"
+
+
+# The machine
+
+
+def machine_scene(calibration: Calibration) -> Scene:
+    """Return the machine with sliders for pose and exaggeration."""
+    machine, measurements = calibration.dataset.machine, calibration.dataset.measurements
+    solution, result = calibration.solution, calibration.result
+    n = measurements.n_poses
+    chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
+    T = [solution.T_Rb_Re[k] for k in chosen.tolist()]
+    q, by_readings = measurements.q_of_poses[chosen], calibration.platform is not None
+    nominal, parameters = geometries(machine), solution.kinematic.parametrization
+    scene = MachineScene(machine, solution.legs, nominal, result, parameters)
+
+    def placed(legs: Any) -> PlacedModel:
+        return scene.placed(legs, q, T, by_readings=by_readings)
+
+    calibrated = placed(solution.legs)
+    pairs = [("change by the calibration", ("nominal", "calibrated"),
+              placed(nominal), calibrated)]  # fmt: skip
+    pairs += [
+        (words, ("calibrated", "moved along the direction"), calibrated, placed(scene.moved(k)))
+        for k, (words, _) in enumerate(scene.directions)
+    ]
+    images = row_names(measurements)
+    turn_base = machine.T_base_Rb.rotation.as_matrix()
+    turn_platform = machine.T_platform_Re.rotation.as_matrix().T
+    factor = enlargement(scene.ellipsoids, _RING * scene.size)
+    content = {
+        "unit": "m",
+        "flat": not machine.spatial,
+        "factors": FACTORS,
+        "poses": [printable(images[row]) for row in measurements.first_rows[chosen].tolist()],
+        "modes": [
+            {
+                "name": printable(name),
+                "legend": legend,
+                "step": scene.first_step(before, after),
+                "models": [_model(before), _model(after)],
+            }
+            for name, legend, before, after in pairs
+        ],
+        "names": [printable(name) for name in machine.leg_names],
+        "rims": scene.rims,
+        "rings": {
+            "name": f"1 sigma, {factor:g} times as large",
+            "turns": _rounded(turn_base @ components(T)[0] @ turn_platform, 6),
+            **{side: _rounded(factor * axes, 6) for side, axes in scene.ellipsoids.items()},
+        },
+        "cameras": _cameras(calibration, _DEPTH * scene.size),
+    }
+    left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
+    caption = (
+        "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
+        "same readings, or grey the calibrated one and blue where a direction would move it; the "
+        "slider exaggerates the difference. Rings are ellipsoids of one "
+        "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
+        f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
+    )
+    return Scene("machine-scene", content, 560, caption)
+
+
+def _model(model: PlacedModel) -> dict[str, Any]:
+    """Return the geometry of a model; joints at A that no motor moves are included once."""
+    is_fixed = np.ptp(model.A, axis=0).max() == 0.0
+    once = model._replace(A=model.A[:1], moving=model.moving[:1]) if is_fixed else model
+    return {name: _rounded(values, 7) for name, values in once._asdict().items()}
+
+
+def _cameras(calibration: Calibration, depth: float) -> list[dict[str, Any]]:
+    """Return the cameras of used views as pyramids of their field of view."""
+    solution, views = calibration.solution, calibration.dataset.measurements.views
+    frame, used_views = calibration.dataset.machine.T_base_Rb, calibration.result.views
+    used = [v for v, view in enumerate(views) if view.name in used_views][:MAX_CAMERAS]
+    return [
+        {
+            "name": printable(views[v].name),
+            "points": _rounded(
+                pyramid(solution.cameras[v], frame * solution.T_camera_Rb[v].inv(), depth), 4
+            ),
+        }
+        for v in used
+    ]
+
+
+def _rounded(values: Array, digits: int) -> Any:
+    return np.round(values, digits).tolist()
+
+
+# Outlines
+
+
+def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
+    """Return the sections on residuals and on the outlines with the largest ones."""
+    if not len(calibration.residuals):
+        return []
+    crops = outline_crops(calibration, calibration.overlays)
+    n = len(crops.missing)
+    missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
+    lines = Text(
+        [
+            "Green: measured outline, red if rejected by the fit; dashed orange: predicted by the "
+            "fit. Click to enlarge, scroll to zoom, drag to move."
+        ],
+        dim=True,
+    )
+    galleries = [
+        Gallery(gallery, title)
+        for gallery, title in (
+            (
+                crops.worst,
+                f"The worst {len(crops.worst)}, by their distance in standard deviations",
+            ),
+            (crops.median, f"{len(crops.median)} typical ones (median distance)"),
+        )
+        if gallery
+    ]
+    sections: list[tuple[str, str, Sequence[Any]]] = [
+        ("residuals", "Residuals", [residual_charts(calibration, crops.links)])
+    ]
+    if galleries or missing:
+        sections.append(("outlines", "Outlines", [*missing, lines, *galleries]))
+    return sections
+
+
+# Evidence
+
+
+def identifiability_blocks(calibration: Calibration) -> list[Any]:
+    """Return counts, ranks, and the least certain directions."""
+    problem, result = calibration.solution.posterior.problem, calibration.result
+    free = int(problem.free.sum())
+    n_held = len(calibration.solution.kinematic.held_basis)
+    counts = {
+        "Equations": f"{problem.n_equations}: "
+        + ", ".join(
+            f"{f.n * f.n_rows} of {f.name.replace('_', ' ')}" for f in problem.factors if f.n
+        ),
+        "Priors": str(len(problem.priors.mean)),
+        "Unknowns": f"{problem.n_unknowns}: "
+        + ", ".join(
+            f"{block.n_unknowns} of {block.name.replace('_', ' ')}"
+            for block in problem.variables
+            if block.n_unknowns
+        )
+        + f", and {problem.n_elements} platform poses",
+        "Kinematic parameters": f"{free - n_held} of {free} directions determined",
+        "Degrees of freedom": f"{result.residuals.dof}, chi2 {result.residuals.chi2:.1f}",
+    }
+    blocks: list[Any] = [Facts(counts)]
+    try:
+        conditions, full = ranks_of_dataset(calibration.dataset, problem.choices)
+    except LegcalError:
+        conditions = ()
+    if conditions:
+        rows: list[list[Cell]] = [
+            [
+                CONDITIONS[c.name],
+                number(c.equations, 0),
+                number(c.unknowns, 0),
+                "holds" if c.ok else "fails" if c.needed else "fails, not needed with the board",
+            ]
+            for c in conditions
+        ]
+        enough = "" if full.complete else "not enough"
+        ranks: list[list[Cell]] = [[number(full.rank, 0), number(full.of, 0), enough]]
+        blocks += [
+            Table(("condition of the paper", ">equations", ">unknowns", ""), rows),
+            Table((">predicted rank", ">of", ""), ranks),
+        ]
+    weak: list[list[Cell]] = [
+        [
+            row.in_words,
+            number(1e3 * row.sigma_m, 4),
+            _parts(components.parameters, components.components),
+        ]
+        for row in result.weakest
+        for components in (row.links or row,)
+    ]
+    if weak:
+        columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
+        note = "Select one under Show in the machine above to see it as a motion."
+        blocks.append(Table(columns, weak, note=note))
+    if result.held:
+        blocks.append(Items(result.held, title="Held at nominal, without effect on the platform"))
+    return blocks
+
+
+def _parts(names: Any, components: Any) -> str:
+    return ", ".join(f"{c:+.2f} {name}" for name, c in zip(names, components, strict=True))
+
+
+def held_out_blocks(calibration: Calibration) -> list[Any]:
+    """Return the prediction errors in held-out images."""
+    holdout = calibration.result.holdout
+    if holdout is None:
+        return [Text(["No held-out images (use --holdout 0.2)."], dim=True)]
+    if holdout.rms_px is None:
+        return [Text(["The held-out images show no outline that could be compared."])]
+    facts = {
+        "Held out": f"{holdout.images} images of {holdout.poses} poses, {holdout.outlines} "
+        f"outlines, {holdout.wrong} of them far off and left out",
+        "Prediction error": f"{holdout.rms_px:.3f} px (rms); {holdout.expected_px or 0.0:.3f} px "
+        "were expected",
+    }
+    if holdout.platform is not None:
+        pair = holdout.platform
+        facts["At the platform"] = (
+            f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms over {pair.poses} poses); "
+            f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected"
+        )
+    rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in holdout.views.items()]
+    return [Facts(facts), Table(("view", ">rms [px]"), rows)]
+
+
+def note_blocks(calibration: Calibration) -> list[Any]:
+    """Return the diagnosis, and the notes by topic."""
+    blocks: list[Any] = []
+    diagnosis: list[list[Cell]] = [
+        [d.what, "; ".join(d.same_as), number(d.images_before, 0), number(d.images_after, 0),
+         d.remedy]
+        for d in calibration.result.diagnosis or ()
+    ]  # fmt: skip
+    if diagnosis:
+        columns = ("likely mistake", "indistinguishable from", ">images that agree",
+                   ">with correction", "remedy")  # fmt: skip
+        blocks.append(Table(columns, diagnosis, "Diagnosis"))
+    for topic in Topic:
+        if topic is Topic.DIAGNOSIS:
+            continue  # as a table
+        notes = [note for note in calibration.notes if topic_of(note) is topic]
+        blocks += [Items(notes, title=topic)] * bool(notes)
+    steps = calibration.result.stages.staged
+    remarks = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
+    if any(remarks):
+        remarks_of_steps = [remark for remark in remarks if remark]
+        blocks.append(Items(remarks_of_steps, title="The four steps alone"))
+    return blocks
+
+
+def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
+    """Return version, command, settings, and the hashes of all input files."""
+    dataset, problem = calibration.dataset, calibration.solution.posterior.problem
+    settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(problem.settings).items()}
+    facts = {
+        "Version": f"legcal {__version__}, Python {system.python_version()}, {system.machine()}",
+        "Command": command or "from Python",
+        "Time": when,
+        "Dataset": str(dataset.folder),
+        "Encoder sigma": _encoder_sigma(dataset),
+        "Start of the fit": f"{calibration.result.start}, {calibration.solution.iterations} "
+        "iterations",
+        "Chosen parameters": _chosen(calibration) or "none",
+        "Least common-mode biases": ", ".join(
+            f"{name} {px:.3g} px" for name, px in sorted(problem.choices.least_shared_px.items())
+        )
+        or "none",
+        "Settings of the fit": ", ".join(f"{name} {value}" for name, value in settings.items()),
+    }
+    return [Facts(facts)]
+
+
+def _encoder_sigma(dataset: Dataset) -> str:
+    """Return the standard deviation of readings, by motor if they differ."""
+    machine = dataset.machine
+    sigma = dataset.measurements.sigma_of(machine.legs)
+    sigma_in_words = {
+        str(machine.legs[j].prismatic): f"{np.degrees(sigma[j]):.3g} deg"
+        if machine.legs[j].reads_angle
+        else f"{1e6 * sigma[j]:g} um"
+        for j in machine.motors
+    }
+    distinct = set(sigma_in_words.values())
+    if len(distinct) < 2:
+        return next(iter(distinct), "no encoder")
+    return ", ".join(f"{name} {words}" for name, words in sigma_in_words.items())
+
+
+def _chosen(calibration: Calibration) -> str:
+    """Return the parameters that were fixed, freed or given a prior by choice."""
+    choices = calibration.solution.posterior.problem.choices
+    units = {row.name: row.unit for row in calibration.result.parameters}
+
+    def shown(name: str, *values: float) -> str:
+        scale, unit = SHOWN_IN[units.get(name, "")]
+        return (
+            " +- ".join(f"{scale * value:.{DIGITS[unit]}f}" for value in values)
+            + f" {unit}".rstrip()
+        )
+
+    choices_in_words = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
+    choices_in_words += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]
+    choices_in_words += [f"{name} free" for name in sorted(choices.free)]
+    choices_in_words += [
+        f"{k} {shown(k, p.mean, p.sigma)}" for k, p in sorted(choices.priors.items())
+    ]
+    choices_in_words += [
+        f"camera of {view} from an earlier result" for view in sorted(choices.cameras)
+    ]
+    return ", ".join(choices_in_words)
