@@ -101,9 +101,10 @@ def _conditions(report: Identifiability) -> Table:
     """Return the paper's conditions."""
     rows = []
     for c in report.conditions:
-        legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
+        failing = [report.legs.index(name) for name in c.failing or ()]
+        legs = f": {legs_in_words(failing, report.legs)}" if failing else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
-        remark = "" if c.needed else ", not needed with the board"
+        remark = ", not needed with the board" if c.needed is False else ""
         remark += ", by analogy" if c.by_analogy else ""
         rows.append((CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
     return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
@@ -138,7 +139,7 @@ def _two_digits(value: float) -> str:
 def _scale(report: Identifiability) -> list[Part]:
     """Return the possible sources of scale with their precision."""
     rows = []
-    for source in report.scale:
+    for source in report.scale or ():
         scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
         motion = source.platform_sigma
         rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
@@ -229,8 +230,9 @@ def _verdict(report: Identifiability) -> list[Part]:
             f"{_two_digits(degrees(sigma.dE_rad))} deg."
         )
         lines.append(Text(expected, style="dim"))
-        ways = [s.assumed for s in report.scale if s.sigma is not None and s.source != "radii"]
-        for radii in (s.platform_sigma for s in report.scale if s.source == "radii"):
+        scale = report.scale or ()
+        ways = [s.assumed for s in scale if s.sigma is not None and s.source != "radii"]
+        for radii in (s.platform_sigma for s in scale if s.source == "radii"):
             if radii is not None:
                 lines.append(
                     f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "

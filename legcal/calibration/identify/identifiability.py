@@ -17,7 +17,13 @@ from legcal.calibration.identify.remedies import (
     judge_board,
     recommend,
 )
-from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
+from legcal.calibration.identify.report import (
+    ConditionBlock,
+    Identifiability,
+    PaperBlock,
+    Ranks,
+    Recommendation,
+)
 from legcal.calibration.identify.scale import (
     is_scale_open,
     n_open_with_radii,
@@ -205,11 +211,11 @@ def identifiability_of_dataset(
     report = _report_on(dataset.machine, analysis, None, None)
     if dataset.axes is None:
         intrinsics = expected_intrinsics(analysis)
-        report = replace(report, intrinsics=intrinsics)
+        report = report.model_copy(update={"intrinsics": intrinsics})
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
-    return replace(report, notes=(*report.notes, note))
+    return report.model_copy(update={"notes": (*report.notes, note)})
 
 
 def ranks_of_dataset(
@@ -290,7 +296,10 @@ def _report_on(
 ) -> Identifiability:
     """Report on a session."""
     session = analysis.session
-    conditions = conditions_of(machine, session)
+    conditions = tuple(
+        ConditionBlock.of(condition, machine.leg_names)
+        for condition in conditions_of(machine, session)
+    )
     board = judge_board(
         analysis,
         *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
@@ -324,7 +333,8 @@ def _report_on(
         remedies=() if full.complete else find_remedies(analysis, replanning),
         recommendation=recommendation,
         notes=tuple(notes),
-        scale=scale_sources(analysis),
+        scale=scale_sources(analysis) or None,
+        paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )
 
 
