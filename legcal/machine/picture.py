@@ -26,7 +26,7 @@ MOTOR_COLOUR = "#8a6d3b"  # arms, carriages and rails
 AXIS_COLOURS = ("#c62828", "#2e7d32", "#1565c0")  # x, y, z
 _CARRIAGE = 0.06  # length of a carriage, relative to its travel
 _STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
-_SIDE, _EDGE, _HEAD, _LINE = 420.0, 46.0, 44.0, 15.0  # panel, margin, title, text line [px]
+_EDGE, _HEAD, _LINE = 46.0, 44.0, 15.0  # margin, title, text line [px]
 _ARM = 34.0  # length of the axis of a frame [px]
 _APART = 15.0  # smallest distance of the names of marks [px]
 _MARK = b"<!-- legcal inspect -->"
@@ -128,11 +128,17 @@ def plot_machine(machine: Machine) -> Figure:
 
 
 def draw_machine(
-    machine: Machine, *, in_page: bool = False, marks: Sequence[Mark] = (), title: str = "at home"
+    machine: Machine,
+    *,
+    in_page: bool = False,
+    marks: Sequence[Mark] = (),
+    title: str = "at home",
+    side: float = 420.0,
 ) -> Canvas:
     """Draw a machine and marks beside it: from above (x to the right, y up) and the side (z up).
 
-    The views are side by side in a file; *in_page*, which is narrow, one below the other.
+    The views, *side* pixels wide, are side by side in a file; *in_page*, which is narrow, one below
+    the other.
     """
     B = machine.home.apply(machine.B_platform)
     A = B - vectors_A_to_B(machine, machine.home)
@@ -140,23 +146,24 @@ def draw_machine(
     ends = (A, B, motors.standing.reshape(-1, 3), motors.moving.reshape(-1, 3))
     corners = np.concatenate([*ends, *(mark.points for mark in marks)])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    scale = (_SIDE - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
+    scale = (side - 2 * _EDGE) / max(float((high - low).max()), 1e-6)
     views = [("from above", [0, 1])] + [("from the side", [0, 2])] * machine.spatial
-    across, down = (1, len(views)) if in_page else (len(views), 1)
-    foot = _HEAD + _SIDE * down
-    width, height = _SIDE * across, foot + _LINE * (2 + (machine.n_legs + 3) // 4)
+    heights = [2.0 * _EDGE + scale * float((high - low)[axes[1]]) for _, axes in views]
+    width = side if in_page else side * len(views)
+    foot = _HEAD + (sum(heights) if in_page else max(heights))
+    height = foot + _LINE * (2 + (machine.n_legs + 3) // 4)
     canvas = Canvas(width, height, f"{machine.name} {title}")
     canvas.box(0.0, 0.0, width, height, "white")
     canvas.text(12.0, 20.0, canvas.title, size=15)
     for k, (view, axes) in enumerate(views):
-        left, top = _SIDE * (k % across), _HEAD + _SIDE * (k // across)
+        left, top = (0.0, _HEAD + sum(heights[:k])) if in_page else (k * side, _HEAD)
         middle = 0.5 * (low + high)[axes]
 
         def on_paper(
             points: Array,
             axes: list[int] = axes,
             middle: Array = middle,
-            at: tuple[float, float] = (left + 0.5 * _SIDE, top + 0.5 * _SIDE),
+            at: tuple[float, float] = (left + 0.5 * side, top + 0.5 * heights[k]),
         ) -> Array:
             return np.asarray(at + scale * (points[..., axes] - middle) * [1.0, -1.0])
 

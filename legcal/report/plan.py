@@ -28,6 +28,7 @@ PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.tx
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # least certain parameters shown, equally many of each unit
 _LEAST = 6  # smallest number of images drawn; fewer determine next to nothing
+_SIDE = 560.0  # width of a picture of camera places [px]
 _DEPTH = 0.1  # depth of the pyramid of a camera, relative to its distance from the machine
 
 
@@ -271,7 +272,7 @@ def _draw_places(plan: Plan, *, in_page: bool) -> Canvas:
                 distance = f"{1e3 * np.linalg.norm(joint - eye):.0f}"
                 marks.append(Mark(line, _CAMERA_COLOUR, distance, 1, 0.5, only_plan=True))
     title = "at home, with the cameras; distances in mm"
-    return draw_machine(machine, in_page=in_page, marks=marks, title=title)
+    return draw_machine(machine, in_page=in_page, marks=marks, title=title, side=_SIDE)
 
 
 def _draw_growth(plan: Plan) -> Canvas:
