@@ -175,7 +175,9 @@ def test_tables_sort_by_numbers_and_back(page: Any) -> None:
     button = page.find_element("xpath", "//*[@id='parameters']//th/button[text()='change']")
 
     def column() -> list[float]:
-        cells = page.find_elements("css selector", "#parameters > .scroll tbody td:nth-child(5)")
+        cells = page.find_elements(
+            "css selector", "#parameters > div:nth-of-type(1) td.n:nth-child(5)"
+        )
         return [float(one.get_dom_attribute("data-value")) for one in cells]
 
     before = column()

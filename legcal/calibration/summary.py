@@ -33,6 +33,7 @@ from legcal.calibration.quantities import (
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.pages.document import Number, Table
 from legcal.pages.svg import Figure
 from legcal.vision.board import Link
 
@@ -124,6 +125,18 @@ class ParameterTable:
             tuple(_cell(name, x, n) for name, x in zip(self.columns, row, strict=True))
             for row, n in zip(self.rows, self.digits, strict=True)
         ]
+
+    def as_table(self, title: str = "") -> Table:
+        """Return the table for a terminal or a page."""
+        columns = [f">{name}" if name in NUMBERS else name for name in self.columns]
+        rows = [
+            [
+                Number(x, text) if name in NUMBERS else text
+                for name, x, text in zip(self.columns, row, texts, strict=True)
+            ]
+            for row, texts in zip(self.rows, self.cells(), strict=True)
+        ]
+        return Table(columns, rows, title)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a data frame, a row a parameter.
@@ -221,9 +234,13 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
 
     *verbose* says how the fit went too, and names what moves the platform by nothing.
     """
+    notes = [f"Note: {note}" for note in result.notes]
+    return [*doubt_lines(result), *notes, *fit_lines(result, verbose=verbose)]
+
+
+def fit_lines(result: Result, *, verbose: bool) -> list[str]:
+    """Return what a fit was made from, how well it fits, and what it leaves open."""
     return [
-        *_doubt_lines(result),
-        *(f"Note: {note}" for note in result.notes),
         *(result.details if verbose else ()),
         *_observation_lines(result),
         *_board_lines(result),
@@ -236,13 +253,12 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
 
 
 def brief_sentences(result: Result) -> list[str]:
-    """Return what the first screen says beside the verdict and the platform error."""
+    """Return what the first screen says beside the verdict, the platform error and notes."""
     return [
-        *_doubt_lines(result),
+        *doubt_lines(result),
         *_direction_lines(result, 1),
         *_observation_lines(result),
         *([] if result.holdout is None else _holdout_lines(result.holdout)),
-        *(f"Note: {note}" for note in result.notes),
     ]
 
 
@@ -315,7 +331,7 @@ class Summarised:
         return summary_html(self.result)
 
 
-def _doubt_lines(result: Result) -> list[str]:
+def doubt_lines(result: Result) -> list[str]:
     """Return what speaks against the result, each with its effect on the platform and its remedy.
 
     One doubt alone stands in the verdict.

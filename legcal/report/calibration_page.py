@@ -10,18 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from legcal.calibration.doubts import Doubt
 from legcal.calibration.evaluation import Evaluation, evaluate
 from legcal.calibration.identify.identifiability import ranks_of_dataset
-from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.notes import Topic, topic_of
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.plots import parameter_charts, platform_chart
-from legcal.calibration.quantities import DIGITS, Quantity, joints_of, mm_deg, parameters_of
+from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
+from legcal.calibration.summary import brief_sentences, fit_lines, tables
 from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import row_names
@@ -51,6 +49,7 @@ from legcal.pages.document import (
 )
 from legcal.pages.html import PAGE, page_html, time_of_page
 from legcal.pages.svg import Bars, log_bars, number_grid
+from legcal.report.calibration import platform_table
 from legcal.report.identify import CONDITIONS
 from legcal.report.residuals import outline_crops, residual_charts
 from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
@@ -61,13 +60,6 @@ MAX_POSES = 60  # largest number of poses of the slider
 MAX_CAMERAS = 60
 _RING = 0.06  # size of the median ellipsoid, relative to the machine
 _DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
-_BY_PRIOR = 0.7  # sigma of a parameter that its prior determines, relative to that of the prior
-_PARALLEL = 1e-9
-_STATUS = {
-    "estimated": "estimated",
-    "fixed": "fixed",
-    "weak": "undetermined combination, kept nominal",
-}
 _WORDS: dict[Light, str] = {
     "good": "Use it",
     "doubtful": "Do not trust it yet",
@@ -143,8 +135,8 @@ def calibration_page(
         ("parameters", "Parameters", parameter_blocks(calibration)),
         ("machine", "The machine", [machine_scene(calibration)]),
         *_outline_sections(calibration),
+        ("fit", "The fit", [Items(fit_lines(calibration.result, verbose=True))]),
         ("identifiability", "Identifiability", identifiability_blocks(calibration)),
-        ("holdout", "Held-out images", held_out_blocks(calibration)),
         ("notes", "Diagnosis and notes", note_blocks(calibration)),
         ("record", "Reproducibility", reproducibility_blocks(calibration, command, when)),
     )
@@ -165,41 +157,8 @@ def verdict_of(calibration: Calibration) -> Verdict:
     light: Light = "good"
     if not verdict.trustworthy:
         light = "bad" if verdict.is_to_be_refused else "doubtful"
-    doubts = [f"{doubt.sentence}{_effect(doubt)}" for doubt in verdict.doubts]
-    return Verdict(light, _WORDS[light], verdict.sentence, [*doubts, *_grounds(calibration)])
-
-
-def _effect(doubt: Doubt) -> str:
-    """Return how far a doubt would move the platform, in words."""
-    if doubt.sigma_dX_m is None or doubt.sigma_dE_rad is None:
-        return ""
-    return f" At the platform: {mm_deg(doubt.sigma_dX_m, doubt.sigma_dE_rad)}."
-
-
-def _grounds(calibration: Calibration) -> list[str]:
-    """Return what the verdict rests on."""
-    result, found = calibration.result, []
-    platform, seen = result.platform, result.observations
-    if platform is not None:
-        ratio = platform.change_dX_m / platform.sigma_dX_m if platform.sigma_dX_m else np.inf
-        found.append(
-            f"The change of the platform is {ratio:.1f} times its standard deviation; above 2 a "
-            "calibration counts as an improvement."
-        )
-    if seen is not None:
-        found.append(f"{seen.used} of {seen.total} {seen.kind} in {seen.images} images were used.")
-    quality = result.residuals
-    if quality.rms_px is not None:
-        found.append(f"Outlines lie {quality.rms_px:.3f} px (rms) from the fit.")
-    held_out = result.holdout
-    if held_out is not None and held_out.rms_px is not None and held_out.expected_px is not None:
-        found.append(
-            f"Images that were kept aside lie {held_out.rms_px:.3f} px off; "
-            f"{held_out.expected_px:.3f} px were expected."
-        )
-    if witness := single_witness(calibration.solution.posterior.problem):
-        found.append(witness)
-    return found
+    reasons = brief_sentences(calibration.result)
+    return Verdict(light, _WORDS[light], verdict.sentence, reasons)
 
 
 def _written_beside(command: str) -> str:
@@ -263,43 +222,16 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
     if platform is None or calibration.platform is None:
         reason = calibration.dataset.machine.undetermined
         return [Text([f"No error of the platform is predicted, because {reason}."])]
-    change, sigma = calibration.platform.change, calibration.platform.sigma
-    rows = [
-        _figures("before: nominal vs. calibrated model", change.displacement, change.rotation),
-        _figures("after: predicted error of the calibrated model, 1 sigma", sigma.displacement,
-                 sigma.rotation),
-    ]  # fmt: skip
-    workspace = platform_map(calibration)
-    if workspace is not None:
-        n = len(workspace.position)
-        rows += [
-            _figures(f"before, {n} places of the workspace", workspace.change.displacement,
-                     workspace.change.rotation),
-            _figures(f"after, {n} places of the workspace", workspace.sigma.displacement,
-                     workspace.sigma.rotation),
-        ]  # fmt: skip
-    columns = ("", ">mean [mm]", ">largest [mm]", ">mean [deg]", ">largest [deg]")
-    scope = "The first two rows" if workspace is not None else "Both rows"
     note = (
-        f"{scope} are at the {platform.poses} poses of the images. Both models get the "
-        "same readings; errors of the readings themselves are not in sigma."
+        f"The first row is at the {platform.poses} poses of the images. Both models get the same "
+        "readings; errors of the readings themselves are not in sigma."
     )
     charts = [Drawing(chart.markup()) for chart in platform_chart(calibration.result)]
-    blocks: list[Any] = [Table(columns, rows, note=note), *charts]
+    blocks: list[Any] = [replace(platform_table(platform), note=note), *charts]
+    workspace = platform_map(calibration)
     if workspace is not None and workspace.index.size:
         blocks += _maps(workspace)
     return blocks
-
-
-def _figures(name: str, displacement: Array, rotation: Array) -> list[Any]:
-    degrees = np.degrees(rotation)
-    return [
-        name,
-        number(1e3 * displacement.mean(), 3),
-        number(1e3 * displacement.max(), 3),
-        number(degrees.mean(), 4),
-        number(degrees.max(), 4),
-    ]
 
 
 def _maps(workspace: PlatformMap) -> list[Any]:
@@ -398,25 +330,8 @@ def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
 
 
 def parameter_blocks(calibration: Calibration) -> list[Any]:
-    """Return joints in the links with all other parameters, as a table and as bars."""
-    priors, result = _prior_sigmas(calibration), calibration.result
-    turns: dict[str, Array] = {
-        side: np.abs(Rotation.from_quat(block.T_link_frame.quat_xyzw).as_matrix())
-        for side, block in (result.links or {}).items()
-    }
-    joints, parameters = list(joints_of(result)), parameters_of(result)
-    others = [q for q in parameters if not (joints and q.parameter.is_joint_coordinate)]
-    rows = []
-    for q in (*joints, *others):
-        name, prior = q.parameter, priors.get(q.name)
-        if name.is_joint_coordinate and name.kind in turns:
-            row = turns[name.kind]["xyz".index(name.component)]
-            along = int(row.argmax())  # a prior of one axis of the frame, if parallel
-            prior = None
-            if row[along] > 1.0 - _PARALLEL:
-                prior = priors.get(str(replace(name, component="xyz"[along])))
-        rows.append(_cells(q, prior))
-    machine = calibration.dataset.machine
+    """Return joints in the links with all other parameters, as tables and as bars."""
+    result, machine = calibration.result, calibration.dataset.machine
     motors = ""
     if any(motor.turns for motor in machine.actuators):
         motors = "; axis_point: lateral displacement of the arm axis"
@@ -429,48 +344,14 @@ def parameter_blocks(calibration: Calibration) -> list[Any]:
         f"nominal ones{motors}. Sigma is one standard deviation; coordinates without sigma fix the "
         "frame R_b or R_e, which photographs of legs cannot determine. Click a heading to sort."
     )
-    columns = ("parameter", "of", ">nominal", ">calibrated", ">change", ">sigma", "unit",
-               ">prior sigma", "how determined")  # fmt: skip
-    shown = [q for q in (*joints, *others) if q.parameter.kind != "radius"]
-    charts = [Drawing(chart.markup()) for chart in parameter_charts(shown)]
-    return [Table(columns, rows, note=note), Row(charts)]
-
-
-def _cells(q: Quantity, prior: float | None) -> list[Cell]:
-    """Return the cells of a row."""
-    prior = prior if q.status == "estimated" else None
+    joints, parameters = list(joints_of(result)), parameters_of(result)
+    others = [q for q in parameters if not (joints and q.parameter.is_joint_coordinate)]
+    charts = parameter_charts([q for q in (*joints, *others) if q.parameter.kind != "radius"])
     return [
-        q.name,
-        q.frame,
-        number(q.nominal, q.digits),
-        number(q.value, q.digits),
-        number(q.change, q.digits, signed=True),
-        number(q.sigma, q.digits),
-        q.unit,
-        number(prior, q.digits),
-        _determination(q, prior),
+        *(table.as_table(title) for title, table in tables(result)),
+        Text([note], dim=True),
+        Row([Drawing(chart.markup()) for chart in charts]),
     ]
-
-
-def _prior_sigmas(calibration: Calibration) -> dict[str, float]:
-    """Return the standard deviations of priors by the name of their parameter [mm, deg, px]."""
-    problem = calibration.solution.posterior.problem
-    priors, named = problem.priors, problem.named
-    numbers = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    sigma_by_name = {named[i]: sigma for i, sigma in numbers if i < len(named)}
-    sigma_by_name |= dict(calibration.solution.estimates.prior_sigma)
-    units = {row.name: row.unit for row in calibration.result.parameters}
-    return {k: SHOWN_IN[units[k]][0] * sigma for k, sigma in sigma_by_name.items() if k in units}
-
-
-def _determination(q: Quantity, prior: float | None) -> str:
-    if q.status == "frame":
-        return f"the joint defines the {q.defines} of the frame"
-    if q.sigma is None or prior is None:
-        return _STATUS[q.status]
-    if q.sigma > _BY_PRIOR * prior:
-        return "mostly by its prior"
-    return "by images, readings and its prior"
 
 
 # The machine
@@ -656,36 +537,11 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
         note = "Select one under Show in the machine above to see it as a motion."
         blocks.append(Table(columns, weak, note=note))
-    if result.held:
-        blocks.append(Items(result.held, title="Held at nominal, without effect on the platform"))
     return blocks
 
 
 def _parts(names: Any, components: Any) -> str:
     return ", ".join(f"{c:+.2f} {name}" for name, c in zip(names, components, strict=True))
-
-
-def held_out_blocks(calibration: Calibration) -> list[Any]:
-    """Return the prediction errors in held-out images."""
-    holdout = calibration.result.holdout
-    if holdout is None:
-        return [Text(["No held-out images (use --holdout 0.2)."], dim=True)]
-    if holdout.rms_px is None:
-        return [Text(["The held-out images show no outline that could be compared."])]
-    facts = {
-        "Held out": f"{holdout.images} images of {holdout.poses} poses, {holdout.outlines} "
-        f"outlines, {holdout.wrong} of them far off and left out",
-        "Prediction error": f"{holdout.rms_px:.3f} px (rms); {holdout.expected_px or 0.0:.3f} px "
-        "were expected",
-    }
-    if holdout.platform is not None:
-        pair = holdout.platform
-        facts["At the platform"] = (
-            f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms over {pair.poses} poses); "
-            f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected"
-        )
-    rows: list[list[Cell]] = [[name, number(rms, 3)] for name, rms in holdout.views.items()]
-    return [Facts(facts), Table(("view", ">rms [px]"), rows)]
 
 
 def note_blocks(calibration: Calibration) -> list[Any]:
