@@ -16,7 +16,7 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine
 from legcal.machine.parameters import from_vector, geometries, to_vector
-from legcal.report.study import study_table
+from legcal.report.session import study_table
 from legcal.simulation.paper import (
     ESTIMATORS,
     MACHINES,

@@ -37,7 +37,6 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
 from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
-from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
@@ -189,19 +188,20 @@ def calibrate(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
     )
     notes = [
-        *Note.about(Topic.DIAGNOSIS, (one.sentence for one in found.diagnosis)),
-        *Note.about(Topic.DATASET, dataset.notes),
-        *Note.about(Topic.DATASET, missing),
-        *Note.about(Topic.IMAGES, on_images),
-        *Note.about(Topic.MODEL, (*choices.notes, *identify_notes)),
-        *Note.about(Topic.DATASET, cache_notes),
-        *Note.about(Topic.READINGS, found.fitted.unreached_notes()),
-        *Note.about(Topic.READINGS, _own_zero_notes(dataset, found.solution)),
-        *Note.about(Topic.IMAGES, [f"Left out, as asked: {leave_out}."] if leave_out else ()),
-        *Note.about(Topic.BOARDS, board_notes(dataset, found.solution, found.corners)),
+        *(one.sentence for one in found.diagnosis),
+        *dataset.notes,
+        *missing,
+        *on_images,
+        *choices.notes,
+        *identify_notes,
+        *cache_notes,
+        *found.fitted.unreached_notes(),
+        *_own_zero_notes(dataset, found.solution),
+        *([f"Left out, as asked: {leave_out}."] if leave_out else ()),
+        *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
-        *Note.about(Topic.CAMERAS, _camera_notes(dataset, found.solution)),
-        *Note.about(Topic.CAMERAS, exact_cameras(dataset, choices)),
+        *_camera_notes(dataset, found.solution),
+        *exact_cameras(dataset, choices),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),

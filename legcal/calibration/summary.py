@@ -1,9 +1,9 @@
-"""What a calibration says to people: its table of parameters and sentences, from the document."""
+"""What a calibration says to people: tables, sentences and charts, from the document."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, overload
@@ -21,7 +21,6 @@ from legcal.calibration.documents import (
     WorkspaceAccuracy,
 )
 from legcal.calibration.link_joints import joints_title, mark_in_words
-from legcal.calibration.plots import uncertainty_figure
 from legcal.calibration.quantities import (
     FRAMES,
     Quantity,
@@ -34,7 +33,7 @@ from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
 from legcal.pages.document import Number, Table
-from legcal.pages.svg import Figure
+from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
 from legcal.vision.board import Link
 
 if TYPE_CHECKING:
@@ -500,3 +499,41 @@ def _holdout_lines(found: Holdout) -> list[str]:
         f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
         f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
     ]
+
+
+# Charts
+
+
+def parameter_charts(quantities: Sequence[Quantity]) -> list[Canvas]:
+    """Draw changes and standard deviations of estimated quantities, a chart for each unit."""
+    charts = []
+    for unit in ("mm", "deg"):
+        shown = [q for q in quantities if q.unit == unit and q.sigma]
+        if shown:
+            changes = [None if q.change is None else abs(q.change) for q in shown]
+            bars = Bars("change", changes), Bars("1 sigma", [q.sigma for q in shown])
+            names = [q.name for q in shown]
+            charts.append(log_bars("Change against the nominal model", unit, names, *bars))
+    return charts
+
+
+def platform_chart(result: Result) -> list[Canvas]:
+    """Draw the change of the platform at the poses, and its predicted error; none without both."""
+    poses = [] if result.platform is None else result.platform.per_pose
+    number = np.arange(1.0, len(poses) + 1.0)
+    lines = [
+        Points(number, 1e3 * np.array(values), group=k, label=label, line="")
+        for k, (values, label) in enumerate(
+            (
+                ([pose.change_dX_m for pose in poses], "before: change against the nominal model"),
+                ([pose.sigma_dX_m for pose in poses], "after: predicted error (1 sigma)"),
+            )
+        )
+    ]
+    return [scatter("Platform error", lines, "pose", "platform [mm]", log="y")] if poses else []
+
+
+def uncertainty_figure(result: Result) -> Canvas:
+    """Draw changes and standard deviations of all parameters, and of the platform at poses."""
+    charts = parameter_charts(parameters_of(result))
+    return stacked("How well the parameters are known", [*charts, *platform_chart(result)])

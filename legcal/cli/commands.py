@@ -78,7 +78,7 @@ def camera(
 
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.calibration.camera_calibration.projection import compare_cameras
-    from legcal.report.images import camera_table, comparison_table
+    from legcal.report.machine import camera_table, comparison_table
     from legcal.report.render import report
     from legcal.vision.camera_export import convert_camera
     from legcal.vision.camera_file import read_camera
@@ -160,7 +160,7 @@ def detect(
     """
     from legcal.calibration import doctor as job
     from legcal.data.dataset import load_dataset
-    from legcal.report.doctor import examination_table
+    from legcal.report.session import examination_table
 
     if edit:
         from legcal.viewer.address import Address, check_address
@@ -204,7 +204,7 @@ def doctor(
     Exit 0 if it is ready, 1 for problems, 2 if files cannot be used.
     """
     from legcal.calibration import doctor as job
-    from legcal.report.doctor import examination_table
+    from legcal.report.session import examination_table
 
     examination = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
     show(as_json, examination.document, lambda: examination_table(examination))

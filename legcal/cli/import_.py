@@ -58,7 +58,7 @@ def import_(
     """Make a dataset from recordings of a machine that rests at each pose."""
     from legcal.progress import shown_progress
     from legcal.recordings.importing import import_recordings, plan_import
-    from legcal.report.new_dataset import import_table, written_lines
+    from legcal.report.session import import_table, written_lines
 
     with shown_progress(not quiet) as progress:
         plan = plan_import(

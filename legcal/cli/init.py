@@ -66,7 +66,7 @@ def init(
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
     from legcal.data.new_dataset import SheetOptions, plan_new_dataset, write_new_dataset
-    from legcal.report.new_dataset import matching_table, written_lines
+    from legcal.report.session import matching_table, written_lines
 
     options = SheetOptions(
         cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma

@@ -101,7 +101,7 @@ def simulate(
     (legcal.SimulationSettings).
     """
     from legcal.machine.loader import load_mechanism
-    from legcal.report.images import simulation_table
+    from legcal.report.session import simulation_table
     from legcal.simulation.dataset import simulate as run
     from legcal.simulation.dataset import summary_document
     from legcal.simulation.request import requested

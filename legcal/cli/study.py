@@ -55,7 +55,7 @@ def paper(
     from markupsafe import Markup
 
     from legcal.pages.document import Drawing
-    from legcal.report.study import study_table
+    from legcal.report.session import study_table
     from legcal.simulation.observe import TableNoise
     from legcal.simulation.paper import PaperStudy
     from legcal.simulation.study import StudyResult, run_study

@@ -13,13 +13,17 @@ import numpy as np
 
 from legcal.calibration.evaluation import Evaluation, evaluate
 from legcal.calibration.identify.identifiability import ranks_of_dataset
-from legcal.calibration.notes import Topic, topic_of
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.plots import parameter_charts, platform_chart
 from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
-from legcal.calibration.summary import brief_sentences, fit_lines, tables
+from legcal.calibration.summary import (
+    brief_sentences,
+    fit_lines,
+    parameter_charts,
+    platform_chart,
+    tables,
+)
 from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import row_names
@@ -52,8 +56,7 @@ from legcal.pages.svg import Bars, log_bars, number_grid
 from legcal.report.calibration import platform_table
 from legcal.report.identify import CONDITIONS
 from legcal.report.residuals import outline_crops, residual_charts
-from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
-from legcal.scene.shapes import enlargement, pyramid
+from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, enlargement, pyramid
 from legcal.version import __version__
 
 MAX_POSES = 60  # largest number of poses of the slider
@@ -545,7 +548,7 @@ def _parts(names: Any, components: Any) -> str:
 
 
 def note_blocks(calibration: Calibration) -> list[Any]:
-    """Return the diagnosis, and the notes by topic."""
+    """Return the diagnosis, and the notes."""
     blocks: list[Any] = []
     diagnosis: list[list[Cell]] = [
         [d.what, "; ".join(d.same_as), number(d.images_before, 0), number(d.images_after, 0),
@@ -556,11 +559,9 @@ def note_blocks(calibration: Calibration) -> list[Any]:
         columns = ("likely mistake", "indistinguishable from", ">images that agree",
                    ">with correction", "remedy")  # fmt: skip
         blocks.append(Table(columns, diagnosis, "Diagnosis"))
-    for topic in Topic:
-        if topic is Topic.DIAGNOSIS:
-            continue  # as a table
-        notes = [note for note in calibration.notes if topic_of(note) is topic]
-        blocks += [Items(notes, title=topic)] * bool(notes)
+    in_table = {diagnosis.sentence for diagnosis in calibration.diagnosis}
+    notes = [note for note in calibration.notes if note not in in_table]
+    blocks += [Items(notes)] * bool(notes)
     steps = calibration.result.stages.staged
     remarks = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
     if any(remarks):

@@ -22,7 +22,7 @@ from legcal.planning.laid_board import LaidBoard
 from legcal.planning.planned_session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
-from legcal.scene.shapes import pyramid
+from legcal.scene.motions import pyramid
 
 PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"

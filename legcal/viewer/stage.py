@@ -13,8 +13,7 @@ from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.machine.picture import corners_of_base, motor_lines
-from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
-from legcal.scene.shapes import enlargement
+from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, enlargement
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 

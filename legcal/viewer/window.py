@@ -27,8 +27,7 @@ from legcal.machine.coordinates import COORDINATES
 from legcal.scene.motions import FACTORS
 from legcal.viewer.address import Address, check_address
 from legcal.viewer.motion import Motion
-from legcal.viewer.photographs import Photographs, Place
-from legcal.viewer.source import Source
+from legcal.viewer.source import Photographs, Place, Source
 from legcal.viewer.stage import Seen, Stage
 
 if TYPE_CHECKING:
