@@ -289,8 +289,9 @@ def test_verdict_document_summary_and_next_step_follow_any_doubt(
         assert found.verdict.sentence.startswith(f"{heading}: the platform moves by ")
         assert "what is in doubt may add 0.001 mm" in found.verdict.sentence
         document = found.result.document()
+        names = ("code", "what", "sigma_dX_m", "sigma_dE_rad", "remedy")
         assert (document["trustworthy"], document["verdict"]) == (False, found.verdict.sentence)
-        assert document["doubts"] == [doubt.document().document()]
+        assert document["doubts"] == [{name: getattr(doubt, name) for name in names}]
         assert found.verdict.sentence in found.summary()
         first = next_steps(found, "out", "")[0]
         assert first == "Something is wrong. Mend it, and calibrate again."

@@ -14,9 +14,9 @@ from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     BoardPose,
     Distance,
+    DoubtBlock,
     Gamma,
     Holdout,
-    HoldoutPlatform,
     Kinematic,
     NoSteps,
     Observations,
@@ -159,13 +159,13 @@ def _result_of(calibration: Calibration) -> Result:
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     nominal, witness = geometries(machine), single_witness(solution.posterior.problem)
-    turned_from = nominal_axes(names, nominal)
+    turned_from, held_out = nominal_axes(names, nominal), calibration.held_out
     return Result(
         legcal_result=1,
         status="converged",
         verdict=calibration.verdict.sentence,
         trustworthy=calibration.verdict.trustworthy,
-        doubts=[doubt.document() for doubt in calibration.doubts],
+        doubts=[DoubtBlock.model_validate(doubt) for doubt in calibration.doubts],
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,
@@ -200,7 +200,7 @@ def _result_of(calibration: Calibration) -> Result:
         ),
         start=solution.start,
         platform=_platform(calibration),
-        holdout=_holdout(calibration),
+        holdout=None if held_out is None else Holdout.model_validate(held_out),
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
@@ -380,29 +380,3 @@ def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
 def _predicted(error: PlatformError) -> dict[str, Any]:
     """Return the fields of :class:`WorkspaceAccuracy`."""
     return {"poses": len(error.displacement), **_errors(error, "sigma_")}
-
-
-def _holdout(calibration: Calibration) -> Holdout | None:
-    """Return what images that were kept aside say."""
-    held_out = calibration.held_out
-    if held_out is None:
-        return None
-    pair = held_out.at_platform
-    return Holdout(
-        images=held_out.n_images,
-        poses=held_out.n_poses,
-        outlines=held_out.outlines,
-        wrong=held_out.wrong,
-        rms_px=held_out.rms_px,
-        expected_px=held_out.expected_px,
-        views=held_out.rms_px_of_view,
-        platform=None
-        if pair is None
-        else HoldoutPlatform(
-            poses=len(held_out.displacement),
-            dX_m=pair.displacement,
-            expected_dX_m=pair.expected_displacement,
-            dE_rad=pair.rotation,
-            expected_dE_rad=pair.expected_rotation,
-        ),
-    )

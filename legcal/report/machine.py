@@ -273,10 +273,10 @@ def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     )
     images = [
         (
-            image.name,
+            image.image,
             f"{image.used}/{image.corners}",
             "left out" if image.rms_px is None else f"{image.rms_px:.3f} px",
-            "" if image.tilt is None else f"{np.degrees(image.tilt):.0f} deg",
+            "" if image.tilt_rad is None else f"{np.degrees(image.tilt_rad):.0f} deg",
         )
         for image in calibration.images
     ]
