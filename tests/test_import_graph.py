@@ -191,7 +191,6 @@ OUTSIDE = {
     "brief",
     "causes",
     "errors",
-    "option_fields",
     "processors",
     "progress",
     "signals",
