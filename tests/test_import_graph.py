@@ -32,7 +32,7 @@ BESIDE = "simulation"  # it knows the truth
 PUBLIC: dict[str, set[str]] = {
     "geometry": {"axes", "covariances", "lines", "motions", "rotations", "types"},
     "files": {"folder", "motions", "published", "quantity", "reading", "schema", "table"},
-    "pages": {"document", "html", "svg"},
+    "pages": {"document", "svg"},
     "machine": {
         "actuator",
         "configurations",

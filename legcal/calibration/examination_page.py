@@ -40,8 +40,8 @@ from legcal.pages.document import (
     Text,
     Verdict,
     number,
+    page_html,
 )
-from legcal.pages.html import page_html
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import PredictedLeg
 

@@ -29,7 +29,6 @@ from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
-from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
@@ -39,7 +38,7 @@ from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
 from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
-from legcal.calibration.result_folder import Beside, write_result
+from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.calibration.verdict import judge
 from legcal.data.cache import (

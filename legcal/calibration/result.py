@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     BoardPose,
@@ -37,18 +38,20 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.held_out import HeldOut, Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
-from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
+from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import row_names
+from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.directions import describe_direction
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
@@ -77,6 +80,38 @@ class Verdict:
     def is_to_be_refused(self) -> bool:
         """Whether it is not to be loaded into a controller: a doubt is grave."""
         return any(doubt.is_grave for doubt in self.doubts)
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class OutlineResiduals:
+    """Residuals of the outlines in the fit, including those it rejected."""
+
+    index: IntArray  # (n,): rows of the table of outlines
+    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
+    offset: Array
+    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def outline_residuals(
+    posterior: Posterior, dataset: Dataset, outlines: Outlines
+) -> OutlineResiduals:
+    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
+    problem = posterior.problem
+    offset = problem.offsets(posterior.state)
+    covariance = posterior.noise.covariance(problem.outlines.covariance)
+    L = np.linalg.cholesky(covariance) if len(offset) else covariance
+    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+    # The fit numbers outlines as they stand in canonical order.
+    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
+    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+    number = order.reorder(numbered).contrast.astype(np.intp)
+    index = number[problem.outlines.index]
+    back = np.argsort(index, kind="stable")
+    return OutlineResiduals(index[back], offset[back], whitened[back])
 
 
 @dataclass(frozen=True, eq=False)

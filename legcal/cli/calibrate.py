@@ -176,7 +176,7 @@ def calibrate(
     from legcal.calibration import pipeline
     from legcal.calibration.result_folder import REPORT_NAME
     from legcal.data.overrides import overrides_of_settings
-    from legcal.pages.html import PAGE
+    from legcal.pages.document import PAGE
     from legcal.report import calibration
     from legcal.report.calibration_page import write_report
 
@@ -236,7 +236,7 @@ def _page_of_check(output: Path) -> Path:
     """
     from legcal.calibration.result_folder import REPORT_NAME
     from legcal.files.folder import RESULT, check_path
-    from legcal.pages.html import PAGE
+    from legcal.pages.document import PAGE
 
     check_path(output)
     if RESULT.is_in(output):

@@ -101,7 +101,7 @@ if TYPE_CHECKING:
 
 def check_page(page: Path | None) -> None:
     """Refuse, before any work, a place where no page can be written."""
-    from legcal.pages.html import PAGE
+    from legcal.pages.document import PAGE
 
     if page is not None:
         PAGE.check_place(page)
@@ -115,7 +115,7 @@ def write_page(
     blocks: Sequence[Any] = (),
 ) -> None:
     """Write the printed text as a page, with further blocks, if *page* is set."""
-    from legcal.pages.html import PAGE, page_html
+    from legcal.pages.document import PAGE, page_html
     from legcal.report.render import text_page
 
     if page is not None:

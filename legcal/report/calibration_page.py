@@ -36,6 +36,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.pages.document import (
+    PAGE,
     Cell,
     Drawing,
     Facts,
@@ -50,8 +51,9 @@ from legcal.pages.document import (
     Text,
     Verdict,
     number,
+    page_html,
+    time_of_page,
 )
-from legcal.pages.html import PAGE, page_html, time_of_page
 from legcal.pages.svg import Bars, log_bars, number_grid
 from legcal.report.calibration import platform_table
 from legcal.report.identify import CONDITIONS
@@ -232,7 +234,7 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
     charts = [Drawing(chart.markup()) for chart in platform_chart(calibration.result)]
     blocks: list[Any] = [replace(platform_table(platform), note=note), *charts]
     workspace = platform_map(calibration)
-    if workspace is not None and workspace.index.size:
+    if workspace is not None:
         blocks += _maps(workspace)
     return blocks
 
@@ -240,24 +242,16 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
 def _maps(workspace: PlatformMap) -> list[Any]:
     """Return slices of constant z, whose colours mean the same before and after."""
     blocks: list[Any] = []
-    before, after = 1e3 * workspace.change.displacement, 1e3 * workspace.sigma.displacement
-    most = float(max(before.max(), after.max()))
+    before, after = 1e3 * workspace.change, 1e3 * workspace.sigma
+    most = float(max(np.nanmax(before), np.nanmax(after)))
     for name, values in (("Before", before), ("After, 1 sigma", after)):
-        digits = int(np.clip(np.ceil(1.5 - np.log10(max(values.max(), 1e-9))), 0, 5))
+        digits = int(np.clip(np.ceil(1.5 - np.log10(max(np.nanmax(values), 1e-9))), 0, 5))
+        x, y = (1e3 * workspace.x).tolist(), (1e3 * workspace.y).tolist()
         slices = [
-            Drawing(
-                number_grid(
-                    (1e3 * workspace.x).tolist(),
-                    (1e3 * workspace.y).tolist(),
-                    np.where(level >= 0, values[level], np.nan),
-                    f"{name} [mm], z = {1e3 * z:z.0f} mm",
-                    most,
-                    digits,
-                ).markup()
-            )
-            for z, level in zip(workspace.z.tolist(), workspace.index, strict=True)
+            number_grid(x, y, level, f"{name} [mm], z = {1e3 * z:z.0f} mm", most, digits)
+            for z, level in zip(workspace.z.tolist(), values, strict=True)
         ]
-        blocks.append(Row(slices))
+        blocks.append(Row([Drawing(chart.markup()) for chart in slices]))
     note = "Slices at the orientation of home; empty cells are out of reach."
     return [*blocks, Text([note], dim=True)]
 

@@ -15,8 +15,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.feasibility import poses_at
 from legcal.machine.picture import Mark, draw_machine
-from legcal.pages.document import Drawing, Items, Picture, Row
-from legcal.pages.html import page_html
+from legcal.pages.document import Drawing, Items, Picture, Row, page_html
 from legcal.pages.svg import Canvas, Points, scatter
 from legcal.planning.laid_board import LaidBoard
 from legcal.planning.planned_session import Plan, views_in_words

@@ -22,9 +22,9 @@ from legcal.pages.document import (
     Section,
     Table,
     Verdict,
+    time_of_page,
 )
 from legcal.pages.document import Text as Paragraphs
-from legcal.pages.html import time_of_page
 from legcal.version import __version__
 
 Part = str | Text | Table
