@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform as system
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from legcal.calibration.evaluation import Evaluation, evaluate
 from legcal.calibration.identify.identifiability import ranks_of_dataset
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
+from legcal.calibration.quantities import joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
 from legcal.calibration.summary import (
@@ -25,7 +25,6 @@ from legcal.calibration.summary import (
     tables,
 )
 from legcal.calibration.workspace_errors import PlatformMap, platform_map
-from legcal.data.dataset import Dataset
 from legcal.data.measurements import row_names
 from legcal.errors import LegcalError, printable
 from legcal.files.quantity import SHOWN_IN
@@ -56,7 +55,7 @@ from legcal.pages.document import (
 )
 from legcal.pages.svg import Bars, log_bars, number_grid
 from legcal.report.calibration import platform_table
-from legcal.report.identify import CONDITIONS
+from legcal.report.identify import conditions_table
 from legcal.report.residuals import outline_crops, residual_charts
 from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, enlargement, pyramid
 from legcal.version import __version__
@@ -222,7 +221,7 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]
 
 
 def platform_blocks(calibration: Calibration) -> list[Any]:
-    """Return figures, histograms and maps of the error of the platform."""
+    """Return figures, a chart and maps of the error of the platform."""
     platform = calibration.result.platform
     if platform is None or calibration.platform is None:
         reason = calibration.dataset.machine.undetermined
@@ -504,23 +503,11 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
     try:
         conditions, full = ranks_of_dataset(calibration.dataset, problem.choices)
     except LegcalError:
-        conditions = ()
-    if conditions:
-        rows: list[list[Cell]] = [
-            [
-                CONDITIONS[c.name],
-                number(c.equations, 0),
-                number(c.unknowns, 0),
-                "holds" if c.ok else "fails" if c.needed else "fails, not needed with the board",
-            ]
-            for c in conditions
-        ]
-        enough = "" if full.complete else "not enough"
-        ranks: list[list[Cell]] = [[number(full.rank, 0), number(full.of, 0), enough]]
-        blocks += [
-            Table(("condition of the paper", ">equations", ">unknowns", ""), rows),
-            Table((">predicted rank", ">of", ""), ranks),
-        ]
+        pass
+    else:
+        counts["Predicted rank"] = f"{full.rank} of {full.of}"
+        legs = calibration.dataset.machine.leg_names
+        blocks += [conditions_table(conditions, legs)] * bool(conditions)
     weak: list[list[Cell]] = [
         [
             row.in_words,
@@ -565,62 +552,13 @@ def note_blocks(calibration: Calibration) -> list[Any]:
 
 
 def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
-    """Return version, command, settings, and the hashes of all input files."""
-    dataset, problem = calibration.dataset, calibration.solution.posterior.problem
-    settings = {name.replace("_", " "): f"{v:g}" for name, v in asdict(problem.settings).items()}
+    """Return version, command, and where the fit started."""
     facts = {
         "Version": f"legcal {__version__}, Python {system.python_version()}, {system.machine()}",
         "Command": command or "from Python",
         "Time": when,
-        "Dataset": str(dataset.folder),
-        "Encoder sigma": _encoder_sigma(dataset),
+        "Dataset": str(calibration.dataset.folder),
         "Start of the fit": f"{calibration.result.start}, {calibration.solution.iterations} "
         "iterations",
-        "Chosen parameters": _chosen(calibration) or "none",
-        "Least common-mode biases": ", ".join(
-            f"{name} {px:.3g} px" for name, px in sorted(problem.choices.least_shared_px.items())
-        )
-        or "none",
-        "Settings of the fit": ", ".join(f"{name} {value}" for name, value in settings.items()),
     }
     return [Facts(facts)]
-
-
-def _encoder_sigma(dataset: Dataset) -> str:
-    """Return the standard deviation of readings, by motor if they differ."""
-    machine = dataset.machine
-    sigma = dataset.measurements.sigma_of(machine.legs)
-    sigma_in_words = {
-        str(machine.legs[j].prismatic): f"{np.degrees(sigma[j]):.3g} deg"
-        if machine.legs[j].reads_angle
-        else f"{1e6 * sigma[j]:g} um"
-        for j in machine.motors
-    }
-    distinct = set(sigma_in_words.values())
-    if len(distinct) < 2:
-        return next(iter(distinct), "no encoder")
-    return ", ".join(f"{name} {words}" for name, words in sigma_in_words.items())
-
-
-def _chosen(calibration: Calibration) -> str:
-    """Return the parameters that were fixed, freed or given a prior by choice."""
-    choices = calibration.solution.posterior.problem.choices
-    units = {row.name: row.unit for row in calibration.result.parameters}
-
-    def shown(name: str, *values: float) -> str:
-        scale, unit = SHOWN_IN[units.get(name, "")]
-        return (
-            " +- ".join(f"{scale * value:.{DIGITS[unit]}f}" for value in values)
-            + f" {unit}".rstrip()
-        )
-
-    choices_in_words = [f"{name} fixed" for name in sorted(choices.fixed - choices.values.keys())]
-    choices_in_words += [f"{k} fixed at {shown(k, v)}" for k, v in sorted(choices.values.items())]
-    choices_in_words += [f"{name} free" for name in sorted(choices.free)]
-    choices_in_words += [
-        f"{k} {shown(k, p.mean, p.sigma)}" for k, p in sorted(choices.priors.items())
-    ]
-    choices_in_words += [
-        f"camera of {view} from an earlier result" for view in sorted(choices.cameras)
-    ]
-    return ", ".join(choices_in_words)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 from math import degrees
 
@@ -10,6 +11,7 @@ from rich.text import Text
 from legcal.calibration.identify.report import (
     BoardReport,
     CameraIntrinsics,
+    ConditionBlock,
     Identifiability,
     Ranks,
     WeakDirection,
@@ -42,7 +44,7 @@ def identify_table(report: Identifiability) -> Report:
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
-        [_conditions(report), Text(_LEGEND, style="dim")],
+        [conditions_table(report.conditions, report.legs), Text(_LEGEND, style="dim")],
         _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
         _scale(report) if report.scale else None,
@@ -97,12 +99,12 @@ def _recommendation(report: Identifiability) -> list[Part]:
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
-def _conditions(report: Identifiability) -> Table:
+def conditions_table(conditions: Sequence[ConditionBlock], leg_names: Sequence[str]) -> Table:
     """Return the paper's conditions."""
     rows = []
-    for c in report.conditions:
-        failing = [report.legs.index(name) for name in c.failing or ()]
-        legs = f": {legs_in_words(failing, report.legs)}" if failing else ""
+    for c in conditions:
+        failing = [leg_names.index(name) for name in c.failing or ()]
+        legs = f": {legs_in_words(failing, leg_names)}" if failing else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
         remark = ", not needed with the board" if c.needed is False else ""
         remark += ", by analogy" if c.by_analogy else ""

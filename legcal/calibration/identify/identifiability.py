@@ -220,13 +220,19 @@ def identifiability_of_dataset(
 
 def ranks_of_dataset(
     dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[Condition, ...], Ranks]:
+) -> tuple[tuple[ConditionBlock, ...], Ranks]:
     """Return the paper's conditions and the rank of the joint fit for a dataset.
 
     As :func:`identifiability_of_dataset`, without remedies.
     """
     analysis = _analysis_of(dataset, choices)
-    return conditions_of(dataset.machine, analysis.session), analysis.full
+    return _named_conditions(dataset.machine, analysis.session), analysis.full
+
+
+def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
+    """Return the paper's conditions with the names of legs."""
+    conditions = conditions_of(machine, session)
+    return tuple(ConditionBlock.of(condition, machine.leg_names) for condition in conditions)
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
@@ -296,10 +302,7 @@ def _report_on(
 ) -> Identifiability:
     """Report on a session."""
     session = analysis.session
-    conditions = tuple(
-        ConditionBlock.of(condition, machine.leg_names)
-        for condition in conditions_of(machine, session)
-    )
+    conditions = _named_conditions(machine, session)
     board = judge_board(
         analysis,
         *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
