@@ -43,7 +43,6 @@ PUBLIC: dict[str, set[str]] = {
         "directions",
         "equations",
         "family",
-        "feasibility",
         "files",
         "firmware",
         "firmware_files",

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
-from legcal.machine.feasibility import poses_at
+from legcal.machine.configurations import poses_at
 from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Drawing, Items, Picture, Row, page_html
 from legcal.pages.svg import Canvas, Points, scatter
