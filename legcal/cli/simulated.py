@@ -22,7 +22,6 @@ from legcal.cli.options import (
     show,
     write_page,
 )
-from legcal.processors import processors
 
 
 class _Level(StrEnum):
@@ -170,6 +169,7 @@ def paper(
     from legcal.simulation.observe import TableNoise
     from legcal.simulation.paper import PaperStudy
     from legcal.simulation.study import StudyResult, run_study
+    from legcal.workers import processors
 
     def make_page(study_result: StudyResult, folder: Path) -> None:
         figure = Markup((folder / "fig4.svg").read_text(encoding="utf-8"))
