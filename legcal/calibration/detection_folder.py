@@ -18,7 +18,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from markupsafe import Markup
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import OVERLAYS, PHOTOGRAPHS, Detection, unique_names
@@ -51,8 +50,8 @@ from legcal.pages.document import (
     Text,
     Verdict,
     number,
+    page_html,
 )
-from legcal.pages.html import page_html
 from legcal.perception.overlays import (
     Mark,
     PartMarks,
@@ -483,7 +482,7 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
             for name, (leg, _) in joints.items()
         ],
         clicks=clicks,
-        drawing=Markup(draw_machine(machine, in_page=True)),
+        drawing=draw_machine(machine, in_page=True).markup(),
         sigma=SIGMA_PX,
         first=min(unplaced, default=0),
         token=token,

@@ -26,7 +26,6 @@ from legcal.calibration.documents import (
     MovedPlatform,
 )
 from legcal.calibration.evaluation import machine_difference
-from legcal.calibration.joint_fit.held_out import PlatformPair
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -76,7 +75,7 @@ class Check:
         The fit of the new images alone.
     movement : Movement
         The test; ``movement.moved`` is its answer.
-    at_platform : PlatformPair
+    at_platform : MovedPlatform
         Difference of the platform between new images and earlier result, root mean square over
         the poses, and its standard deviation if nothing moved.
     notes : tuple of str
@@ -87,7 +86,7 @@ class Check:
     earlier: EarlierResult
     solution: Solution
     movement: Movement
-    at_platform: PlatformPair
+    at_platform: MovedPlatform
     notes: tuple[str, ...] = ()
 
     @property
@@ -96,12 +95,12 @@ class Check:
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
         test = f"p-value {p}, significance {100 * movement.significance:g} %"
-        uncertainty = f"{mm_deg(pair.expected_displacement, pair.expected_rotation)} (1 sigma)"
+        uncertainty = f"{mm_deg(pair.sigma_dX_m, pair.sigma_dE_rad)} (1 sigma)"
         if not movement.moved:
             return (
                 f"No change was detected ({test}); the platform pose is confirmed to {uncertainty}."
             )
-        change = mm_deg(pair.displacement, pair.rotation)
+        change = mm_deg(pair.dX_m, pair.dE_rad)
         return (
             f"Something has moved ({test}): the platform pose has changed by {change}, uncertainty "
             f"{uncertainty}; calibrate again."
@@ -109,7 +108,7 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the output of ``--json``."""
-        movement, pair = self.movement, self.at_platform
+        movement = self.movement
         return CheckDocument(
             legcal_check=1,
             result=str(self.earlier.folder),
@@ -134,12 +133,7 @@ class Check:
                 )
                 for explanation in movement.explanations
             ],
-            platform=MovedPlatform(
-                dX_m=pair.displacement,
-                dE_rad=pair.rotation,
-                sigma_dX_m=pair.expected_displacement,
-                sigma_dE_rad=pair.expected_rotation,
-            ),
+            platform=self.at_platform,
             images=self.dataset.measurements.n_rows,
             residuals=FitQuality.model_validate(self.solution.quality),
             notes=list(self.notes),
@@ -380,7 +374,7 @@ def _compare(
     return Check(dataset, earlier, solution, movement, at_platform)
 
 
-def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPair:
+def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> MovedPlatform:
     """Return the platform motion of a fit; J (k, 6, n) is its derivative by the parameters."""
     values, covariance = fit.estimate()
     # Priors shrink the estimate towards the earlier result by 1 - G.
@@ -388,11 +382,11 @@ def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPa
     spread = G @ covariance + G @ prior.covariance @ G.T
     shift = J @ (values - prior.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
-    return PlatformPair(
-        _rms(shift[:, 3:] ** 2),
-        _rms(variance[:, 3:]),
-        _rms(shift[:, :3] ** 2),
-        _rms(variance[:, :3]),
+    return MovedPlatform(
+        dX_m=_rms(shift[:, 3:] ** 2),
+        dE_rad=_rms(shift[:, :3] ** 2),
+        sigma_dX_m=_rms(variance[:, 3:]),
+        sigma_dE_rad=_rms(variance[:, :3]),
     )
 
 

@@ -188,7 +188,7 @@ def inspect(
     machine = load_mechanism(model, base=base, platform=platform, leg_radius=radius)
     description = machine_document(machine)
     if picture is not None:
-        MACHINE_PICTURE.write(picture, draw_machine(machine))
+        MACHINE_PICTURE.write(picture, draw_machine(machine).markup())
         typer.echo(printable(f"Wrote {picture}."), err=True)
     if write is not None:
         for path in write_model(machine, write):
@@ -238,8 +238,7 @@ def identify(
 ) -> None:
     """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
-    from legcal.report.identify import identify_table
-    from legcal.report.page.verdicts import identify_verdict
+    from legcal.report.identify import identify_table, identify_verdict
 
     check_page(page)
     views = [text.split(",") for text in view or []]

@@ -24,8 +24,8 @@ from legcal.calibration.camera_calibration.diagnostics import (
 from legcal.calibration.camera_calibration.document import (
     CAMERA_FILE,
     PICTURE_FILE,
+    BoardImage,
     CameraCalibration,
-    ImageResult,
     write_camera,
     write_picture,
 )
@@ -316,15 +316,17 @@ def _result(
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(board_in_images.corners[k].number)
         reason = left_out.get(k, "" if k in board_in_images.images else "the board was not found")
-        if i is None:
-            images.append(ImageResult(path.name, n, 0, None, None, reason))
-            continue
         of_image = corners.image == i
-        n_used = int(np.count_nonzero(of_image))
         images.append(
-            ImageResult(path.name, n, n_used, adjusted.rms_px(of_image), float(tilt[i]), "")
+            BoardImage(
+                image=path.name,
+                corners=len(board_in_images.corners[k].number),
+                used=int(np.count_nonzero(of_image)),
+                rms_px=None if i is None else adjusted.rms_px(of_image),
+                tilt_rad=None if i is None else float(tilt[i]),
+                reason=(reason or None) if i is None else None,
+            )
         )
     used_images = [k for k, image in enumerate(images) if image.used]
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
@@ -355,9 +357,9 @@ def _result(
     )
 
 
-def _left_out(images: Sequence[ImageResult]) -> list[str]:
+def _left_out(images: Sequence[BoardImage]) -> list[str]:
     """Return a sentence for each reason, with the images left out."""
-    by_reason = _by_reason((image.name, image.reason) for image in images if image.reason)
+    by_reason = _by_reason((image.image, image.reason) for image in images if image.reason)
     return [f"{', '.join(names)} left out: {reason}." for reason, names in by_reason.items()]
 
 
