@@ -22,7 +22,7 @@ from legcal.machine.parameters import from_vector, to_vector
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
 from legcal.simulation.paper import platform_errors
 

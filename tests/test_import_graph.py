@@ -135,7 +135,7 @@ PUBLIC: dict[str, set[str]] = {
         "photographs",
         "placement",
     },
-    "paper": {"conditions", "criteria", "four_steps", "nominal"},
+    "paper": {"conditions", "criteria", "four_steps", "unknowns"},
     "calibration": {
         "camera_calibration.calibration",
         "camera_calibration.document",

@@ -5,8 +5,14 @@ Every function depends on the unknowns, on errors of the observed values, and on
 of axes become weights by the derivatives with respect to them. Of the three residuals of a vector
 product two are independent: (6), (18) and (19) have the two across the direction.
 
+Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
+have no branches and no square root. It is the chart of ``Frames``, except that a small w is half of
+a rotation vector, and that steps begin with the translation. An unknown axis is turned about its
+normal basis e1, e2 by two turns, w = (turn_1 e1 + turn_2 e2) / 2: its
+:func:`~legcal.geometry.axes.axis_angles` but for a factor near one (:func:`gibbs_of`).
+
 An observed direction is u + e1 alpha1 + e2 alpha2, its normal basis E being e1, e2 as rows. An
-error of a pose is a step of :func:`~legcal.paper.gibbs.moved_points`.
+error of a pose is a step of :func:`~legcal.paper.equations.moved_points`.
 """
 
 from __future__ import annotations
@@ -18,10 +24,14 @@ from itertools import combinations, combinations_with_replacement
 from math import comb
 
 import casadi as ca
+import numpy as np
 
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.rotations import turned
+from legcal.geometry.types import Array
 from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
 from legcal.machine.leg import JointType
-from legcal.paper.gibbs import moved_points, turned_frame, turned_points
 
 END_ERRORS = 3  # errors of the end of a leg (13): two of its direction, one of its reading
 
@@ -292,3 +302,60 @@ def _ray() -> tuple[ca.SX, ca.SX]:
 
 def _direction() -> tuple[ca.SX, ca.SX]:
     return ca.SX.sym("u", 3), ca.SX.sym("E", 2, 3)
+
+
+# Unknown motions
+
+
+def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) after R, t and a step (6,): translation [m], then Gibbs vector."""
+    return turned_points(step[3:], R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
+
+
+def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) turned by the rotation that has the Gibbs vector w (3,)."""
+    cross = ca.skew(w)
+    turn = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
+    return turn @ points
+
+
+def stepped_poses(R: Array, t: Array, steps: Array) -> tuple[Array, Array]:
+    """Return the poses (n, 3, 3), (n, 3) of :func:`moved_points` for numbers, steps (n, 6)."""
+    return turned(R, 2.0 * steps[:, 3:]), t + steps[:, :3]
+
+
+# Unknown axes
+
+
+def axis_frames(v: Array) -> Array:
+    """Return axes (n, 3) and their normal bases as columns, (n, 3, 3)."""
+    return np.concatenate([v[:, :, None], np.swapaxes(normal_basis(v), 1, 2)], axis=2)
+
+
+def turned_frame(turns: ca.SX, frame: ca.SX) -> ca.SX:
+    """Return an axis and its normal basis, columns (3, 3), after two turns of the axis."""
+    return turned_points(0.5 * frame[:, 1:] @ turns, frame)
+
+
+def gibbs_of(angles: Array) -> Array:
+    """Return the turns (..., 2) of an axis that is turned by angles (..., 2) [rad]."""
+    half = 0.5 * np.linalg.norm(angles, axis=-1, keepdims=True)
+    return np.asarray(angles * np.where(half > 0.0, np.tan(half) / np.where(half, half, 1.0), 1.0))
+
+
+def angles_of(turns: Array) -> Array:
+    """Return the angles (..., 2) [rad] of turns, the inverse of :func:`gibbs_of`."""
+    half = 0.5 * np.linalg.norm(turns, axis=-1, keepdims=True)
+    return np.asarray(
+        turns * np.where(half > 0.0, np.arctan(half) / np.where(half, half, 1.0), 1.0)
+    )
+
+
+def axis_slope(nominal: Array, turns: Array) -> Array:
+    """Return the derivative (3, 2) of the first column of :func:`turned_frame` by the turns."""
+    by_turns = np.array([-0.5 * turns, [0.0, 1.0], [-1.0, 0.0]])
+    axis = turned_axis(nominal, angles_of(turns))
+    frame = np.vstack([nominal, normal_basis(nominal)])
+    return np.asarray(
+        (frame.T @ by_turns - 0.5 * np.outer(axis, turns)) / (1.0 + 0.25 * float(turns @ turns))
+    )

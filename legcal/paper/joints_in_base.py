@@ -27,15 +27,19 @@ from legcal.geometry.motions import components, motion_of
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import LegColumns
-from legcal.paper.camera_poses import candidate_camera_poses
 from legcal.paper.equations import (
     LegInView,
     pairs_of_vectors,
     products_in_base,
+    stepped_poses,
     vectors_of_view,
 )
-from legcal.paper.gibbs import stepped_poses
-from legcal.paper.joints_in_camera import JointsInCamera, adjusted_to_base, points_in_both
+from legcal.paper.joints_in_camera import (
+    JointsInCamera,
+    adjusted_to_base,
+    candidate_camera_poses,
+    points_in_both,
+)
 from legcal.paper.least_squares import (
     LeastSquares,
     Term,
@@ -43,10 +47,8 @@ from legcal.paper.least_squares import (
     evaluated,
     solve_least_squares,
 )
-from legcal.paper.nominal import NominalMachine
 from legcal.paper.platform_pose import SeenPoints, poses_on_rays
-from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
+from legcal.paper.unknowns import NominalMachine, Unknowns, hold_at_nominal, left_near_nominal
 
 _PLACES = np.r_[
     LegColumns.A, LegColumns.BASE_AXIS, ActuatorColumns.AXIS, ActuatorColumns.POINT

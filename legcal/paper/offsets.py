@@ -28,9 +28,7 @@ from legcal.paper.least_squares import (
     solve_least_squares,
     undetermined,
 )
-from legcal.paper.nominal import NominalMachine
-from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
+from legcal.paper.unknowns import NominalMachine, Unknowns, hold_at_nominal, left_near_nominal
 
 _APART = 1e-3  # [mean leg lengths] minimum distance of separate platform joints
 

@@ -43,7 +43,7 @@ from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.machine.solved_poses import solve_poses
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.paper_report import BOUND, INITIAL, PaperSummary
 from legcal.simulation.poses import draw_poses
