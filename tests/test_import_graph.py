@@ -174,7 +174,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"laid_board", "places", "planned_session", "request", "session"},
+    "planning": {"places", "request", "session"},
     "exports": {"formats", "subject"},
     "scene": {"motions", "shapes"},
     "report": {
@@ -193,7 +193,7 @@ PUBLIC: dict[str, set[str]] = {
     },
     "viewer": {"address", "click_server", "source", "window"},
     "cli": set(),
-    "simulation": {"dataset", "observe", "paper", "previews", "request", "study"},
+    "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }
 OUTSIDE = {
     "__main__",

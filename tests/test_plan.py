@@ -39,11 +39,10 @@ from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
 from legcal.planning.places import Place, Setting, default_setting, parse_bounds
-from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
-from legcal.planning.session import write_session
+from legcal.planning.session import Plan, write_session
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera

@@ -24,16 +24,15 @@ from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.loader import load_mechanism
 from legcal.report.images import simulation_table
 from legcal.simulation.cameras import mild_lens, read_lens
-from legcal.simulation.dataset import SimulatedDataset, simulate, summary_document
-from legcal.simulation.folder import TRUTH_NAME
+from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate, summary_document
 from legcal.simulation.observe import OutlineNoise, TableNoise
-from legcal.simulation.request import requested
 from legcal.simulation.settings import (
     Distribution,
     Level,
     ParameterErrors,
     SimulationSettings,
     Spread,
+    requested,
 )
 from legcal.simulation.visibility import Viewpoint
 

@@ -23,6 +23,8 @@ from legcal.simulation.paper import (
     ESTIMATORS,
     MACHINES,
     PAPER_VIEWS,
+    SCALARS,
+    Means,
     PaperStudy,
     expected_errors,
     expected_norm,
@@ -30,7 +32,6 @@ from legcal.simulation.paper import (
     paper_machine,
     platform_errors,
 )
-from legcal.simulation.paper_report import SCALARS, Means
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.study import StudyResult, run_study

@@ -21,7 +21,7 @@ from legcal.cli.options import (
 from legcal.errors import printable
 
 if TYPE_CHECKING:
-    from legcal.planning.planned_session import Plan
+    from legcal.planning.session import Plan
 
 
 def plan(
@@ -122,7 +122,7 @@ def plan(
 
 def _previews(plan: Plan) -> dict[str, bytes]:
     """Return a small rendered photograph of each view, by its name."""
-    from legcal.simulation.previews import preview
+    from legcal.simulation.session import preview
 
     views = plan.views[:1] if plan.hand_held else plan.views
     return {

@@ -104,7 +104,7 @@ def simulate(
     from legcal.report.images import simulation_table
     from legcal.simulation.dataset import simulate as run
     from legcal.simulation.dataset import summary_document
-    from legcal.simulation.request import requested
+    from legcal.simulation.settings import requested
 
     nominal = load_mechanism(model)
     settings = requested(

@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass, UsageError
-from legcal.exports.identifiers import comment
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import workspace
 from legcal.machine.coordinates import (

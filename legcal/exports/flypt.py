@@ -17,13 +17,12 @@ from legcal.exports.correction import poses_at_readings, stacked
 from legcal.exports.firmware import (
     describe_errors,
     figures_of,
+    hexapod_refusal,
     least_squares,
     number_text,
     picture_of,
 )
-from legcal.exports.identifiers import comment
-from legcal.exports.linuxcnc import hexapod_refusal
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.configurations import workspace

@@ -28,19 +28,34 @@ from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
-from legcal.planning.goals import Workspace, criterion_of, workspace_of
-from legcal.planning.laid_board import LaidBoard, lying
-from legcal.planning.order import shortest_order, ways
+from legcal.planning.exchange import (
+    Chosen,
+    Criterion,
+    Session,
+    Workspace,
+    choose,
+    criterion_of,
+    exchange,
+    workspace_of,
+)
 from legcal.planning.places import (
+    LaidBoard,
     Place,
     Setting,
     all_points,
+    lying,
     near,
     places_around,
 )
-from legcal.planning.planned_session import Plan, PlannedView, pose_labels
-from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
+from legcal.planning.poses import (
+    candidate_poses,
+    drawn_legs,
+    poses_near,
+    shortest_order,
+    some_of,
+    ways,
+)
+from legcal.planning.session import Plan, PlannedView, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
 from legcal.vision.sight import Bodies, Seen, visible_parts

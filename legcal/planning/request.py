@@ -28,8 +28,8 @@ from legcal.planning.places import (
     Setting,
     default_setting,
 )
-from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
+from legcal.planning.session import Plan
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision.board import Board
 from legcal.vision.board_file import board_document, board_of, parse_board

@@ -20,8 +20,8 @@ from legcal.machine.feasibility import poses_at
 from legcal.machine.model import vectors_A_to_B
 from legcal.pages.document import Drawing, Items, Picture, Row
 from legcal.pages.html import page_html
-from legcal.planning.laid_board import LaidBoard
-from legcal.planning.planned_session import Plan, views_in_words
+from legcal.planning.places import LaidBoard
+from legcal.planning.session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.page.text_page import text_page
 from legcal.report.render import Report, heading, report, table

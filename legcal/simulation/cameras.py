@@ -21,7 +21,7 @@ from legcal.geometry.lines import direction_above, normal_basis
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.planning.laid_board import feet
+from legcal.planning.places import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.rays import in_view, surrounding_points
