@@ -9,11 +9,12 @@ from __future__ import annotations
 import io
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -167,9 +168,7 @@ class PaperStudy:
 
     def summary(self, records: Iterable[Record]) -> PaperSummary:
         """Return the means over all runs."""
-        machines = {name: paper_machine(name) for name in MACHINES}
-        in_radians = self.noise == TableNoise.in_radians()
-        return PaperSummary.of(records, machines, in_radians=in_radians)
+        return PaperSummary.of(records, in_radians=self.noise == TableNoise.in_radians())
 
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], seed: np.random.SeedSequence
@@ -441,89 +440,63 @@ READINGS = (
 )
 
 _DRAWN = {"literal": "steps as printed", "default": "weighted steps", "fit": "joint fit"}
-_BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#8a8a8a"
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
-_ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
-_BARS, _MARKS, _TRUE = "mean error", "expected at the Cramer-Rao bound", "true value (right)"
 
 
+@dataclass(frozen=True, eq=False)
 class Means:
-    """Means of one estimator's errors over the runs without failure, accumulated run by run."""
+    """Means of one estimator's errors over the runs without failure."""
 
-    def __init__(self, machine: str, estimator: str, n_parameters: int) -> None:
-        self.machine, self.estimator = machine, estimator
-        self.n = 0
-        self.failures: Counter[str] = Counter()  # the other runs, by kind of error
-        self._scalars, self._squares = np.zeros((2, len(SCALARS)))
-        self._parameters = np.zeros(n_parameters)
+    machine: str
+    estimator: str
+    scalars: Array  # (n, 4): dX [m], dE and the angle [rad], and d' inv(C) d / n of each run, with
+    # the errors d of the n parameters, and their covariance C at the Cramer-Rao bound of the run
+    errors: Array  # (n_parameters,) mean absolute error of every parameter [m]
+    failures: dict[str, int]  # the other runs, by kind of error
 
-    def add(self, record: Record) -> None:
-        """Add the errors of one run."""
-        if "failure" in record:
-            self.failures[record["failure"]["kind"]] += 1
-            return
-        scalars = np.array([record[name] for name in SCALARS])
-        self.n += 1
-        self._scalars += scalars
-        self._squares += scalars**2
-        self._parameters += record["parameters"]
-
-    @property
-    def n_failed(self) -> int:
-        """The number of failed runs."""
-        return self.failures.total()
-
-    @property
-    def scalars(self) -> Array:
-        """Means of dX [m], dE and the angle [rad], and the squared errors of the bound, (4,)."""
-        return self._scalars / max(self.n, 1)
-
-    @property
-    def uncertainties(self) -> Array:
-        """Standard deviations of the means, (4,)."""
-        count = max(self.n, 1)
-        variances = np.maximum(self._squares / count - self.scalars**2, 0.0)
-        return np.asarray(np.sqrt(variances / max(self.n - 1, 1)))
-
-    @property
-    def of_bound(self) -> tuple[float, float]:
-        """Root mean square of d' inv(C) d / n for errors d of the n parameters, and its sigma.
-
-        C is the covariance of the Cramer-Rao bound of the same run: 1 for an estimator that reaches
-        it. Its spread is far smaller than the spread of dX.
-        """
-        ratio = float(np.sqrt(self.scalars[3]))
-        return ratio, float(self.uncertainties[3]) / (2.0 * ratio) if ratio else 0.0
-
-    @property
-    def parameters(self) -> Array:
-        """Mean absolute error of every parameter [m]."""
-        return self._parameters / max(self.n, 1)
+    @classmethod
+    def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> Means:
+        """Return the means over the records of an estimator on a machine."""
+        good = [record for record in records if "failure" not in record]
+        failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
+        return cls(
+            machine,
+            estimator,
+            np.array([[record[name] for name in SCALARS] for record in good]).reshape(-1, 4),
+            np.mean([record["parameters"] for record in good], axis=0) if good else np.zeros(0),
+            dict(sorted(failures.items())),
+        )
 
     def row(self) -> EstimatorRow:
-        """Return a row of ``--json``; null where every run failed."""
-        (dX, dE, angle, _), (of_dX, of_dE, *_) = self.scalars.tolist(), self.uncertainties.tolist()
-        ratio, of_ratio = self.of_bound
-        figures: dict[str, Any] = {
-            "dX_mm": 1e3 * dX,
-            "dE_deg": float(np.degrees(dE)),
-            "parameters_mm": (1e3 * self.parameters).tolist(),
-            "angle_deg": float(np.degrees(angle)),
-            "dX_mean_sigma_mm": 1e3 * of_dX,
-            "dE_mean_sigma_deg": float(np.degrees(of_dE)),
-            "of_bound": ratio,
-            "of_bound_sigma": of_ratio,
-        }
-        if not self.n:
-            figures = {**dict.fromkeys(figures), "parameters_mm": []}
+        """Return a row of ``--json``; null where every run failed.
+
+        ``of_bound`` is the root mean square of the errors of all parameters, each measured by the
+        covariance of the bound of its run: 1 for an estimator that reaches it. Its spread is far
+        smaller than the spread of dX.
+        """
+        n = len(self.scalars)
+        figures = dict[str, Any].fromkeys(_FIGURES)
+        if n:
+            mean = self.scalars.mean(axis=0)
+            sigma = self.scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
+            ratio = np.sqrt(mean[3])
+            values = [mean[0], mean[1], mean[2], sigma[0], sigma[1], ratio, 0.5 * sigma[3] / ratio]
+            figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
         return EstimatorRow(
             estimator=self.estimator,
             coplanar=self.machine == "coplanar",
+            parameters_mm=(1e3 * self.errors).tolist(),
             **figures,
-            runs=self.n,
-            failed=self.n_failed,
-            failures=dict(sorted(self.failures.items())),
+            runs=n,
+            failed=sum(self.failures.values()),
+            failures=self.failures,
         )
+
+
+_FIGURES = ("dX_mm", "dE_deg", "angle_deg", "dX_mean_sigma_mm", "dE_mean_sigma_deg", "of_bound",
+            "of_bound_sigma")  # fmt: skip
+_DEGREES = float(np.degrees(1.0))
+_SCALES = np.array([1e3, _DEGREES, _DEGREES, 1e3, _DEGREES, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -531,33 +504,29 @@ class PaperSummary:
     """The paper's evaluation: errors before and after calibration, of every estimator."""
 
     means: tuple[Means, ...]  # by machine, and then: initial, the estimators, the bound
-    names: tuple[str, ...]  # of the parameters
-    truths: dict[str, Array]  # (n_parameters,) true values of each machine [m]
     in_radians: bool  # whether Table 1 was read in radians
 
     @classmethod
-    def of(
-        cls, records: Iterable[Record], machines: Mapping[str, Machine], *, in_radians: bool
-    ) -> PaperSummary:
-        """Return the means over records, in one pass over these."""
-        first = next(iter(machines.values()))
-        names = parametrize(first.leg_names, geometries(first), first.frame_legs).names
-        means: dict[tuple[str, str], Means] = {}
+    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperSummary:
+        """Return the means over records."""
+        by_key: dict[tuple[str, str], list[Record]] = {}
         for record in records:
             for machine, errors_by_estimator in record.items():
                 for estimator, errors in errors_by_estimator.items():
-                    key = machine, estimator
-                    means.setdefault(key, Means(*key, len(names))).add(errors)
-        truths = {
-            name: to_vector(machine.parameters, machine.frame_legs)
-            for name, machine in machines.items()
-        }
-        return cls(tuple(means.values()), names, truths, in_radians)
+                    by_key.setdefault((machine, estimator), []).append(errors)
+        return cls(tuple(Means.of(*key, some) for key, some in by_key.items()), in_radians)
 
     @property
-    def readings(self) -> tuple[str, ...]:
-        """The interpretation of the paper where its text leaves a choice."""
-        return (IN_RADIANS if self.in_radians else IN_DEGREES, *READINGS)
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        first = paper_machine(MACHINES[0])
+        return parametrize(first.leg_names, geometries(first), first.frame_legs).names
+
+    @property
+    def truths(self) -> dict[str, Array]:
+        """True values (n_parameters,) of each machine [m]."""
+        machines = {name: paper_machine(name) for name in MACHINES}
+        return {name: to_vector(m.parameters, m.frame_legs) for name, m in machines.items()}
 
     def document(self) -> dict[str, Any]:
         """Return the document of ``--json``."""
@@ -567,12 +536,12 @@ class PaperSummary:
             names=list(self.names),
             true_values_mm={name: (1e3 * xi).tolist() for name, xi in self.truths.items()},
             as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
-            readings=list(self.readings),
+            readings=[IN_RADIANS if self.in_radians else IN_DEGREES, *READINGS],
         ).document()
 
     def files(self) -> dict[str, bytes]:
         """Return figure 4 as a picture, and as a drawing to enlarge."""
-        return {"fig4.svg": _figure(self, "svg"), "fig4.png": _figure(self, "png")}
+        return {f"fig4.{kind}": _figure(self, kind) for kind in ("svg", "png")}
 
 
 class EstimatorRow(Document):
@@ -607,67 +576,26 @@ class PaperDocument(Document):
 # Figure 4
 
 
-class _Panel(NamedTuple):
-    """One panel: an estimator on a machine [mm]."""
-
-    title: str
-    errors: Array
-    limit: Array
-    truth: Array
-
-
-def _panels(summary: PaperSummary) -> list[list[_Panel]]:
-    """Return the panels: a row for each estimator, a column for each machine."""
-    by_name = {(means.machine, means.estimator): means for means in summary.means}
-    compared = {estimator for _, estimator in by_name}
-
-    def panel(machine: str, estimator: str) -> _Panel:
-        means, limit = by_name[machine, estimator], by_name[machine, BOUND]
-        failed = f" ({means.n_failed} of {means.n + means.n_failed} runs failed)"
-        return _Panel(
-            f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}",
-            1e3 * means.parameters,
-            1e3 * limit.parameters,
-            1e3 * summary.truths[machine],
-        )
-
-    return [
-        [panel(machine, estimator) for machine in summary.truths]
-        for estimator in _DRAWN
-        if estimator in compared
-    ]
-
-
-def _limits(grid: Sequence[Sequence[_Panel]]) -> tuple[float, float]:
-    """Return the ends of the scale of errors that all panels share [mm]."""
-    values = np.concatenate(
-        [[1e-2, 1.0], *(x for row in grid for p in row for x in (p.errors, p.limit))]
-    )
-    shown = values[values > 0.0]
-    return 0.7 * float(shown.min()), 1.4 * float(shown.max())
-
-
-def _title(summary: PaperSummary) -> str:
-    """Return the title of the figure."""
-    n_runs = summary.means[0].n + summary.means[0].n_failed
-    return f"Fig. 4 of the paper: {len(summary.names)} parameters, means over {n_runs} calibrations"
-
-
-def _label(name: str) -> str:
-    """Return a short label of a parameter: A2x for leg2.base.x."""
-    leg, kind, *axis = name.split(".")
-    return f"{_LETTERS[kind]}{leg.removeprefix('leg')}{''.join(axis)}"
-
-
 def _figure(summary: PaperSummary, kind: str) -> bytes:
-    """Return the figure as a file of a kind: svg or png."""
+    """Return the figure as a file of a kind, svg or png.
+
+    A row for each estimator, a column for each machine; all panels share the scale of errors.
+    """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    grid, names = _panels(summary), list(map(_label, summary.names))
-    n_rows, n_columns = len(grid), len(grid[0])
-    width, height = 7.0 * n_columns, 2.9 * n_rows + 0.6
+    means = {(m.machine, m.estimator): m for m in summary.means}
+    machines = list(summary.truths)
+    estimators = [name for name in _DRAWN if (machines[0], name) in means]
+    labels = []
+    for name in summary.names:  # A2x for leg2.base.x
+        leg, parameter, *axis = name.split(".")
+        labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
+    drawn = [1e3 * m.errors for m in means.values() if m.estimator != INITIAL]
+    sizes = np.concatenate([[1e-2, 1.0], *drawn])
+    limits = 0.7 * float(sizes[sizes > 0.0].min()), 1.4 * float(sizes.max())
+    width, height = 7.0 * len(machines), 2.9 * len(estimators) + 0.6
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     place = {  # in inches; automatic layout in matplotlib takes as long as everything else
@@ -678,11 +606,20 @@ def _figure(summary: PaperSummary, kind: str) -> bytes:
         "wspace": 0.27,
         "hspace": 0.4,
     }
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, gridspec_kw=place)
-    for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
-        handles = _draw(axis, panel, names)
-        axis.set_ylim(_limits(grid))
-    figure.suptitle(_title(summary), fontsize=11, y=1.0 - 0.15 / height)
+    axes = figure.subplots(len(estimators), len(machines), squeeze=False, gridspec_kw=place)
+    handles = []
+    for axis, (estimator, machine) in zip(axes.flat, product(estimators, machines), strict=True):
+        shown = means[machine, estimator]
+        n_failed = sum(shown.failures.values())
+        failed = f" ({n_failed} of {len(shown.scalars) + n_failed} runs failed)" * bool(n_failed)
+        axis.set_title(f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed}", fontsize=10)
+        values = shown.errors, means[machine, BOUND].errors, summary.truths[machine]
+        handles = _draw(axis, *(1e3 * x for x in values), labels)
+        axis.set_ylim(limits)
+    first = summary.means[0]
+    n_runs = len(first.scalars) + sum(first.failures.values())
+    title = f"Fig. 4 of the paper: {len(labels)} parameters, means over {n_runs} calibrations"
+    figure.suptitle(title, fontsize=11, y=1.0 - 0.15 / height)
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
@@ -691,21 +628,24 @@ def _figure(summary: PaperSummary, kind: str) -> bytes:
     return content.getvalue()
 
 
-def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
-    """Draw a panel with Matplotlib and return the handles of its legend."""
+def _draw(axis: Axes, errors: Array, limit: Array, truth: Array, names: list[str]) -> list[Any]:
+    """Draw errors, their limit and true values [mm], and return the handles of the legend."""
     place = range(len(names))
-    bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
-    marks = axis.scatter(place, panel.limit, marker="_", s=70, lw=2.0, color=_LIMIT, label=_MARKS)
-    marks.set_zorder(3)
+    handles: list[Any] = []
+    if len(errors):
+        handles.append(axis.bar(place, errors, color="#4c78a8", label="mean error"))
+    expected = "expected at the Cramer-Rao bound"
+    handles.append(axis.scatter(place, limit, marker="_", s=70, lw=2.0, color="#e45756",
+                                label=expected, zorder=3))  # fmt: skip
     right = axis.twinx()
-    line = right.plot(place, panel.truth, color=_LINE, lw=0.8, marker=".", ms=3, label=_TRUE)
-    axis.set_title(panel.title, fontsize=10)
+    handles += right.plot(place, truth, color="#8a8a8a", lw=0.8, marker=".", ms=3,
+                          label="true value (right)")  # fmt: skip
     axis.set_xticks(place, names, rotation=90, fontsize=7)
     axis.set_xlim(-0.7, len(names) - 0.3)
     axis.set_yscale("log")
     axis.yaxis.set_major_formatter("{x:g}")
-    axis.set_ylabel(_ERROR_AXIS, fontsize=8)
-    right.set_ylabel(_TRUTH_AXIS, fontsize=8)
+    axis.set_ylabel("mean error [mm]", fontsize=8)
+    right.set_ylabel("true value [mm]", fontsize=8)
     for side in (axis, right):
         side.tick_params(axis="y", labelsize=8)
-    return [bars, marks, *line]
+    return handles
