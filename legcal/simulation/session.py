@@ -37,7 +37,6 @@ from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
     MAX_HAND_DRAWS,
     board_and_cameras,
-    board_before,
     board_on_platform,
     camera_in_hand,
     cameras_around,
@@ -60,7 +59,7 @@ from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
-from legcal.vision.board import Board, FixedBoard
+from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera
 from legcal.workers import Workers, worker_pool
 
@@ -206,15 +205,16 @@ class _Simulator:
         posed = pose_machine(self.truth, solids, poses)
         on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:
-            on_base = self._board_of_plan(self.plan)
-            posed = _beside(on_base, posed)
+            on_base = self.plan.board
+            if on_base is not None:
+                posed = tuple(map(on_base.beside, posed))
             views = self.plan.viewpoints(self.rngs["cameras"], posed)
             groups = (self.plan.hand,) * len(views) if self.plan.hand else ()
         board = chosen_board(self.settings.board, posed)
         board_of_platform = chosen_board(self.settings.platform_board, posed, "platform")
         boards: tuple[FixedBoard, ...] = ()
         if board_of_platform is not None:
-            T = board_on_platform(board_of_platform, self.truth, posed, poses.poses, views)
+            T = board_on_platform(board_of_platform, self.truth, posed, poses.poses)
             first = 0 if board is None else board.n_corners
             boards = (FixedBoard(board_of_platform, "platform", T, first),)
             posed = tuple(
@@ -222,8 +222,14 @@ class _Simulator:
                 for T, posed_machine in zip(poses.poses, posed, strict=True)
             )
         if board is not None:
-            on_base, views = self._with_board(board, posed, views)
-            posed = _beside(on_base, posed)
+            in_order: Sequence[PosedMachine] = posed
+            if self.settings.hand_held:
+                views_of = range(len(self.cameras))
+                in_order = [posed[p] for v in views_of for p in self.poses_of(v, len(posed))]
+            on_base, views = board_and_cameras(
+                board, self.truth, in_order, self.cameras, self.rngs["cameras"], self.progress
+            )
+            posed = tuple(map(on_base.beside, posed))
         elif not views:
             views = self._cameras_around(posed, with_board=bool(boards))
         if on_base is not None:
@@ -233,32 +239,6 @@ class _Simulator:
         if self.settings.level == Level.PHOTOGRAPHS:
             views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
         return _Setup(poses, posed, boards, views, groups)
-
-    def _board_of_plan(self, plan: PlannedSession) -> PlacedBoard | None:
-        """Return the board of a plan; refuse another beside it."""
-        if plan.board is not None and self.settings.board is not None:
-            raise UsageError(
-                "The plan could not be shot: found --board and a plan with a board, needed one of "
-                "them; leave out --board."
-            )
-        return plan.board
-
-    def _with_board(
-        self,
-        board: Board,
-        posed: tuple[PosedMachine, ...],
-        views_in_settings: tuple[Viewpoint, ...],
-    ) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
-        """Return a board on the base in view of the given cameras, or with cameras to see it."""
-        if views_in_settings:
-            return board_before(board, self.truth, posed, views_in_settings), views_in_settings
-        bodies: Sequence[PosedMachine] = posed
-        if self.settings.hand_held:
-            views = range(len(self.cameras))
-            bodies = [posed[p] for v in views for p in self.poses_of(v, len(posed))]
-        return board_and_cameras(
-            board, self.truth, bodies, self.cameras, self.rngs["cameras"], self.progress
-        )
 
     def _cameras_around(
         self, posed: tuple[PosedMachine, ...], *, with_board: bool
@@ -351,13 +331,6 @@ class _Simulator:
             measurements, outlines, axes, corners, self.truth, setup.poses, labels, posed, scene,
             left_out, setup.boards, setup.groups,
         )  # fmt: skip
-
-
-def _beside(
-    board: PlacedBoard | None, posed_machines: tuple[PosedMachine, ...]
-) -> tuple[PosedMachine, ...]:
-    """Return machines with a board beside them, if there is one."""
-    return posed_machines if board is None else tuple(map(board.beside, posed_machines))
 
 
 def exact_outlines(scene: Scene) -> Outlines:

@@ -70,17 +70,18 @@ class Spread:
     Raises
     ------
     UsageError
-        If the size is no number, or there is no such distribution.
+        If the size is no number from 0 to 1, or there is no such distribution.
     """
 
     size: float = 0.0
     distribution: Distribution | str = Distribution.UNIFORM
 
     def __post_init__(self) -> None:
-        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
+        is_size = isinstance(self.size, Real) and 0.0 <= self.size <= MAX_SIZE
+        if not is_size or self.distribution not in list(Distribution):
             raise UsageError(
                 f"A spread could not be used: found the size {self.size!r} and the distribution "
-                f"{self.distribution!r}, needed a number [m, rad] and "
+                f"{self.distribution!r}, needed 0 to {MAX_SIZE:g} [m, rad] and "
                 f"{' or '.join(Distribution)}; correct it."
             )
 
@@ -325,14 +326,7 @@ class SimulationSettings:
             "images": (self.images, 1, MAX_IMAGES, ""),
             "the seed": (self.seed, 0, math.inf, ""),
             "the noise of edge points": (self.sigma_px, 0.0, MAX_SIGMA_PX, " px"),
-            "the noise of readings": (self.readings.size, 0.0, MAX_SIZE, " m"),
         }
-        if self.angles is not None:
-            limits["the noise of angles"] = (self.angles.size, 0.0, MAX_SIZE, " rad")
-        for name in KINDS:
-            unit = " rad" if name in ANGLES else " m"
-            size = getattr(self.errors, name).size
-            limits[f"the errors of {name.replace('_', ' ')}"] = (size, 0.0, MAX_SIZE, unit)
         for name, sigma in vars(self.table).items():
             unit = " rad" if name in ("psi", "theta") else " m"
             limits[f"the noise of {name}"] = (sigma, *SIGMA_RANGE, unit)
@@ -356,10 +350,12 @@ class SimulationSettings:
                     f"found views named {', '.join(map(repr, names))}, needed different names that "
                     "can be those of files; rename some."
                 )
-        if self.hand_held and isinstance(self.views, Sequence):
+        if (self.board, self.platform_board) != (None, None) and (
+            self.plan is not None or isinstance(self.views, Sequence)
+        ):
             yield (
-                "found a camera in the hand and places of cameras, needed a number of views; "
-                "leave out one of the two."
+                "found a board, and cameras that stand already, needed cameras that are placed to "
+                "see it; leave out the board, or plan with one (legcal plan --board)."
             )
         if self.hand_held and self.images > 1:
             yield (
@@ -388,15 +384,8 @@ def joint_distance(machine: Machine, name: str) -> float | None:
 # The options of ``legcal simulate``
 
 
-_ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
-    "joints": (("base_joints", "platform_joints"), LENGTH),
-    "base-joints": (("base_joints",), LENGTH),
-    "platform-joints": (("platform_joints",), LENGTH),
-    "offsets": (("offsets",), LENGTH),
-    "lengths": (("lengths",), LENGTH),
-    "axes": (("axes",), ANGLE),
-    "twists": (("twists",), ANGLE),
-    "radii": (("radii",), LENGTH),
+_ERROR_KINDS = {"joints": ("base_joints", "platform_joints")} | {
+    kind.replace("_", "-"): (kind,) for kind in KINDS
 }
 
 
@@ -500,24 +489,18 @@ def parameter_errors(texts: Sequence[str], nominal: Machine) -> ParameterErrors:
             errors = ParameterErrors()
             continue
         kind, equals, size = text.partition("=")
+        units = ANGLE if kind in ANGLES else LENGTH
         if kind in _ERROR_KINDS and not size:
             raise UsageError(
                 f"--error could not be used: found {describe(text)} without a size, needed "
-                f"KIND=SIZE; write {kind}={'2mm' if _ERROR_KINDS[kind][1] is LENGTH else '0.1deg'}."
+                f"KIND=SIZE; write {kind}={'2mm' if units is LENGTH else '0.1deg'}."
             )
         if not equals or kind not in _ERROR_KINDS:
             raise UsageError(
                 f"--error could not be used: found {describe(text)}, needed KIND=SIZE or none, "
                 f"such as joints=2mm; {closest(kind, _ERROR_KINDS)}"
             )
-        kinds, units = _ERROR_KINDS[kind]
-        spread = _spread(size, units, f"--error {kind}")
-        if spread.size > MAX_SIZE:
-            most = f"{MAX_SIZE / units['deg']:.3g}deg" if "deg" in units else f"{MAX_SIZE:g}m"
-            raise UsageError(
-                f"--error {kind} could not be used: found {describe(size)}, needed 0 to {most}; "
-                "correct it and its unit."
-            )
+        kinds, spread = _ERROR_KINDS[kind], _spread(size, units, f"--error {kind}")
         if spread.size > 0.0 and not possible & set(kinds):
             raise UsageError(
                 f"--error {kind} could not be used: found none in the mechanism "
