@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -84,8 +84,7 @@ def write_session(
         yaml_path, _ = write_model(plan.machine, folder)
         texts = {
             CAMERA: camera_info(plan.camera, "camera"),
-            DATASET_YAML: _dataset(plan, yaml_path.relative_to(folder).as_posix()),
-            MEASUREMENTS: _measurements(plan),
+            **_dataset(plan, yaml_path.relative_to(folder).as_posix()),
             POSES_NAME: _poses(plan),
             PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
             **(pictures or {}),
@@ -112,32 +111,59 @@ def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
     return images
 
 
-def _dataset(plan: Plan, model: str) -> str:
-    """Return ``dataset.yaml``."""
+def _dataset(plan: Plan, model: str) -> dict[str, str]:
+    """Return ``dataset.yaml``, and ``measurements.csv`` with the planned readings."""
     views: dict[str, Any] = {}
     for view in plan.views:
-        entry: dict[str, Any] = {"camera": CAMERA}
-        if plan.hand_held:
-            views[HAND] = entry | {"hand_held": True}
-            continue
-        motion = motion_to_xyz_quat(view.T_base_camera)
-        entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
-        shown = np.asarray(view.shows.any(axis=0))
-        if not shown.all():
-            names = plan.machine.leg_names
-            entry["legs"] = [names[j] for j in np.flatnonzero(shown).tolist()]
+        shown = np.flatnonzero(view.shows.any(axis=0)).tolist()
+        legs = [plan.machine.leg_names[j] for j in shown]
+        entry = {"camera": CAMERA} | rough_view(view.T_base_camera, legs, plan.machine)
         views[view.name] = entry
-    document: dict[str, Any] = {
+    if plan.hand_held:
+        views = {HAND: {"camera": CAMERA, "hand_held": True}}
+    motors = list(plan.machine.motors)
+    rows = [
+        [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
+        for name, image, label, v, k in images_of(plan)
+    ]
+    board = {} if plan.board is None else {"board": board_document(plan.board.board)}
+    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
+
+
+def rough_view(
+    T_base_camera: RigidTransform | None, legs: Sequence[str] | None, machine: Machine
+) -> dict[str, Any]:
+    """Return the rough pose of a view, to five digits, and the legs that it shows, if not all."""
+    entry: dict[str, Any] = {}
+    if T_base_camera is not None:
+        motion = motion_to_xyz_quat(T_base_camera)
+        entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
+    if legs is not None and len(legs) < machine.n_legs:
+        entry["legs"] = list(legs)
+    return entry
+
+
+def dataset_texts(
+    machine: Machine,
+    model: str,  # path of its YAML in the dataset
+    views: Mapping[str, Any],
+    rows: Iterable[Sequence[Any]],  # view, image, pose, readings
+    encoder_sigma: float | dict[str, float],
+    **blocks: Any,
+) -> dict[str, str]:
+    """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
+    document = {
         "legcal_dataset": 1,
         "mechanism": model,
         "measurements": MEASUREMENTS,
-        "encoder_sigma": _encoder_sigma(plan),
-        "views": views,
+        "encoder_sigma": encoder_sigma,
+        "views": dict(views),
+        **blocks,
     }
-    if plan.board is not None:
-        document["board"] = board_document(plan.board.board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    return with_schema("dataset", text)
+    joints = [column.name for column in reading_columns(machine.legs)]
+    table = format_table(["view", "image", "pose", *joints], rows)
+    return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
 
 
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
@@ -148,17 +174,6 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     if any(leg.reads_angle for leg in legs) or set(sigma_of_motor.values()) - {plan.sigma_q}:
         return sigma_of_motor
     return plan.sigma_q
-
-
-def _measurements(plan: Plan) -> str:
-    """Return ``measurements.csv`` with the planned readings, to be replaced by measured ones."""
-    motors = list(plan.machine.motors)
-    rows = [
-        [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
-        for name, image, label, v, k in images_of(plan)
-    ]
-    joints = [column.name for column in reading_columns(plan.machine.legs)]
-    return format_table(["view", "image", "pose", *joints], rows)
 
 
 def _poses(plan: Plan) -> str:

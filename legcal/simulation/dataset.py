@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from legcal.brief import brief
 from legcal.calibration.closeness import PLAN_NAME
@@ -31,14 +30,13 @@ from legcal.files.folder import (
     result_folder,
 )
 from legcal.files.motions import motion_to_xyz_quat
-from legcal.files.published import with_schema
 from legcal.files.reading import MAX_DOCUMENT, read_bytes
 from legcal.files.schema import Document, describe
-from legcal.files.table import format_table
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
+from legcal.planning.session import dataset_texts, rough_view
 from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.board import documents
 from legcal.simulation.observe import corners_in_images
@@ -311,34 +309,19 @@ def write_session(
             entry["hand_held"] = True
         if view.camera.gamma_is_given:
             entry["gamma"] = view.camera.gamma
-        if view.T_base_camera is not None:  # rough: five digits are enough
-            rough = motion_to_xyz_quat(view.T_base_camera)
-            entry["T_base_camera"] = {key: [round(x, 5) for x in rough[key]] for key in rough}
-        if view.legs is not None:
-            entry["legs"] = list(view.legs)
+        entry |= rough_view(view.T_base_camera, view.legs, machine)
         views[groups[v] if groups else view.name] = entry
-    document: dict[str, Any] = {
-        "legcal_dataset": 1,
-        "mechanism": model,
-        "measurements": "measurements.csv",
-        "encoder_sigma": dict(m.sigma_by_joint) or m.sigma_q,
-        "views": views,
-    }
-    if board is not None:
-        document["board"] = board
-    if lengths:
-        document["parameters"] = {"lengths": dict(lengths)}
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    (folder / "dataset.yaml").write_text(with_schema("dataset", text), encoding="utf-8")
-    motors = list(machine.motors)
-    joints = [str(machine.legs[j].prismatic) for j in motors]
-    names, readings = list(groups) or [view.name for view in m.views], m.q[:, motors].tolist()
+    names, readings = list(groups) or [view.name for view in m.views], m.q[:, list(machine.motors)]
     rows = (
-        [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row]]
+        [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row].tolist()]
         for row, v in enumerate(m.view.tolist())
     )
-    text = format_table(["view", "image", "pose", *joints], rows)
-    (folder / "measurements.csv").write_text(text, encoding="utf-8")
+    blocks = {} if board is None else {"board": board}
+    if lengths:
+        blocks["parameters"] = {"lengths": dict(lengths)}
+    sigma = dict(m.sigma_by_joint) or m.sigma_q
+    for name, text in dataset_texts(machine, model, views, rows, sigma, **blocks).items():
+        (folder / name).write_text(text, encoding="utf-8")
 
 
 def write_truth(
