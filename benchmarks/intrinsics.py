@@ -39,7 +39,7 @@ from outline_sessions import (
     platform_errors,
 )
 
-from legcal.calibration.camera_calibration.adjustment import robust_fit
+from legcal.calibration.camera_calibration.consensus import robust_fit
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import View
 from legcal.geometry.motions import components

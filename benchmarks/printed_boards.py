@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from board_photographs import PrintedBoard, photograph_boards
 from camera_sessions import together
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit, robust_fit
+from legcal.calibration.camera_calibration.consensus import RobustFit, robust_fit
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages, Sheet

@@ -160,8 +160,18 @@ class LegcalError(Exception):
     diagnosis: tuple[dict[str, object], ...] = ()
     consequences: tuple[Problem, ...] = ()
 
-    def __init__(self, problems: str | Problem | Sequence[str | Problem]) -> None:
-        said = [problems] if isinstance(problems, str | Problem) else problems
+    def __init__(
+        self,
+        problems: str | Problem | Sequence[str | Problem],
+        found: str | Cause = "",
+        needed: str = "",
+        remedy: str = "",
+        file: object = "",
+    ) -> None:
+        """Take problems, or what could not be done with the facts of a :class:`Problem`."""
+        if isinstance(problems, str):
+            problems = Problem(problems, found, needed, remedy, str(file))
+        said = [problems] if isinstance(problems, Problem) else problems
         self.facts = tuple(Problem(one) if isinstance(one, str) else one for one in said)
         self.problems = tuple(printable(str(problem)) for problem in self.facts)
         super().__init__("\n".join(_shortened(self.facts, self.problems)))
@@ -244,6 +254,30 @@ class ModelError(LegcalError):
     """A mechanism file is malformed or contradicts itself."""
 
     exit_code = 2
+
+
+class Problems(list[Problem]):
+    """The problems of a file, collected to be raised together."""
+
+    def __init__(self, file: object) -> None:
+        super().__init__()
+        self.file = str(file)
+
+    def add(
+        self,
+        what: str,
+        found: str | Cause = "",
+        needed: str = "",
+        remedy: str = "",
+        line: int | None = None,
+    ) -> None:
+        """Add a problem of the file."""
+        self.append(Problem(what, found, needed, remedy, self.file, line=line))
+
+    def raise_if_any(self, kind: type[LegcalError] = ModelError) -> None:
+        """Raise all problems as one error."""
+        if self:
+            raise kind(self)
 
 
 class OutOfClass(LegcalError):

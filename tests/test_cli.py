@@ -205,28 +205,12 @@ def test_a_command_that_does_not_parse_is_told_with_where_its_options_are(
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("noise", "dataset", "--json"), ["legcal noise is gone: calibrate", "plan --noise"]),
-        (("init", "photos", "--match=order"), ["--match of legcal init is gone", "column image"]),
-        (("import", "a.bag", "--still", "1"), ["--still of legcal import is gone", "0.3 s"]),
         (("calibrate", "x", "--fix", "leg1.offset"), ["--fix of", "--set NAME=VALUE"]),
         (("calibrate", "x", "--free", "c1.fx"), ["--free of", "--set NAME=free"]),
         (("calibrate", "x", "--prior", "a=1+-1"), ["--prior of", "--set NAME=VALUE±SIGMA"]),
-        (("calibrate", "x", "--significance=0.05"), ["legcal.check"]),
-        (("calibrate", "--list", "machines.csv"), ["docs/python.md"]),
-        (("calibrate", "x", "--resume"), ["docs/python.md"]),
-        (("simulate", "hexapod", "-o", "x", "--views", "2"), ["SimulationSettings(views=N)"]),
-        (("simulate", "hexapod", "-o", "x", "--level", "axes"), ["--level axes", 'level="axes"']),
-        (("simulate", "hexapod", "-o", "x", "--level=axes"), ["--level axes", 'level="axes"']),
-        (("simulate", "hexapod", "-o", "x", "--force"), ["--force", "empty folder"]),
-        (("study", "bound", "--runs", "3"), ["study bound", "python benchmarks/bound.py"]),
-        (("study", "paper", "--part", "1/3"), ["--part of legcal study", "--cluster"]),
-        (("new", "t.csv", "-o", ".", "--travel", "0", "9"), ["--travel", "travel_low"]),
-        (("new", "--family", "delta", "-o", ".", "--rod-spacing=60"), ["--rod-spacing", "table"]),
-        (("plan", "x", "--camera=c.yaml"), ["--camera of legcal plan", "--given DATASET"]),
-        (("plan", "x", "--force"), ["--force of legcal plan", "remove the earlier session"]),
     ],
 )
-def test_what_earlier_versions_had_is_refused_with_what_does_the_same_now(
+def test_earlier_spellings_of_set_are_refused_with_the_new_one(
     words: tuple[str, ...],
     named: list[str],
     monkeypatch: pytest.MonkeyPatch,

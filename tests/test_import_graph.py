@@ -201,7 +201,6 @@ OUTSIDE = {
     "causes",
     "errors",
     "figures",
-    "option_fields",
     "processors",
     "progress",
     "signals",

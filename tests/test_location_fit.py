@@ -27,9 +27,9 @@ from legcal.calibration.location.frames import (
     frames_after,
     jacobian,
     residuals,
+    search,
     tool_motions,
 )
-from legcal.calibration.location.search import search
 from legcal.calibration.location.tool_poses import PoseNoise, motions_by_readings
 from legcal.geometry.rotations import nearest_rotation, rotation_matrices
 from legcal.geometry.types import Array
@@ -93,13 +93,6 @@ def test_the_nearest_rotation_is_never_a_mirror() -> None:
     others = rotation_matrices(np.random.default_rng(2).normal(size=(200, 1, 3)))
     apart = np.linalg.norm(matrices - found, axis=(1, 2))
     assert np.all(apart < np.linalg.norm(matrices - others, axis=(2, 3)))
-
-
-def test_nothing_changes_where_opencv_has_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = noisy(pairs_at(BASE, TOOL), np.random.default_rng(4))
-    before = fitted(pairs)
-    monkeypatch.delattr("cv2.calibrateRobotWorldHandEye")
-    assert np.abs(fitted(pairs).frames - before.frames).max() < 1e-11
 
 
 @FEW

@@ -29,7 +29,7 @@ from legcal.machine.model_writer import (
 )
 from legcal.machine.parameters import geometries
 from legcal.machine.spanning_tree import close_loop
-from legcal.machine.urdf import Problems, parse_xml
+from legcal.machine.urdf import XmlProblems, parse_xml
 
 machine_of = cache(load_mechanism)
 
@@ -209,7 +209,7 @@ def _rotation(quaternion: list[float]) -> Rotation:
 
 def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     path, values = MUJOCO / "model.xml", json.loads((MUJOCO / "values.json").read_text())
-    root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), Problems(path)
+    root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), XmlProblems(path)
     reader = MjcfReader(root, problems)
     reader.read_bodies()
     pairs = [close_loop(loop, reader.tree, reader.poses)[0] for loop in reader.loops()]

@@ -209,7 +209,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
         return choose(*found, **more)
 
     monkeypatch.setattr(planner, "choose", stopped)
-    monkeypatch.setattr("legcal.cli.plan._previews", lambda _: {})
+    monkeypatch.setattr("legcal.cli.sessions._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.location.frames import PosePairs, transforms
-from legcal.calibration.location.search import search
+from legcal.calibration.location.frames import PosePairs, search, transforms
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.axes import LegAxes
 from legcal.data.corners import Corners, join_corners

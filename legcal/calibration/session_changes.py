@@ -393,14 +393,21 @@ def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArra
 
 
 def _with_rejected(posterior: Posterior) -> FitProblem:
-    """Return the problem with rejected outlines, those far off with the weights of Huber's loss.
+    """Return the problem with what it rejected, what is far off with the weights of Huber's loss.
 
-    A fit rejects the images on one side of a change where the other side has more.
+    A fit rejects outlines, and readings of redundant motors, on one side of a change where the
+    other side has more.
     """
-    problem, noise = posterior.problem, posterior.noise
-    offsets, claimed = problem.offsets(posterior.state), problem.outlines.covariance
+    problem, noise, state = posterior.problem, posterior.noise, posterior.state
+    offsets, claimed = problem.offsets(state), problem.outlines.covariance
     distance = np.sqrt(noise.squared_norms(offsets, claimed))
-    return problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
+    problem = problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
+    if not problem.legs.is_redundant:
+        return problem
+    factor, sigma = problem.factor("readings"), problem.readings.sigma
+    distance = np.abs(factor.rows(state).r[:, 0]) / sigma
+    root = np.sqrt(_HUBER / np.maximum(distance, _HUBER)) / sigma
+    return problem.with_factors(replace(factor, whitening=root[:, None, None]))
 
 
 def _size(hypothesis: _Hypothesis, number: _Solved) -> tuple[str, float, float]:
@@ -603,73 +610,32 @@ def _subsets(sequences: Sequence[int], few: Sequence[tuple[int, ...]]) -> Sequen
     return list(chain.from_iterable(combinations(sequences, n) for n in sizes))
 
 
-class _Encoders(NamedTuple):
-    """The readings of a factor of the fit."""
-
-    factor: str
-    leg: IntArray  # (n,) index of the leg
-    reading: Array  # (n,) [m or rad]
-    by_reading: Array  # (n,) derivative of the whitened residual
-    share: Array  # (n, n_blocks)
-    row: IntArray  # (n,) first row of the pose, -1 without any
-
-
-def _encoders(problem: FitProblem, course: _Course) -> list[_Encoders]:
-    """Return the readings of rods that change their length, and of actuators."""
-    rods, arms = problem.readings, problem.observed.actuator_readings
-    both = (
-        ("readings", rods, rods.sign * rods.length, -rods.sign),
-        ("actuator_readings", arms, arms.reading, np.full(len(arms), -1.0)),
-    )
-    return [
-        _Encoders(
-            name,
-            table.leg,
-            reading,
-            np.asarray(problem.factor(name).whitening)[:, 0, 0] * derivative,
-            course.of_poses(table.pose),
-            course.row_of_pose[table.pose],
-        )
-        for name, table, reading, derivative in both
-        if len(table)
-    ]
-
-
 def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
     """Yield what may be wrong with the readings of motors."""
-    encoders = _encoders(problem, course)
-    moves = [_last_moves(e.reading, e.leg, e.row, course.before) for e in encoders]
-    for e, last_move in zip(encoders, moves, strict=True):
-        for j in np.unique(e.leg).tolist():
-            leg = problem.legs.nominal[j]
-            unit = "rad" if leg.reads_angle else "m"
-            once = np.ones((len(e.leg), 1))
-            numbers: list[tuple[Kind, str, Array]] = [
-                ("encoder", unit, once),
-                ("drift", unit, course.drift(e.row)),
-                ("gain", "1", e.reading[:, None]),
-                ("backlash", unit, 0.5 * np.sign(last_move)[:, None]),
-            ]
-            turned = math.tau if leg.reads_angle else math.inf
-            if np.ptp(e.reading[e.leg == j]) > _GOOD_PART * turned:
-                once_a_turn = np.column_stack([np.cos(e.reading), np.sin(e.reading)])
-                numbers.append(("eccentricity", unit, once_a_turn))
-            for kind, of_unit, by in numbers:
-                wrong = (e.by_reading * (e.leg == j))[:, None, None] * by[:, None]
-                of_factor, share = {e.factor: wrong}, {e.factor: e.share}
-                label, changes = leg.motor_label, kind == "encoder"
-                yield _Hypothesis(kind, label, of_unit, of_factor, share, changes)
-    shares = {e.factor: e.share for e in encoders}
-    of_all: list[tuple[Kind, str, list[Array]]] = [
-        ("lag", "", moves),
-        ("pitch", ALL_MOTORS, [e.reading for e in encoders]),
-    ]
-    for kind, label, wrong_by in of_all:
-        columns = {
-            e.factor: (e.by_reading * by)[:, None, None]
-            for e, by in zip(encoders, wrong_by, strict=True)
-        }
-        yield _Hypothesis(kind, label, "1", columns, shares, False)
+    readings, reading = problem.readings, problem.readings.reading
+    row = course.row_of_pose[readings.pose]
+    whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+    share = {"readings": course.of_poses(readings.pose)}
+    last_move = _last_moves(reading, readings.leg, row, course.before)
+
+    def wrong_by(kind: Kind, subject: str, unit: str, by: Array) -> _Hypothesis:
+        """Return the hypothesis that readings are wrong by multiples of *by* (n, d)."""
+        columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
+        return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
+
+    for j in np.unique(readings.leg).tolist():
+        leg, of_motor = problem.legs.nominal[j], (readings.leg == j)[:, None]
+        unit, subject = leg.reading_unit, leg.motor_label
+        yield wrong_by("encoder", subject, unit, 1.0 * of_motor)
+        yield wrong_by("drift", subject, unit, of_motor * course.drift(row))
+        yield wrong_by("gain", subject, "1", of_motor * reading[:, None])
+        yield wrong_by("backlash", subject, unit, of_motor * 0.5 * np.sign(last_move)[:, None])
+        turned = math.tau if leg.reads_angle else math.inf
+        if np.ptp(reading[of_motor[:, 0]]) > _GOOD_PART * turned:
+            once_a_turn = np.column_stack([np.cos(reading), np.sin(reading)])
+            yield wrong_by("eccentricity", subject, unit, of_motor * once_a_turn)
+    yield wrong_by("lag", "", "1", last_move[:, None])
+    yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:

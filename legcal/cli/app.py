@@ -16,27 +16,20 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import calibrate
-from legcal.cli.commands import (
-    camera,
-    detect,
-    doctor,
+from legcal.cli.machines import (
     evaluate,
+    example,
+    export,
     identify,
     inspect,
     locate,
+    new,
+    schema,
+    view,
 )
-from legcal.cli.example import example
-from legcal.cli.export import export
-from legcal.cli.import_ import import_
-from legcal.cli.init import init
-from legcal.cli.new import new
 from legcal.cli.options import print_failure
-from legcal.cli.plan import plan
-from legcal.cli.retired import refuse_retired
-from legcal.cli.schema import schema
-from legcal.cli.simulate import simulate
-from legcal.cli.study import study
-from legcal.cli.view import view
+from legcal.cli.sessions import camera, detect, doctor, import_, init, plan
+from legcal.cli.simulated import simulate, study
 from legcal.errors import LegcalError, UsageError, printable
 from legcal.signals import INTERRUPTED, raise_if_stopped
 from legcal.version import __version__
@@ -94,6 +87,25 @@ def _refuse_empty(words: Sequence[str]) -> None:
             )
 
 
+_REPLACED = {
+    "--fix": "--set NAME, or --set NAME=VALUE",
+    "--free": "--set NAME=free",
+    "--prior": "--set NAME=VALUE±SIGMA",
+}
+
+
+def _refuse_replaced(words: Sequence[str]) -> None:
+    """Refuse the earlier spellings of ``calibrate --set``."""
+    options = dict.fromkeys(word.partition("=")[0] for word in words)
+    problems = [
+        f"{option} of legcal calibrate is gone: write {_REPLACED[option]}."
+        for option in options
+        if words[:1] == ["calibrate"] and option in _REPLACED
+    ]
+    if problems:
+        raise UsageError(problems)
+
+
 def _with_remedy(error: Exception) -> str:
     """Return the message of typer on options and arguments, with a remedy; "" if there is none."""
     message = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
@@ -123,7 +135,7 @@ def run(*, as_json: bool) -> int:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
-        refuse_retired(sys.argv[1:])
+        _refuse_replaced(sys.argv[1:])
         code = app(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error

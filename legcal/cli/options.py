@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -36,6 +35,24 @@ DatasetArgument = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")
 ]
+ModelOption = Annotated[
+    str, typer.Option("--model", metavar="MODEL", help="The nominal model, as for inspect.")
+]
+DatasetOutputOption = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DIR", help="The dataset folder to write.")
+]
+LengthsOption = Annotated[
+    bool, typer.Option("--lengths", help="The table holds whole lengths of legs.")
+]
+HandHeldOption = Annotated[
+    bool,
+    typer.Option("--hand-held", help="Hand-held camera: a new pose for every image; with --board."),
+]
+NoiseOption = Annotated[
+    Path | None,
+    typer.Option(metavar="RESULT", help="Take the errors of outlines from this earlier result."),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress on stderr.")]
 
 
@@ -81,35 +98,6 @@ if TYPE_CHECKING:
 
     from legcal.pages.document import Verdict
     from legcal.report.render import Report
-
-
-def declared(request: type) -> Iterator[inspect.Parameter]:
-    """Return the fields of a dataclass (``legcal.option_fields``) as parameters of a command."""
-    types = get_type_hints(request)
-    for field in fields(request):
-        keywords = dict(field.metadata["option"])
-        option = typer.Option(*keywords.pop("flags"), **keywords)
-        yield inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=field.default,
-            annotation=Annotated[types[field.name], option],
-        )
-
-
-def parameters_of(command: Callable[..., None]) -> list[inspect.Parameter]:
-    """Return the explicit parameters of a command, without ``**options``."""
-    parameters = inspect.signature(command, eval_str=True).parameters.values()
-    return [
-        parameter for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD
-    ]
-
-
-def declare(command: Callable[..., None], order: Sequence[inspect.Parameter]) -> None:
-    """Give a command the signature that Typer reads: its parameters in the order of the help."""
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in order]
-    command.__annotations__ = {p.name: p.annotation for p in parameters}
-    vars(command)["__signature__"] = inspect.Signature(parameters)
 
 
 def check_page(page: Path | None) -> None:
@@ -194,6 +182,15 @@ def show(
         print_table(table())
 
 
+def as_lines(lines: Iterable[str]) -> Report:
+    """Return lines that wrap without losing anything, such as paths to copy."""
+    from rich.text import Text
+
+    from legcal.report.render import report
+
+    return report([Text(line, overflow="fold") for line in lines])
+
+
 def print_table(text: Report | Text | str) -> None:
     """Print text for people on stdout."""
     from rich.console import Console
@@ -260,3 +257,18 @@ def print_failure(
             return
     if sys.stderr is not None:
         sys.stderr.write(f"legcal: {message}\n")
+
+
+def open_browser(address: str) -> None:
+    """Open the browser at an address, where it can have windows."""
+    if _has_screen():
+        import webbrowser
+
+        webbrowser.open(address)
+
+
+def _has_screen() -> bool:
+    """Return whether a browser with windows can be opened."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.errors import ModelError, Problem
+from legcal.errors import ModelError
 from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
@@ -59,14 +59,12 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             first, second = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
             if body_of[first] == body_of[second]:
                 raise ModelError(
-                    Problem(
-                        f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
-                        "be used",
-                        "both on one rigid body",
-                        "two",
-                        "remove it",
-                        str(urdf.path),
-                    )
+                    f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
+                    "be used",
+                    "both on one rigid body",
+                    "two",
+                    "remove it",
+                    urdf.path,
                 )
             _merge(body_of, T_body_link, first, second, np.eye(4))
     tree = [

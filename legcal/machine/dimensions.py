@@ -1,17 +1,12 @@
-"""The options of ``legcal new`` that describe a machine; the command line takes them from here.
+"""What ``legcal new`` is told of a machine beside a table, or in place of one.
 
-This module imports the standard library only, so that help and completion are fast.
 :func:`legcal.machine.family.description_of` builds the machine.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
-
-from legcal.option_fields import option
-
-_FAMILY = "Dimensions of --family"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,34 +16,18 @@ class Dimensions:
     Lengths are in ``unit``.
     """
 
-    family: str | None = field(
-        default=None, metadata=option("In place of a table: hexapod or delta.")
-    )
-    unit: str | None = field(default=None, metadata=option("Unit of all lengths: mm, m, in."))
-    name: str | None = field(default=None, metadata=option("Name of the model and its files."))
-    type: str | None = field(
-        default=None, metadata=option("Type of the legs, where the table has none: UPS.")
-    )
-    min_length: float | None = field(
-        default=None, metadata=option("Shortest length of a leg, where readings are zero.")
-    )
-    max_length: float | None = field(default=None, metadata=option("Longest length of a leg."))
-    leg_radius: float | None = field(default=None, metadata=option("Radius of tube and rod."))
-    height: float | None = field(
-        default=None, metadata=option("Height of the platform above the base at home.")
-    )
-    base_radius: float | None = field(
-        default=None, metadata=option("Radius of the circle of base joints, or motors.", _FAMILY)
-    )
-    platform_radius: float | None = field(
-        default=None, metadata=option("Radius of the circle of platform joints.", _FAMILY)
-    )
-    arm_length: float | None = field(
-        default=None, metadata=option("Length of the arms of a delta.", _FAMILY)
-    )
-    rod_length: float | None = field(
-        default=None, metadata=option("Length of the rods of a delta.", _FAMILY)
-    )
+    family: str | None = None  # hexapod or delta, in place of a table
+    unit: str | None = None
+    name: str | None = None  # of the model and its files
+    type: str | None = None  # of the legs: UPS
+    min_length: float | None = None  # of a leg, where readings are zero
+    max_length: float | None = None
+    leg_radius: float | None = None  # of tube and rod
+    height: float | None = None  # of the platform above the base at home
+    base_radius: float | None = None  # of the circle of base joints, or motors
+    platform_radius: float | None = None  # of the circle of platform joints
+    arm_length: float | None = None  # of a delta
+    rod_length: float | None = None  # of a delta
 
     def stated(self) -> dict[str, Any]:
         """Return the given dimensions by name."""

@@ -20,7 +20,6 @@ from legcal.machine.description import Description, leg_type
 from legcal.machine.description_table import described_machine, read_description
 from legcal.machine.dimensions import Dimensions
 from legcal.machine.model_builder import Created, create_model
-from legcal.option_fields import flag
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
 SHORTEST, LONGEST = 0.8, 1.2  # range of leg lengths, relative to the length at home
@@ -280,3 +279,8 @@ FAMILIES = {
         _delta,
     ),
 }
+
+
+def flag(name: str) -> str:
+    """Return the option of a dimension."""
+    return f"--{name.replace('_', '-')}"

@@ -40,34 +40,28 @@ def find_model(model: str | Path) -> Path:
             if RESULT.is_in(path):
                 return path / RESULT_YAML
             raise ModelError(
-                Problem(
-                    "the mechanism could not be read",
-                    f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
-                    "both",
-                    f"copy the result folder again, or give {path / RESULT_YAML} if it is the "
-                    "model that you mean",
-                    str(path),
-                )
+                "the mechanism could not be read",
+                f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
+                "both",
+                f"copy the result folder again, or give {path / RESULT_YAML} if it is the "
+                "model that you mean",
+                path,
             )
         if (path / DATASET_YAML).is_file():
             raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
-            Problem(
-                "the mechanism could not be read",
-                f"a folder without {FOLDER_YAML}",
-                "a folder with it, a result folder, or a YAML, URDF or MJCF file",
-                "give the file",
-                str(path),
-            )
+            "the mechanism could not be read",
+            f"a folder without {FOLDER_YAML}",
+            "a folder with it, a result folder, or a YAML, URDF or MJCF file",
+            "give the file",
+            path,
         )
     if os.path.exists(path) and not os.path.isdir(path):
         if path.suffix.lower() == ".csv":
             raise ModelError(
-                Problem(
-                    "the mechanism could not be read: found a CSV file, needed a mechanism YAML, "
-                    f"URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR",
-                    file=str(path),
-                )
+                "the mechanism could not be read: found a CSV file, needed a mechanism YAML, "
+                f"URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR",
+                file=path,
             )
         return path
     if is_shipped:

@@ -5,9 +5,8 @@ A YAML with its URDF (ours, or Gepetto's, with stand-in joints), a URDF with its
 coincident frames. Without a block ``legcal`` the tree is closed near its drawn configuration.
 """
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,38 +14,34 @@ from typing import cast
 
 import numpy as np
 from lxml import etree
-from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass, Problem, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link, rigid_bodies
-from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
 from legcal.machine.files import find_model, find_urdf, is_xml, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
-from legcal.machine.open_joints import with_held_joints
-from legcal.machine.schema import MAX_LOOPS, LegcalBlock, MechanismFile, read_mechanism_file
-from legcal.machine.solver import Equations, solve
+from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.spanning_tree import (
     Loop,
     LoopKind,
     Source,
     UrdfBuilder,
-    assumed_travel,
     check_one_mechanism,
     close_loop,
     moving_groups,
     reference_poses,
-    set_travel,
-    sliders_without_travel,
-    travel_note,
 )
-from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
+from legcal.machine.topology import find_chains, motors_on, propose_block
 from legcal.machine.urdf import (
+    BLOCK,
     LOOP_TAGS,
-    Problems,
+    NO_BLOCK,
+    URDF_LOOPS,
     Urdf,
+    XmlProblems,
     checked_tree,
     number_list,
     parse_robot,
@@ -54,19 +49,10 @@ from legcal.machine.urdf import (
     parse_xml,
     read_urdf,
 )
-from legcal.machine.wording import BLOCK, NO_BLOCK, URDF_LOOPS
 
 _CLOSING = re.compile(r"closing_(.+)_([12])")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
-TRIALS = 24
-STEPS = 200
-CLOSED = 1e-10  # largest residual of a closed loop [m, rad]
-_DRAWN_CLOSED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
-_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
-_RIGID = 1e-3  # tolerance of determinants of rotations
-_SPREAD = 0.1  # start offset of a trial per trial number [rad], and relative to the machine
-_MAX_STEP = 0.3  # largest step [rad], and relative to the machine
 
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
@@ -90,8 +76,8 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
     if source.file.legcal is not None:
-        is_drawn_closed = source.file.legcal.home is None and _is_drawn_closed(source)
-        return completed(source) if is_drawn_closed else source
+        is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
+        return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
@@ -114,23 +100,19 @@ def _check_stated(source: Source, base: str | None, platform: str | None) -> Non
             continue
         if source.file.legcal is not None:
             raise UsageError(
-                Problem(
-                    f"{option} could not be used",
-                    "a file with a block legcal, which names base and platform",
-                    "a file without it",
-                    f"write '{link}' in legcal.{option.removeprefix('--')}",
-                    str(source.path),
-                )
+                f"{option} could not be used",
+                "a file with a block legcal, which names base and platform",
+                "a file without it",
+                f"write '{link}' in legcal.{option.removeprefix('--')}",
+                source.path,
             )
         if link not in source.urdf.links:
             raise UsageError(
-                Problem(
-                    f"{option} could not be used",
-                    f"the link '{link}', which is not in the file",
-                    "",
-                    closest(link, source.urdf.links),
-                    str(source.path),
-                )
+                f"{option} could not be used",
+                f"the link '{link}', which is not in the file",
+                "",
+                closest(link, source.urdf.links),
+                source.path,
             )
 
 
@@ -156,30 +138,14 @@ def _of_stated(source: Source) -> Source:
     return replace(source, file=file)
 
 
-def _is_drawn_closed(source: Source) -> bool:
-    """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
-    chain = _closed_chain(source)
-    poses = reference_poses(source.urdf).values()
-    size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
-    return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
-
-
-def _closed_chain(source: Source) -> ClosedChain:
-    """Return the tree of a mechanism with its closures."""
-    try:
-        return ClosedChain(source.urdf.text, _closures(source))
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
-
-
 def _with_arms_as_motors(source: Source) -> Source:
     """Return a mechanism without motors with those joints on its base as motors that move rods."""
-    urdf, closures = source.urdf, _closures(source)
+    urdf, closures = source.urdf, source.closures
     with suppress(OutOfClass):
-        proposed_block(source, [])
+        propose_block(source, [])
         return source  # moved by hand
     with suppress(OutOfClass):
-        block = proposed_block(source, None)
+        block = propose_block(source, None)
         bodies = rigid_bodies(urdf, closures, block.platform_joint)
         turning = motors_on(bodies, urdf, bodies.body_of[block.base])
         chains = find_chains(bodies, urdf, block.base, block.platform, turning)
@@ -198,20 +164,6 @@ def _with_arms_as_motors(source: Source) -> Source:
     return source
 
 
-def proposed_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
-    """Return the block ``legcal`` that is proposed for a file, as :func:`propose_block`."""
-    ends = source.base, source.platform
-    return propose_block(source.urdf, _closures(source), motors, source.path, ends)
-
-
-def _closures(source: Source) -> list[Closure]:
-    """Return the closures of a mechanism in the order of its file."""
-    return [
-        Closure("3d" if kind == "3d" else "6d", first, second)
-        for (first, second), kind in zip(source.file.closed_loop, source.file.type, strict=True)
-    ]
-
-
 def _read_xml(path: Path) -> Source:
     """Return the mechanism of an XML file, by its root element."""
     beside = yaml_of_urdf(path)
@@ -223,13 +175,11 @@ def _read_xml(path: Path) -> Source:
         return read_mjcf_source(path, content)
     if root.tag == "sdf":
         raise ModelError(
-            Problem(
-                "the mechanism could not be read",
-                "an SDF file of Gazebo",
-                "a URDF or MJCF file",
-                "export the model as URDF or MJCF",
-                str(path),
-            )
+            "the mechanism could not be read",
+            "an SDF file of Gazebo",
+            "a URDF or MJCF file",
+            "export the model as URDF or MJCF",
+            path,
         )
     if root.tag != "robot":
         raise ModelError(
@@ -245,14 +195,11 @@ def _read_xml(path: Path) -> Source:
         return read_loop_source(path, content)
     parse_urdf(path, content, travel_needed=False)  # a link with two parents closes a loop as well
     raise OutOfClass(
-        Problem(
-            "this is not a parallel mechanism",
-            "a URDF, which is a tree without closed loops, and no YAML that closes them",
-            "",
-            f"write {path.with_suffix('.yaml')} with closed_loop, type, name_mot and "
-            "a legcal block",
-            str(path),
-        )
+        "this is not a parallel mechanism",
+        "a URDF, which is a tree without closed loops, and no YAML that closes them",
+        "",
+        f"write {path.with_suffix('.yaml')} with closed_loop, type, name_mot and a legcal block",
+        path,
     )
 
 
@@ -288,13 +235,11 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
         on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
         if on_replaced:
             raise ModelError(
-                Problem(
-                    "legcal.legs could not be used",
-                    f"'{on_replaced[0]}', which stands for another joint (joint_name)",
-                    "another joint of that leg",
-                    "name its prismatic joint",
-                    str(path),
-                )
+                "legcal.legs could not be used",
+                f"'{on_replaced[0]}', which stands for another joint (joint_name)",
+                "another joint of that leg",
+                "name its prismatic joint",
+                path,
             )
     wording = NO_BLOCK if file.legcal is None else BLOCK
     completed = replace(completed, wording=wording)
@@ -413,14 +358,12 @@ def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
             (number, link) = next(iter(numbers.items()))
             other = f"closing_{name}_{3 - int(number)}"
             raise ModelError(
-                Problem(
-                    "the loops could not be closed",
-                    f"the frame '{link}' and no '{other}'",
-                    "both ends of each loop",
-                    f"export the model again with both parts of the mate closing_{name}, or "
-                    f"remove '{link}'",
-                    str(path),
-                )
+                "the loops could not be closed",
+                f"the frame '{link}' and no '{other}'",
+                "both ends of each loop",
+                f"export the model again with both parts of the mate closing_{name}, or "
+                f"remove '{link}'",
+                path,
             )
     return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
 
@@ -432,17 +375,15 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     prismatic joints if none is named.
     """
     robot = parse_robot(path, content)
-    problems = Problems(path)
+    problems = XmlProblems(path)
     elements = [element for element in robot if element.tag in LOOP_TAGS]
     if len(elements) > MAX_LOOPS:
         raise ModelError(
-            Problem(
-                "the loops could not be closed",
-                f"{len(elements)} of them",
-                f"at most {MAX_LOOPS}",
-                "give one mechanism",
-                str(path),
-            )
+            "the loops could not be closed",
+            f"{len(elements)} of them",
+            f"at most {MAX_LOOPS}",
+            "give one mechanism",
+            path,
         )
     bare = checked_tree(robot, path, content, problems, travel_needed=False)
     loops = _loops(elements, bare, problems)
@@ -473,7 +414,7 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     return Source(path, file, urdf, tuple(notes))
 
 
-def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
+def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
     """Return the valid loops of a URDF, and note the problems of the others."""
     loops = []
     seen: set[str] = set()
@@ -481,11 +422,11 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -
         n_before = len(problems)
         name = element.get("name", "").strip() or f"{element.tag}_{i}"
         if name in seen:
-            problems.add(element, "has a name that another one has", "give each its own name")
+            problems.at(element, "has a name that another one has", "give each its own name")
         seen.add(name)
         kind = element.get("type", "").strip().lower()
         if kind not in KINDS:
-            problems.add(
+            problems.at(
                 element,
                 f"closes a loop with the type '{element.get('type', '')}', needed one of "
                 f"{', '.join(KINDS)}",
@@ -502,7 +443,7 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -
 
 
 def _ends(
-    element: etree._Element, urdf: Urdf, problems: Problems
+    element: etree._Element, urdf: Urdf, problems: XmlProblems
 ) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
     """Return the links of a loop and its frame in each, or None after noting problems."""
     sides = [part for part in element if part.tag in ("link1", "link2")]
@@ -513,7 +454,7 @@ def _ends(
         sides = [part for tag in ("parent", "child") for part in element.findall(tag)]
         origins = [element.find(f"{part.tag}_origin") for part in sides]
     if len(sides) != 2:
-        problems.add(
+        problems.at(
             element,
             f"names {len(sides)} links, needed two",
             "write <link1 link=...> and <link2 link=...>, or <parent ...> and <child ...>",
@@ -523,12 +464,12 @@ def _ends(
     links = [side.get("link", "") for side in sides]
     for link in links:
         if link not in urdf.links:
-            problems.add(
+            problems.at(
                 element, f"names the link '{link}', which is not in the file",
                 closest(link, urdf.links).rstrip("."),
             )  # fmt: skip
     if links[0] == links[1]:
-        problems.add(element, f"joins the link '{links[0]}' to itself", "name two links")
+        problems.at(element, f"joins the link '{links[0]}' to itself", "name two links")
     poses = [_pose(element, origin, problems) for origin in origins]
     if len(problems) > n_before:
         return None
@@ -536,7 +477,7 @@ def _ends(
 
 
 def _pose(
-    element: etree._Element, origin: etree._Element | None, problems: Problems
+    element: etree._Element, origin: etree._Element | None, problems: XmlProblems
 ) -> RigidTransform:
     """Return the motion of ``xyz`` and ``rpy``, zero by default."""
     xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
@@ -544,33 +485,33 @@ def _pose(
 
 
 def _three(
-    element: etree._Element, part: etree._Element | None, key: str, problems: Problems
+    element: etree._Element, part: etree._Element | None, key: str, problems: XmlProblems
 ) -> Array:
     """Return three numbers of an element of a loop; zero by default."""
     text = None if part is None else part.get(key)
     numbers = [0.0] * 3 if text is None else number_list(text, 3)
     if numbers is None:
-        problems.add(
+        problems.at(
             element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
         )
     return np.array(numbers or [0.0] * 3)
 
 
-def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[Array, Array]:
+def _axes(element: etree._Element, kind: LoopKind, problems: XmlProblems) -> tuple[Array, Array]:
     """Return the unit axes of a loop in its two frames; the URDF default is x."""
     x = np.array([1.0, 0.0, 0.0])
     if kind not in ("revolute", "universal"):
         return x, x
     common = element.find("axis")
     if common is not None and common.get("frame") is not None:
-        problems.add(
+        problems.at(
             element,
             f"gives its axis in the frame '{common.get('frame')}' alone, needed it in both",
             "give both frames with rpy so that the axis is the same in them",
         )
     parts = [element.find(f"{side}_axis") for side in ("parent", "child")]
     if kind == "universal" and None in parts:
-        problems.add(
+        problems.at(
             element,
             "is universal and has not two axes",
             "write <parent_axis xyz=...> and <child_axis xyz=...>",
@@ -581,18 +522,20 @@ def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[
         axis = x if given is None else _three(element, given, "xyz", problems)
         norm = float(np.linalg.norm(axis))
         if norm < 1e-9 and not problems:
-            problems.add(element, "has a zero axis, needed a direction", "correct its xyz")
+            problems.at(element, "has a zero axis, needed a direction", "correct its xyz")
         axes.append(axis / max(norm, 1e-9))
     return axes[0], axes[1]
 
 
-def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list[str], list[str]]:
+def _motors(
+    robot: etree._Element, urdf: Urdf, problems: XmlProblems
+) -> tuple[list[str], list[str]]:
     """Return the joints with an encoder, and notes about them."""
     named = [e for e in robot.iterfind("transmission/joint") if e.get("name") is not None]
     named += [e for e in robot.iterfind("ros2_control/joint") if e.get("name") is not None]
     for element in named:
         if element.get("name") not in urdf.joints:
-            problems.add(
+            problems.at(
                 element,
                 "names no joint of the file",
                 closest(str(element.get("name")), urdf.joints).rstrip("."),
@@ -605,195 +548,3 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
         f"The file names no motors: all {len(sliders)} prismatic joints were taken as motors; "
         "name the motors in <transmission> elements if some are not."
     ] * bool(sliders)
-
-
-def completed(source: Source) -> Source:
-    """Return a mechanism without a block, completed with the closed poses and all travels."""
-    closures, chain = _closures(source), _closed_chain(source)
-    start = chain.neutral()
-    for joint, value in source.values.items():
-        start[chain.q_index(joint)] = value
-    drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
-    unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
-    unit[chain.rotation_columns()] = 1.0
-    closed = closed_near(chain, start, source.urdf.links, unit)
-    configuration = start if closed is None else closed
-    urdf = source.urdf
-    sliders = sliders_without_travel(urdf)
-    off = _loop_error(chain, start)
-    if sliders and closed is not None and off > CLOSED:
-        configuration = closed = _levelled(chain, closed, source, closures, unit)
-    elif closed is not None and off > CLOSED:
-        configuration = closed = _at_drawn_motors(chain, closed, start, source, unit)
-    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
-    if sliders:
-        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
-        source = _with_travel(source, readings, poses)
-    if closed is None:
-        return source
-    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
-    drawn = {
-        name: float(configuration[chain.q_index(name)])
-        for name in source.file.name_mot
-        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
-    }
-    is_open = not sliders and off > _OPEN * size
-    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
-
-
-def _at_drawn_motors(
-    chain: ClosedChain, closed: Array, start: Array, source: Source, unit: Array
-) -> Array:
-    """Return a closed configuration with the motors where the file draws them, if there is one."""
-    moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
-             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
-    if len(moved) < len(source.file.name_mot) or not all(moved):
-        return closed
-    values = [chain.q_index(name) for name in source.file.name_mot]
-    rates = np.zeros((len(values), chain.nv))
-    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        off = points[0][values] - start[values]
-        return np.concatenate([residual, off])[None], np.concatenate([jacobian, rates])[None]
-
-    there = _solved(chain, equations, closed, unit)
-    return closed if there is None else there
-
-
-def _levelled(
-    chain: ClosedChain,
-    configuration: Array,
-    source: Source,
-    closures: Sequence[Closure],
-    unit: Array,
-) -> Array:
-    """Return a closed configuration with a level platform, or the given one if there is none.
-
-    A file without a closed drawing and without slider limits leaves the pose undetermined. Among
-    the level poses the one with sliders nearest to their drawn positions is taken.
-    """
-    urdf = source.urdf
-    try:
-        block = proposed_block(source, source.file.name_mot)
-    except OutOfClass:
-        return configuration  # refused later
-    bodies = rigid_bodies(urdf, closures, block.platform_joint)
-    motors = source.file.name_mot
-    chains = find_chains(bodies, urdf, block.base, block.platform, motors)
-    A, B = (
-        np.array(points) @ bodies.T_body_link[link][:3, :3]
-        for link, points in (
-            (block.base, [leg.A for leg in chains]),
-            (block.platform, [leg.B_platform for leg in chains]),
-        )
-    )
-    level = RigidTransform.from_rotation(level_rotation(A, B))
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        turned, by_joints = chain.welded(block.base, block.platform, level)
-        rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
-        return rows[0][None], rows[1][None]
-
-    closed = _solved(chain, equations, configuration, unit)
-    if closed is None:
-        return configuration
-    sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
-    values = [chain.q_index(name) for name in sliders]
-    rates = [chain.v_index(name) for name in sliders]
-    for _ in range(STEPS):
-        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
-        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
-        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
-        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
-            break
-        closed = nearer
-    return closed
-
-
-def closed_near(
-    chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
-) -> Array | None:
-    """Return a closed configuration near a given one, or None.
-
-    Of the results of several starts, the one with the smallest rotations of links is taken. *unit*
-    (nv,) is the size of the machine [m], 1 for angles.
-    """
-    if _loop_error(chain, start) <= CLOSED:
-        return start
-    rng = np.random.default_rng(1965)
-    best: tuple[float, Array] | None = None
-    drawn = chain.turns(start, links[0], links)
-    for trial in range(TRIALS):
-        away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
-        closed = _close(chain, away, unit)
-        if closed is None:
-            continue
-        turned = _turned(drawn, chain.turns(closed, links[0], links))
-        if best is None or turned < best[0] - 1e-6:
-            best = turned, closed
-    return None if best is None else best[1]
-
-
-def _turned(before: Array, after: Array) -> float:
-    """Return the total difference of rotations (n, 3, 3) [rad]."""
-    apart = np.swapaxes(before, 1, 2) @ after
-    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # degenerate or not finite
-        return math.inf
-    return float(Rotation.from_matrix(apart).magnitude().sum())
-
-
-def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
-    """Return a closed configuration near a given one, or None."""
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        return residual[None], jacobian[None]
-
-    return _solved(chain, equations, configuration, unit)
-
-
-def _shortened(step: Array, unit: Array) -> Array:
-    """Return a step (nv,), shortened to ``_MAX_STEP``."""
-    longest = float(np.abs(step / unit).max(initial=0.0))
-    return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
-
-
-def _solved(
-    chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
-) -> Array | None:
-    """Return the solution of equations near a configuration, or None."""
-    solution = solve(
-        equations,
-        lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
-        configuration[None],
-        tolerance=CLOSED,
-        unit=unit,
-        damped=True,
-        steps=STEPS,
-    )
-    return solution.points[0] if solution.worst[0] <= CLOSED else None
-
-
-def _loop_error(chain: ClosedChain, configuration: Array) -> float:
-    """Return the largest residual of the loops."""
-    residual = chain.residual(configuration)
-    return float(np.abs(residual).max()) if len(residual) else 0.0
-
-
-def _with_travel(
-    source: Source, readings: Mapping[str, float], poses: Mapping[str, RigidTransform]
-) -> Source:
-    """Write an assumed travel about some readings into the URDF, and note it."""
-    travel = assumed_travel(poses)
-    robot = parse_robot(source.urdf.path, source.urdf.content)
-    set_travel(robot, readings, travel)
-    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    names: Sequence[str] = list(readings)
-    return replace(
-        source,
-        urdf=replace(parse_urdf(source.urdf.path, content), wording=source.urdf.wording),
-        notes=(*source.notes, travel_note(names, travel)),
-    )

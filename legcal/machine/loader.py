@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problem
+from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problems
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
@@ -40,7 +40,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
-from legcal.machine.formats import proposed_block, read_source
+from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -82,12 +82,15 @@ from legcal.machine.topology import (
     normals_in_links,
     normals_of_closures,
     plane_of_motion,
+    propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf, UrdfJoint
+from legcal.machine.urdf import Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
+_METRES = "write all lengths in metres (are they millimetres?)"
+_NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
     EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
@@ -137,16 +140,14 @@ def _load(source: Source) -> Machine:
     file, urdf = source.file, source.urdf
     _check_origins(urdf)
     _check_names(file, urdf, source.path)
-    # Closures in a fixed order, since sums depend on it.
-    pairs = sorted(zip(file.closed_loop, file.type, strict=True))
-    closures = [
-        Closure("3d" if kind == "3d" else "6d", first, second) for (first, second), kind in pairs
-    ]
+    closures = sorted(  # in a fixed order, since sums depend on it
+        source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
+    )
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
     if file.name_mot:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
-        block = file.legcal or proposed_block(source, file.name_mot)
+        block = file.legcal or propose_block(source, file.name_mot)
         if block.home is None and source.poses is not None:
             T = source.poses[block.base].inv() * source.poses[block.platform]
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
@@ -296,13 +297,7 @@ def _closed_chain(
 def _actuators(
     chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
 ) -> dict[str | None, Actuator | None]:
-    """Return the actuators by joint, with their numbers from the YAML.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each motor with impossible numbers.
-    """
+    """Return the actuators by joint, with their numbers from the YAML."""
     stated = {
         chain.motor: actuator_of(
             chain, T_body_base, _travel(chain, urdf), urdf.joints[str(chain.motor)].child
@@ -310,31 +305,25 @@ def _actuators(
         for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
-    problems = []
+    problems = Problems(path)
+    motors = sorted(str(motor) for motor in stated)
     for name, entry in (block.motors or {}).items():
-        actuator, place = stated.get(name), f"legcal.motors.{name}"
-        wrong = Problem(f"{place} could not be used", file=str(path), name=place)
+        actuator, refused = stated.get(name), f"legcal.motors.{name} could not be used"
         if actuator is None:
-            motors = sorted(str(motor) for motor in stated)
-            problems.append(
-                replace(
-                    wrong,
-                    found="no motor of that name that carries rods",
-                    needed=f"one of {', '.join(motors)}" if motors else "no entry",
-                    remedy=closest(name, motors)
-                    if motors
-                    else "remove it: sliders along legs carry none",
-                )
+            problems.add(
+                refused,
+                "no motor of that name that carries rods",
+                f"one of {', '.join(motors)}" if motors else "no entry",
+                closest(name, motors) if motors else "remove it: sliders along legs carry none",
             )
             continue
         try:
             pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
         except BadValue as bad:
-            problems.append(replace(wrong, found=bad.found, needed=bad.needed, remedy=bad.remedy))
+            problems.add(refused, bad.found, bad.needed, bad.remedy)
         else:
             stated[name] = replace(actuator, gain=entry.gain, pulses=pulses)
-    if problems:
-        raise ModelError(problems)
+    problems.raise_if_any()
     return stated
 
 
@@ -356,18 +345,16 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
 
 def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
     """Refuse readings at home of joints that are no actuators."""
-    joints = sorted(actuator.joint for actuator in machine.actuators)
+    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
     for name in given:
         if name not in joints:
-            raise ModelError(
-                Problem(
-                    f"legcal.home_readings.{name} could not be used",
-                    "no actuator of that name",
-                    f"one of {', '.join(joints)}",
-                    closest(name, joints),
-                    str(machine.yaml_path),
-                )
+            problems.add(
+                f"legcal.home_readings.{name} could not be used",
+                "no actuator of that name",
+                f"one of {', '.join(joints)}",
+                closest(name, joints),
             )
+    problems.raise_if_any()
 
 
 def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
@@ -381,13 +368,8 @@ def _readings_at_home(
 ) -> list[float]:
     """Return the joint values at home: as *given* for actuators, else those within the travel.
 
-    If both are within the travel, the one *drawn* in the file is taken.
-
-    Raises
-    ------
-    ModelError
-        If both readings at which a rod reaches the platform at home are within the travel, or a
-        reading is given for a joint that is not an actuator.
+    If both readings at which a rod reaches the platform are within the travel, the one *drawn* in
+    the file is taken; without one they are refused.
     """
     path = machine.yaml_path
     _check_home_readings(machine, given)
@@ -396,100 +378,73 @@ def _readings_at_home(
     for j, leg in enumerate(machine.legs):
         if leg.actuator is None:
             continue
+        joint = leg.actuator.joint
         readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
         size, unit = SHOWN_IN[leg.reading_unit]
         choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
-        if leg.actuator.joint in given:
-            wanted = given[leg.actuator.joint]
-            q[j] = min(readings, key=lambda x: abs(x - wanted))
-            if not leg.in_travel(np.array([wanted]))[0]:
-                degrees = ", in radians" if leg.reads_angle else ""
-                raise ModelError(
-                    Problem(
-                        f"legcal.home_readings.{leg.actuator.joint} could not be used",
-                        f"{wanted:g} {leg.reading_unit}, outside the travel of "
-                        f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                        f"the one of {choices} at home",
-                        f"correct it{degrees}",
-                        str(path),
-                    )
-                )
-            continue
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
-        scale = 1e-6 * float(np.ptp(leg.travel))
-        if all(inside) and leg.actuator.joint in drawn:
-            q[j] = min(readings, key=lambda x: abs(x - drawn[str(leg.prismatic)]))
-            continue
-        if all(inside) and abs(readings[0] - readings[1]) > scale:
+        near = given.get(joint)
+        if near is not None and not leg.in_travel(np.array([near]))[0]:
             raise ModelError(
-                Problem(
+                f"legcal.home_readings.{joint} could not be used",
+                f"{near:g} {leg.reading_unit}, outside the travel of "
+                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
+                f"the one of {choices} at home",
+                f"correct it{', in radians' * leg.reads_angle}",
+                path,
+            )
+        if near is None and all(inside):
+            near = drawn.get(joint)
+            if near is None and abs(np.diff(readings)[0]) > 1e-6 * np.ptp(leg.travel):
+                raise ModelError(
                     f"the assembly of leg '{leg.name}' at home is ambiguous",
-                    f"that its rod reaches the platform at {choices} of '{leg.actuator.joint}', "
-                    "both inside its travel",
+                    f"that its rod reaches the platform at {choices} of '{joint}', both inside "
+                    "its travel",
                     "one",
                     f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
-                    str(path),
+                    path,
                 )
-            )
-        middle = 0.5 * sum(leg.travel)
-        q[j] = (
-            readings[inside.index(True)]
-            if any(inside)
-            else min(readings, key=lambda x: abs(x - middle))
-        )
+        if near is None:
+            near = readings[inside.index(True)] if any(inside) else 0.5 * sum(leg.travel)
+        q[j] = min(readings, key=lambda x: abs(x - near))
     return q
 
 
 def _legs_in_order(
     chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, block: LegcalBlock, path: Path
 ) -> list[LegChain]:
-    """Return the leg chains in the order of the YAML.
-
-    Raises
-    ------
-    ModelError
-        If a name belongs to no leg, two names to the same leg, or a leg has no name.
-    """
-    problems, ordered = [], list[LegChain]()
+    """Return the leg chains in the order of the YAML; each must have a name there."""
+    problems, ordered = Problems(path), list[LegChain]()
     owner: dict[int, str] = {}
     for name, joint in block.legs.items():
         matches = [c for c in chains if _is_on(joint, c, bodies, urdf)]
         if not matches:
-            problems.append(
-                Problem(
-                    f"legcal.legs.{name} could not be used",
-                    f"the joint '{joint}', which is on no leg between base and platform",
-                    "one that moves with the leg",
-                    "name its prismatic joint",
-                    str(path),
-                )
+            problems.add(
+                f"legcal.legs.{name} could not be used",
+                f"the joint '{joint}', which is on no leg between base and platform",
+                "one that moves with the leg",
+                "name its prismatic joint",
             )
         elif id(matches[0]) in owner:
-            problems.append(
-                Problem(
-                    f"legcal.legs.{name} could not be used",
-                    f"'{joint}' on the leg that is already named '{owner[id(matches[0])]}'",
-                    "a leg of its own",
-                    "correct it",
-                    str(path),
-                )
+            problems.add(
+                f"legcal.legs.{name} could not be used",
+                f"'{joint}' on the leg that is already named '{owner[id(matches[0])]}'",
+                "a leg of its own",
+                "correct it",
             )
         else:
             owner[id(matches[0])] = name
             ordered.append(matches[0])
-    problems += [
-        Problem(
-            "legcal.legs is incomplete",
-            f"no name for the leg with joint '{distinct_joint(chain)}'",
-            "every leg",
-            "add a line for it",
-            str(path),
-        )
-        for chain in chains
-        if id(chain) not in owner and not problems
-    ]
-    if problems:
-        raise ModelError(problems)
+    problems.raise_if_any()
+    for chain in chains:
+        if id(chain) not in owner:
+            problems.add(
+                "legcal.legs is incomplete",
+                f"no name for the leg with joint '{distinct_joint(chain)}'",
+                "every leg",
+                "add a line for it",
+            )
+    problems.raise_if_any()
     return ordered
 
 
@@ -501,13 +456,7 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
 
 
 def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that all links and joints named in the YAML are in the URDF.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each unknown name.
-    """
+    """Check that all links and joints named in the YAML are in the URDF."""
     block = file.legcal
     links, joints = set(urdf.links), set(urdf.joints)
     named: list[tuple[str, str, str, set[str]]] = [
@@ -526,45 +475,31 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         ]
         if block.platform_joint is not None:
             named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
-    problems = [
-        Problem(
-            f"{place} could not be used",
-            f"the {kind} '{name}', which is not in {urdf.path.name}",
-            "",
-            closest(name, sorted(candidates)),
-            str(path),
-        )
-        for place, name, kind, candidates in named
-        if name not in candidates
-    ]
-    problems += [
-        Problem(
-            f"closed_loop.{i} could not be used",
-            f"'{frame_1}' twice",
-            "two frames",
-            "correct one of them",
-            str(path),
-        )
-        for i, (frame_1, frame_2) in enumerate(file.closed_loop)
-        if frame_1 == frame_2
-    ]
-    problems += _frames_of_neighbours(file, urdf, path)
-    if block is not None and block.base == block.platform:
-        problems.append(
-            Problem(
-                "legcal.platform could not be used",
-                f"the link '{block.base}' as base and as platform",
-                "two links",
-                "correct one of them",
-                str(path),
+    problems = Problems(path)
+    for place, name, kind, candidates in named:
+        if name not in candidates:
+            problems.add(
+                f"{place} could not be used",
+                f"the {kind} '{name}', which is not in {urdf.path.name}",
+                remedy=closest(name, sorted(candidates)),
             )
+    for i, (frame_1, frame_2) in enumerate(file.closed_loop):
+        if frame_1 == frame_2:
+            place = f"closed_loop.{i} could not be used"
+            problems.add(place, f"'{frame_1}' twice", "two frames", "correct one of them")
+    _check_neighbours(file, urdf, problems)
+    if block is not None and block.base == block.platform:
+        problems.add(
+            "legcal.platform could not be used",
+            f"the link '{block.base}' as base and as platform",
+            "two links",
+            "correct one of them",
         )
-    if problems:
-        raise ModelError(problems)
+    problems.raise_if_any()
 
 
-def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[Problem]:
-    """Return the problems of closures that name the frame of a neighbour instead of their own.
+def _check_neighbours(file: MechanismFile, urdf: Urdf, problems: Problems) -> None:
+    """Note closures that name the frame of a neighbour instead of their own.
 
     Legs that meet in a point may share a frame: then no similar frame beside it is unused.
     """
@@ -579,299 +514,201 @@ def _frames_of_neighbours(file: MechanismFile, urdf: Urdf, path: Path) -> list[P
         for link, joint in above.items()
         if not joint.moves and not {link, joint.name} & places.keys() and link not in parents
     }
-    problems = []
     for frame, closures in places.items():
         if len(closures) == 1 or frame not in above:
             continue
         beside = [link for link, parent in spare.items() if parent == above[frame].parent]
-        spared = nearest(frame, beside)
-        if spared:
+        if spared := nearest(frame, beside):
             *others, last = closures
             named = " and ".join(f"closed_loop.{i}" for i in others)
-            problems.append(
-                Problem(
-                    f"closed_loop.{last} could not be used",
-                    f"the frame '{frame}', which {named} "
-                    f"{'names' if len(others) == 1 else 'name'} too, and '{spared}' in no "
-                    "closure",
-                    "",
-                    f"write '{spared}' in one of them, or remove it from {urdf.path.name} "
-                    "where these legs meet in one point",
-                    str(path),
-                )
+            problems.add(
+                f"closed_loop.{last} could not be used",
+                f"the frame '{frame}', which {named} name{'s' * (len(others) == 1)} too, and "
+                f"'{spared}' in no closure",
+                remedy=f"write '{spared}' in one of them, or remove it from {urdf.path.name} "
+                "where these legs meet in one point",
             )
-    return problems
 
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check the number of legs and, in a plane, that their type is supported.
-
-    Raises
-    ------
-    OutOfClass
-        If there are too few, or more than MAX_LEGS, or a leg of a planar mechanism is fixed to the
-        platform or carried by an actuator.
-    """
-    n_d = n_frame_legs(spatial=spatial)
+    """Check the number of legs and, in a plane, that their type is supported."""
+    refused, n_d = "this mechanism is not supported", n_frame_legs(spatial=spatial)
     if len(chains) < n_d:
-        where = "in space" if spatial else "in a plane"
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {where}",
-                f"at least {n_d}, whose joints define the frames of base and platform",
-                "this machine cannot be calibrated with legcal",
-                str(path),
-            )
+            refused,
+            f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {_where(spatial=spatial)}",
+            f"at least {n_d}, whose joints define the frames of base and platform",
+            _NOT_CALIBRATED,
+            path,
         )
     if len(chains) > MAX_LEGS:
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"{len(chains)} legs",
-                f"at most {MAX_LEGS}, since the work grows with their cube",
-                "leave out passive legs",
-                str(path),
-            )
+            refused,
+            f"{len(chains)} legs",
+            f"at most {MAX_LEGS}, since the work grows with their cube",
+            "leave out passive legs",
+            path,
         )
     holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
     if len(holding) > 1:
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"{len(holding)} joints directly between base and platform ({', '.join(holding)})",
-                "one at most, which holds the platform",
-                "check that each leg has its links between these joints",
-                str(path),
-            )
+            refused,
+            f"{len(holding)} joints directly between base and platform ({', '.join(holding)})",
+            "one at most, which holds the platform",
+            "check that each leg has its links between these joints",
+            path,
         )
     fixed = [chain for chain in chains if chain.platform.type is JointType.FIXED]
     if fixed and not spatial:
         raise OutOfClass(
-            Problem(
-                f"the leg of joint '{any_joint(fixed[0])}' is not supported",
-                "it fixed to the platform of a planar mechanism",
-                "a revolute joint there",
-                "this machine cannot be calibrated with legcal",
-                str(path),
-            )
+            f"the leg of joint '{any_joint(fixed[0])}' is not supported",
+            "it fixed to the platform of a planar mechanism",
+            "a revolute joint there",
+            _NOT_CALIBRATED,
+            path,
         )
     if not spatial and any(chain.actuator is not None for chain in chains):
-        raise OutOfClass(_plane_of_arms("whose joints at A move on carriages or arms", path))
+        raise _plane_of_arms("whose joints at A move on carriages or arms", path)
+
+
+def _where(*, spatial: bool) -> str:
+    return "in space" if spatial else "in a plane"
 
 
 def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
-    """Check that a machine without sliders moves in space.
-
-    Raises
-    ------
-    OutOfClass
-        If all axes are parallel: a planar machine of arms, such as a five-bar or a 3-RRR.
-    """
+    """Refuse a machine of arms with parallel axes, such as a five-bar or a 3-RRR."""
     moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
     poses = reference_poses(urdf)
     axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
     if len(axes) < 2 or any(joint.type == "prismatic" for joint in moving):
         return
     if all(parallel(axes[0], axis) for axis in axes):
-        raise OutOfClass(_plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path))
+        raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
 
 
-def _plane_of_arms(kind: str, path: Path) -> Problem:
-    """Return the problem of a planar machine that has no sliders along its legs."""
-    return Problem(
+def _plane_of_arms(kind: str, path: Path) -> OutOfClass:
+    """Return the refusal of a planar machine that has no sliders along its legs."""
+    return OutOfClass(
         "this mechanism is not supported",
         f"a planar machine {kind}",
         "a machine in space, or sliders along the legs",
-        "this machine cannot be calibrated with legcal",
-        str(path),
+        _NOT_CALIBRATED,
+        path,
     )
 
 
 def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
-    """Check that every motor is the slider of a leg, or carries rods.
-
-    Raises
-    ------
-    OutOfClass
-        With one sentence for each motor that is not.
-    """
+    """Check that every motor is the slider of a leg, or carries rods."""
     moving = {chain.motor for chain in chains}
-    problems = []
+    problems = Problems(path)
     for motor in file.name_mot:
-        kind = urdf.joints[motor].type
-        if kind == "continuous" and motor in moving:
-            problems.append(
-                Problem(
-                    f"the motor '{motor}' could not be used",
-                    "a continuous joint",
-                    "one with the limits of its readings",
-                    "write its type as revolute, with <limit>",
-                    str(path),
-                )
-            )
-        elif kind == "revolute" and motor in moving and _beyond_turns(urdf.joints[motor]):
-            lower, upper = urdf.joints[motor].limits or (0.0, 0.0)
-            problems.append(
-                Problem(
-                    f"the motor '{motor}' could not be used",
-                    f"the limits {lower:g} to {upper:g} rad",
-                    "at most two turns either way",
-                    "these look like degrees: write its limits, and its readings, in radian",
-                    str(path),
-                )
-            )
-        elif kind != "prismatic" and motor not in moving:
-            problems.append(
-                Problem(
-                    f"the motor '{motor}' is not supported",
-                    f"a {kind} joint in name_mot that does not stand between the base and an "
-                    "arm with rods",
-                    "sliders of legs, or joints on the base that carry the joints of rods",
-                    "remove it from name_mot if it has no motor, otherwise this machine "
-                    "cannot be calibrated with legcal",
-                    str(path),
-                )
+        joint = urdf.joints[motor]
+        lower, upper = joint.limits or (0.0, 0.0)
+        if motor not in moving and joint.type == "prismatic":
+            problems.add(
+                f"the motor '{motor}' is not supported",
+                "it on no leg",
+                "the slider of a leg",
+                "remove it from name_mot",
             )
         elif motor not in moving:
-            problems.append(
-                Problem(
-                    f"the motor '{motor}' is not supported",
-                    "it on no leg",
-                    "the slider of a leg",
-                    "remove it from name_mot",
-                    str(path),
-                )
+            problems.add(
+                f"the motor '{motor}' is not supported",
+                f"a {joint.type} joint in name_mot that does not stand between the base and an "
+                "arm with rods",
+                "sliders of legs, or joints on the base that carry the joints of rods",
+                f"remove it from name_mot if it has no motor, otherwise {_NOT_CALIBRATED}",
             )
-    if problems:
-        raise OutOfClass(problems)
-
-
-def _beyond_turns(joint: UrdfJoint) -> bool:
-    """Return whether the limits of a joint exceed those of any arm."""
-    return joint.limits is not None and max(map(abs, joint.limits)) > MAX_TURN
+        elif joint.type == "continuous":
+            problems.add(
+                f"the motor '{motor}' could not be used",
+                "a continuous joint",
+                "one with the limits of its readings",
+                "write its type as revolute, with <limit>",
+            )
+        elif joint.type == "revolute" and max(abs(lower), abs(upper)) > MAX_TURN:
+            problems.add(
+                f"the motor '{motor}' could not be used",
+                f"the limits {lower:g} to {upper:g} rad",
+                "at most two turns either way",
+                "these look like degrees: write its limits, and its readings, in radian",
+            )
+    problems.raise_if_any(OutOfClass)
 
 
 def _check_frames(machine: Machine) -> None:
-    """Check that the joint centres of the frame legs span a frame on base and platform.
-
-    Raises
-    ------
-    ModelError
-        If they are too few or too many, coincident or collinear.
-    """
-    path, n_d = machine.yaml_path, n_frame_legs(spatial=machine.spatial)
+    """Check that the joint centres of the frame legs span a frame on base and platform."""
+    n_d = n_frame_legs(spatial=machine.spatial)
     chosen = [machine.leg_names[j] for j in machine.frame_legs]
+    refused, problems = "legcal.base_frame could not be used", Problems(machine.yaml_path)
     if len(chosen) != n_d:
-        where = "in space" if machine.spatial else "in a plane"
-        raise ModelError(
-            Problem(
-                "legcal.base_frame could not be used",
-                f"{len(chosen)} legs",
-                f"{n_d} for a mechanism {where}",
-                f"name {n_d} legs",
-                str(path),
-            )
-        )
-    problems = []
+        where = _where(spatial=machine.spatial)
+        needed = f"{n_d} for a mechanism {where}"
+        problems.add(refused, f"{len(chosen)} legs", needed, f"name {n_d} legs")
+    problems.raise_if_any()
     for side in ("base", "platform"):
         try:
             _ = machine.T_base_Rb if side == "base" else machine.T_platform_Re
         except ValueError:
-            needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
-            problems.append(
-                Problem(
-                    "legcal.base_frame could not be used",
-                    f"{side} joints of {', '.join(chosen)} in one point or on one line",
-                    needed,
-                    "choose other legs",
-                    str(path),
-                )
+            problems.add(
+                refused,
+                f"{side} joints of {', '.join(chosen)} in one point or on one line",
+                "three that span a plane" if n_d == 3 else "two that lie apart in the plane",
+                "choose other legs",
             )
-    if problems:
-        raise ModelError(problems)
+    problems.raise_if_any()
+
+
+def _check_length(length: float, words: str, most: float, path: Path) -> None:
+    """Refuse a length [m] that is most likely in another unit, with *words* for it."""
+    if length > most:
+        raise ModelError(
+            "the lengths could not be used",
+            words.format(f"{length:.4g}"),
+            f"at most {most:g} m",
+            _METRES,
+            path,
+        )
 
 
 def _check_origins(urdf: Urdf) -> None:
-    """Check that no joint is so far away that rounding hides the relative position of joints.
-
-    Raises
-    ------
-    ModelError
-        If an origin is more than 10 km away from the parent link.
-    """
+    """Check that no joint is so far away that rounding hides the relative position of joints."""
     for joint in urdf.joints.values():
+        words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        if away > MAX_ORIGIN:
-            raise ModelError(
-                Problem(
-                    "the lengths could not be used",
-                    f"the origin of joint '{joint.name}' {away:.4g} m away from its parent link",
-                    f"at most {MAX_ORIGIN:g} m",
-                    "write all lengths in metres (are they millimetres?)",
-                    str(urdf.path),
-                )
-            )
+        _check_length(away, words, MAX_ORIGIN, urdf.path)
 
 
 def _check_spread(machine: Machine) -> None:
-    """Check that the joints are within metres of each other, before the search for home.
-
-    Raises
-    ------
-    ModelError
-        If the joints of base or platform lie more than 20 m apart.
-    """
-    sizes = {
-        "the joints on the base": float(np.linalg.norm(np.ptp(machine.A_base, axis=0))),
-        "the joints on the platform": float(np.linalg.norm(np.ptp(machine.B_platform, axis=0))),
-    }
-    for name, size in sizes.items():
-        if size > MAX_LENGTH:
-            raise ModelError(
-                Problem(
-                    "the lengths could not be used",
-                    f"{name} {size:.4g} m apart",
-                    f"at most {MAX_LENGTH:g} m",
-                    "write all lengths in metres (are they millimetres?)",
-                    str(machine.urdf_path),
-                )
-            )
+    """Check that the joints are within metres of each other, before the search for home."""
+    for side, joints in (("base", machine.A_base), ("platform", machine.B_platform)):
+        size = float(np.linalg.norm(np.ptp(joints, axis=0)))
+        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf_path)
 
 
 def _check_unit(machine: Machine) -> None:
-    """Check that leg lengths at home and travels are plausible in metres.
-
-    Raises
-    ------
-    ModelError
-        If a leg is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or the
-        radius of a cylinder along it is more than half or less than 2e-4 of its length.
-    """
+    """Check that leg lengths at home, travels and radii are plausible in metres."""
+    path = machine.urdf_path
     lengths = np.linalg.norm(vectors_A_to_B(machine, machine.home), axis=1)
     fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
     odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
     if len(odd):
         raise ModelError(
-            Problem(
-                "the lengths could not be used",
-                f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
-                "1 mm to 20 m",
-                "write all lengths in metres (are they millimetres?)",
-                str(machine.urdf_path),
-            )
+            "the lengths could not be used",
+            f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
+            "1 mm to 20 m",
+            _METRES,
+            path,
         )
     for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
         if leg.is_motor and not leg.reads_angle and reach > MAX_LENGTH:
             raise ModelError(
-                Problem(
-                    f"the travel of leg '{leg.name}' could not be used",
-                    f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
-                    "at most 20 m",
-                    "write the limits of its slider in metres (are they millimetres?)",
-                    str(machine.urdf_path),
-                )
+                f"the travel of leg '{leg.name}' could not be used",
+                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
+                "at most 20 m",
+                "write the limits of its slider in metres (are they millimetres?)",
+                path,
             )
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
         seen = [(c.link, c.radius, f"along leg '{leg.name}'") for c in leg.cylinders]
@@ -880,114 +717,84 @@ def _check_unit(machine: Machine) -> None:
         for link, radius, where in seen:
             if not MIN_RADIUS < radius / length < MAX_RADIUS:
                 raise ModelError(
-                    Problem(
-                        f"the <visual> cylinder of link '{link}' could not be used",
-                        f"a radius of {1e3 * radius:.4g} mm {where}, which is {1e3 * length:.4g} "
-                        "mm long at home",
-                        f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length",
-                        "correct radius and its unit",
-                        str(machine.urdf_path),
-                    )
+                    f"the <visual> cylinder of link '{link}' could not be used",
+                    f"a radius of {1e3 * radius:.4g} mm {where}, which is {1e3 * length:.4g} "
+                    "mm long at home",
+                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length",
+                    "correct radius and its unit",
+                    path,
                 )
 
 
 def _check_dependence(machine: Machine, *, closes: bool = True) -> None:
     """Check that dependent constraints are dependent exactly; *closes*: the machine closes at home.
 
-    Raises
-    ------
-    OutOfClass
-        If some are nearly dependent: the machine then lacks its intended mobility.
+    If some are nearly dependent, the machine lacks its intended mobility.
     """
     nearly = n_nearly_dependent(machine)
     # If home is a special pose, constraints are dependent there exactly and around it nearly.
     if nearly > (n_dependent_at_home(machine) if closes else 0):
         n = n_pose_constraints(machine.legs)
         raise OutOfClass(
-            Problem(
-                f"the mechanism '{machine.name}' could not be used",
-                f"that {nearly} of the {n} constraints of its joints follow from the "
-                "others to 1 mrad but not exactly",
-                "exactly dependent constraints in an overconstrained machine",
-                "write parallel, perpendicular or intersecting axes with all digits (12 decimals "
-                "or more)",
-                str(machine.yaml_path),
-            )
+            f"the mechanism '{machine.name}' could not be used",
+            f"that {nearly} of the {n} constraints of its joints follow from the "
+            "others to 1 mrad but not exactly",
+            "exactly dependent constraints in an overconstrained machine",
+            "write parallel, perpendicular or intersecting axes with all digits (12 decimals "
+            "or more)",
+            machine.yaml_path,
         )
 
 
 def _check_ties(machine: Machine) -> None:
-    """Check that an overconstrained machine keeps its mobility with small errors.
-
-    Raises
-    ------
-    OutOfClass
-        If errors that are allowed one by one destroy the mobility together.
-    """
+    """Check that an overconstrained machine keeps its mobility with small errors."""
     ties, n = machine_ties(machine), n_pose_constraints(machine.legs)
     if machine.actuators and n_dependent_at_home(machine):
-        joints = {leg.base_joint for leg in machine.legs} | {
-            leg.platform_joint for leg in machine.legs
-        }
+        joints = {joint for leg in machine.legs for joint in (leg.base_joint, leg.platform_joint)}
         remedy = "give its rods spherical joints"
         if joints == {JointType.SPHERICAL}:
             remedy = (
                 "leave out redundant rods (between the same joints as another, a third one on a "
-                "motor, those of a fourth arm), otherwise this machine cannot be calibrated with "
-                "legcal"
+                f"motor, those of a fourth arm), otherwise {_NOT_CALIBRATED}"
             )
         raise OutOfClass(
-            Problem(
-                f"the mechanism '{machine.name}' is not supported",
-                f"an overconstrained machine ({n_dependent_at_home(machine)} of the {n} "
-                "constraints of its joints follow from the others) with moving joints at A",
-                "independent constraints",
-                remedy,
-                str(machine.yaml_path),
-            )
+            f"the mechanism '{machine.name}' is not supported",
+            f"an overconstrained machine ({n_dependent_at_home(machine)} of the {n} "
+            "constraints of its joints follow from the others) with moving joints at A",
+            "independent constraints",
+            remedy,
+            machine.yaml_path,
         )
     if not is_tied(geometries(machine), ties, parametrization_of(machine, twists=True)):
         raise OutOfClass(
-            Problem(
-                f"the mechanism '{machine.name}' is not supported",
-                f"an overconstrained machine ({ties.n_dependent} of the {n} constraints of its "
-                f"joints follow from the others) that loses its mobility {machine.mobility} with "
-                "small errors of its parameters, however they are tied",
-                "parameters with errors that keep the mobility",
-                "give a leg another joint, or leave out a leg without a motor",
-                str(machine.yaml_path),
-            )
+            f"the mechanism '{machine.name}' is not supported",
+            f"an overconstrained machine ({ties.n_dependent} of the {n} constraints of its "
+            f"joints follow from the others) that loses its mobility {machine.mobility} with "
+            "small errors of its parameters, however they are tied",
+            "parameters with errors that keep the mobility",
+            "give a leg another joint, or leave out a leg without a motor",
+            machine.yaml_path,
         )
 
 
 def _check_across(machine: Machine) -> None:
-    """Check that the closures of a planar mechanism also hold across its plane.
-
-    Raises
-    ------
-    OutOfClass
-        If a gap exceeds the tolerance of joints, or a rotation 1 mrad.
-    """
+    """Check that the closures of a planar mechanism also hold across its plane."""
     within = joint_tolerance((machine.A_base, machine.B_platform))
     row, residual = 0, machine.chain.residual(machine.home_configuration)
-    problems = []
+    problems = Problems(machine.yaml_path)
     for closure in machine.chain.closures:
         gap = float(np.linalg.norm(residual[row : row + 3]))
         tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
         row += closure.rows
         if gap > within or tilt > PERPENDICULAR:
-            problems.append(
-                Problem(
-                    "the loops could not be closed",
-                    f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
-                    f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move",
-                    f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg",
-                    "correct the origins and axes along this leg",
-                    str(machine.yaml_path),
-                )
+            problems.add(
+                "the loops could not be closed",
+                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move",
+                f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg",
+                "correct the origins and axes along this leg",
             )
-    if problems:
-        raise OutOfClass(problems)
+    problems.raise_if_any(OutOfClass)
 
 
 def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
@@ -995,43 +802,28 @@ def _check_equations(machine: Machine, configurations: Sequence[Array]) -> None:
 
     The closed configurations come from the URDF alone, the equations from the classified geometry:
     both must describe the same machine. Origins and axes in files are rounded, so the tolerances of
-    joints apply.
-
-    Raises
-    ------
-    OutOfClass
-        If the error of a length exceeds the tolerance of joints, or the error of an axis, a
-        direction or a twist 1 mrad.
+    joints apply, and 1 mrad to axes, directions and twists.
     """
     poses = [machine.chain.placement(c, machine.base, machine.platform) for c in configurations]
     R, t = np.array([R for R, _ in poses]), np.array([t for _, t in poses])
     q = np.array([joint_values(machine, c) for c in configurations])
-    of_legs = []
+    problems = Problems(machine.yaml_path)
+    within = joint_tolerance((machine.A_base, machine.B_platform))
     for j, leg in enumerate(machine.legs):
         equations = leg_equations(leg, R, t, by_local=False, q=q[:, j])
         values = equations.values.copy()
         if leg.actuator is None:
             values[:, 0] -= leg.sign * q[:, j]
-        of_legs.append((leg.name, equations.kinds, np.abs(values)))
-    problems: dict[str, Problem] = {}
-    within = joint_tolerance((machine.A_base, machine.B_platform))
-    for k in range(len(configurations)):
-        for name, kinds, values in of_legs:
-            for kind, value in zip(kinds, values[k].tolist(), strict=True):
-                problem = _broken_equation(kind, value, within)
-                if problem is not None:
-                    problems.setdefault(
-                        name,
-                        Problem(
-                            f"leg '{name}' is not supported",
-                            f"{problem} at a closed pose",
-                            "",
-                            "check the origins and axes along the leg",
-                            str(machine.yaml_path),
-                        ),
-                    )
-    if problems:
-        raise OutOfClass(list(problems.values()))
+        kinds = [*equations.kinds] * len(R)
+        for kind, value in zip(kinds, np.abs(values).ravel().tolist(), strict=True):
+            if (broken := _broken_equation(kind, value, within)) is not None:
+                problems.add(
+                    f"leg '{leg.name}' is not supported",
+                    f"{broken} at a closed pose",
+                    remedy="check the origins and axes along the leg",
+                )
+                break
+    problems.raise_if_any(OutOfClass)
 
 
 def _broken_equation(kind: EquationKind, value: float, within: float) -> str | None:

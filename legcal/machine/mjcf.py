@@ -17,7 +17,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass, Problem
+from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
@@ -36,8 +36,7 @@ from legcal.machine.spanning_tree import (
     origin_xml,
     visual_xml,
 )
-from legcal.machine.urdf import Problems, Urdf, number_list, parse_urdf, parse_xml
-from legcal.machine.wording import MJCF
+from legcal.machine.urdf import MJCF, Urdf, XmlProblems, number_list, parse_urdf, parse_xml
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -70,39 +69,33 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
     if n_parts > MAX_PARTS:
         raise ModelError(
-            Problem(
-                "the MJCF file could not be used",
-                f"{n_parts} bodies, joints, frames and default classes",
-                f"at most {MAX_PARTS}",
-                "give the mechanism alone",
-                str(path),
-            )
+            "the MJCF file could not be used",
+            f"{n_parts} bodies, joints, frames and default classes",
+            f"at most {MAX_PARTS}",
+            "give the mechanism alone",
+            path,
         )
-    reader = MjcfReader(root, Problems(path))
+    reader = MjcfReader(root, XmlProblems(path))
     reader.read_bodies()
     loops = list(reader.loops())
     motors = reader.motors()
     reader.problems.raise_if_any()
     if len(loops) > MAX_LOOPS:
         raise ModelError(
-            Problem(
-                "the loops could not be closed",
-                f"{len(loops)} of them",
-                f"at most {MAX_LOOPS}",
-                "give one mechanism",
-                str(path),
-            )
+            "the loops could not be closed",
+            f"{len(loops)} of them",
+            f"at most {MAX_LOOPS}",
+            "give one mechanism",
+            path,
         )
     if not loops:
         raise OutOfClass(
-            Problem(
-                "this is not a parallel mechanism",
-                "an MJCF file without <connect> or <weld> in <equality>, which is a tree "
-                "without closed loops",
-                "the closures of its loops",
-                "add them",
-                str(path),
-            )
+            "this is not a parallel mechanism",
+            "an MJCF file without <connect> or <weld> in <equality>, which is a tree "
+            "without closed loops",
+            "the closures of its loops",
+            "add them",
+            path,
         )
     pairs = [close_loop(loop, reader.tree, reader.poses) for loop in loops]
     name = root.get("model", "").strip() or path.stem
@@ -118,11 +111,11 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
 class MjcfReader:
     """One MJCF file: its elements with defaults applied, and the tree of its bodies.
 
-    Problems are collected and raised together. The loops are closed in the configuration of the
+    XmlProblems are collected and raised together. The loops are closed in the configuration of the
     file, with all joints at their ``ref``.
     """
 
-    def __init__(self, root: etree._Element, problems: Problems) -> None:
+    def __init__(self, root: etree._Element, problems: XmlProblems) -> None:
         self.root, self.problems = root, problems
         self.tree = UrdfBuilder()
         self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # pose of every body in the world
@@ -149,7 +142,7 @@ class MjcfReader:
     def read_bodies(self) -> None:
         """Write all bodies as links and joints."""
         for element in self.root.iter(*_NOT_READ):
-            self.problems.add(
+            self.problems.at(
                 element, "is not expanded", "save the compiled model with MuJoCo and give that file"
             )
         for element in self.root.iterfind("worldbody//*[@name]"):
@@ -186,7 +179,7 @@ class MjcfReader:
             elif tag == "site" and element.get("name"):
                 self._site(part)
             elif isinstance(tag, str) and tag not in (*_LEFT_ALONE, *_NOT_READ):
-                self.problems.add(element, "is no element of a body", "correct or remove it")
+                self.problems.at(element, "is no element of a body", "correct or remove it")
         return joints, bodies, visuals
 
     def _body(self, part: BodyElement) -> list[BodyElement]:
@@ -194,7 +187,7 @@ class MjcfReader:
         element = part.element
         name = element.get("name", "")
         if name in self.poses:
-            self.problems.add(
+            self.problems.at(
                 element, f"has the name '{name}', which another body has", "give each its own name"
             )
         if not name or name in self.poses:
@@ -237,7 +230,7 @@ class MjcfReader:
         kind = "free" if element.tag == "freejoint" else attributes.get("type", "hinge")
         name = attributes.get("name", "")
         if name and name in self._joints:
-            self.problems.add(
+            self.problems.at(
                 element, f"has the name '{name}', which another joint has", "give each its own name"
             )
         if not name or name in self._joints:
@@ -245,7 +238,7 @@ class MjcfReader:
         self._joints[name] = kind
         if kind == "free":
             if not only or at != WORLD:
-                self.problems.add(
+                self.problems.at(
                     element,
                     "frees a body that has other joints or is not on the world itself",
                     "a free joint stands alone in a body of <worldbody>",
@@ -253,7 +246,7 @@ class MjcfReader:
             self.tree.joint(name, "floating", at, part.body, T_at_body)
             return part.body, EYE
         if kind not in ("hinge", "slide", "ball"):
-            self.problems.add(
+            self.problems.at(
                 element, f"has the type '{kind}', needed free, ball, slide or hinge", "correct it"
             )
             return at, T_at_body
@@ -294,7 +287,7 @@ class MjcfReader:
         given = self._numbers(element, attributes, "axis", (3,))
         axis = np.array(_Z) if given is None else given
         if not np.linalg.norm(axis) > 1e-9:
-            self.problems.add(element, "has a zero axis, needed a direction", "correct its axis")
+            self.problems.at(element, "has a zero axis, needed a direction", "correct its axis")
             axis = np.array(_Z)
         axis = part.T_body_frame.rotation.apply(axis / np.linalg.norm(axis))
         ref = self._numbers(element, attributes, "ref", (1,))
@@ -323,7 +316,7 @@ class MjcfReader:
             return None
         lower, upper = float(numbers[0]), float(numbers[1])
         if not lower < upper:
-            self.problems.add(
+            self.problems.at(
                 element, f"has the range {lower:g} to {upper:g}", "give the lower end first"
             )
             return None
@@ -334,7 +327,7 @@ class MjcfReader:
         element, attributes = part.element, self._attributes(part)
         kind = attributes.get("type", "sphere")
         if kind not in _GEOMS:
-            self.problems.add(
+            self.problems.at(
                 element, f"has the type '{kind}', needed one of {', '.join(_GEOMS)}", "correct it"
             )
         if kind == "mesh":
@@ -347,7 +340,7 @@ class MjcfReader:
             T = self._pose(element, attributes)
             length = 2.0 * float(size[1]) if size is not None and len(size) > 1 else 0.0
         if size is None or not (size[0] > 0.0 and length > 0.0):
-            self.problems.add(
+            self.problems.at(
                 element,
                 "is a cylinder without a radius and a length above zero",
                 "write size, or fromto and size",
@@ -377,7 +370,7 @@ class MjcfReader:
         """Register a site by name."""
         element, name = part.element, str(part.element.get("name"))
         if name in self.sites:
-            self.problems.add(
+            self.problems.at(
                 element, f"has the name '{name}', which another site has", "give each its own name"
             )
         attributes = self._attributes(part)
@@ -420,11 +413,11 @@ class MjcfReader:
                 if element.tag in _COUPLINGS:
                     reason = f"couples <{element.tag}> coordinates, which is not followed"
                 remedy = "close loops with <connect> and <weld> alone"
-                self.problems.add(element, reason, remedy)
+                self.problems.at(element, reason, remedy)
                 continue
             name = str(attributes.get("name") or f"{element.tag}{i}")
             if name in names:
-                self.problems.add(
+                self.problems.at(
                     element, "has a name that another one has", "give each its own name"
                 )
             names.add(name)
@@ -435,9 +428,7 @@ class MjcfReader:
                 continue
             (link_1, T_1), (link_2, T_2) = ends
             if link_1 == link_2:
-                self.problems.add(
-                    element, f"joins the body '{link_1}' to itself", "name two bodies"
-                )
+                self.problems.at(element, f"joins the body '{link_1}' to itself", "name two bodies")
                 continue
             scale = self._numbers(element, attributes, "torquescale", (1,))
             is_point = element.tag == "connect" or (scale is not None and scale[0] == 0.0)
@@ -460,13 +451,13 @@ class MjcfReader:
         names = [element.get("body1", ""), element.get("body2", WORLD)]
         for key, name in zip(("body1", "body2"), names, strict=True):
             if not name:
-                self.problems.add(element, f"has no {key}", "name the body that it holds")
+                self.problems.at(element, f"has no {key}", "name the body that it holds")
             elif name not in self.poses:
                 self._unknown(element, f"the body '{name}' as {key}", name, self.poses)
         attributes = _attributes_of(element)
         anchor = self._numbers(element, attributes, "anchor", (3,))
         if element.tag == "connect" and "anchor" not in attributes:
-            self.problems.add(element, "has no anchor", "write the point in the frame of body1")
+            self.problems.at(element, "has no anchor", "write the point in the frame of body1")
         if any(name not in self.poses for name in names):
             return None
         T_body1_body2 = self.poses[names[0]].inv() * self.poses[names[1]]
@@ -492,14 +483,14 @@ class MjcfReader:
             other = [key for key in _OTHER_DRIVES if element.get(key) is not None]
             name = element.get("joint", element.get("jointinparent"))
             if other and element.tag != "jointpos":
-                self.problems.add(
+                self.problems.at(
                     element,
                     f"drives by {other[0]}, which is no joint with a reading",
                     "drive the slide of each leg itself",
                 )
             drives_no_joint = element.tag == "plugin" or element.get("body") is not None  # suction
             if name is None and not other and not drives_no_joint:
-                self.problems.add(
+                self.problems.at(
                     element, "names no joint", "name the slide that it drives or measures as joint"
                 )
             if name is None:
@@ -508,7 +499,7 @@ class MjcfReader:
             if kind is None:
                 self._unknown(element, f"the joint '{name}'", name, self._joints)
             elif kind in ("ball", "free"):
-                self.problems.add(
+                self.problems.at(
                     element,
                     f"drives or measures the {kind} joint '{name}', which has no one reading",
                     "remove it",
@@ -522,7 +513,7 @@ class MjcfReader:
     ) -> None:
         """Add the problem of an unknown name in an element."""
         remedy = closest(name, candidates).rstrip(".")
-        self.problems.add(element, f"names {reference}, which is not in the file", remedy)
+        self.problems.at(element, f"names {reference}, which is not in the file", remedy)
 
     # Attributes, with defaults and compiler options
 
@@ -538,7 +529,7 @@ class MjcfReader:
     def _default(self, element: etree._Element, name: str) -> Defaults:
         """Return a default class; the main class, and a problem, if it does not exist."""
         if name not in self._defaults:
-            self.problems.add(
+            self.problems.at(
                 element,
                 f"names the default class '{name}', which is not in the file",
                 "correct the name",
@@ -562,7 +553,7 @@ class MjcfReader:
         numbers = number_list(text, len(text.split()))
         if numbers is None or len(numbers) not in counts:
             wanted = " or ".join(map(str, counts))
-            self.problems.add(
+            self.problems.at(
                 element,
                 f"has {key}={text[:60]!r}, needed {wanted} finite number{'s' * (wanted != '1')}",
                 "correct the value",
@@ -580,7 +571,7 @@ class MjcfReader:
         """Return the rotation of ``quat``, ``axisangle``, ``xyaxes``, ``zaxis`` or ``euler``."""
         written = [key for key in ORIENTATIONS if key in attributes]
         if len(written) > 1:
-            self.problems.add(
+            self.problems.at(
                 element, f"has {' and '.join(written)}, needed one orientation", "keep one"
             )
         if len(written) != 1:
@@ -589,7 +580,7 @@ class MjcfReader:
         numbers = self._numbers(element, attributes, key, (ORIENTATIONS[key],))
         rotation = None if numbers is None else self._rotation(key, numbers)
         if numbers is not None and rotation is None:
-            self.problems.add(
+            self.problems.at(
                 element,
                 f"has {key}={attributes[key]!r}, which gives no orientation",
                 "correct the value",
@@ -640,9 +631,9 @@ class MjcfReader:
         for part in element.iterfind("default"):
             inner = part.get("class", "")
             if not inner:
-                self.problems.add(part, "is a default class without a name", "name it")
+                self.problems.at(part, "is a default class without a name", "name it")
             elif inner in self._defaults:
-                self.problems.add(
+                self.problems.at(
                     part, f"is the default class '{inner}' again", "give each its own name"
                 )
             else:
@@ -657,14 +648,14 @@ class MjcfReader:
         ):
             value = element.get(key)
             if value is not None and value not in allowed:
-                self.problems.add(
+                self.problems.at(
                     element,
                     f"has {key}='{value}', needed {' or '.join(allowed)}",
                     "convert the model with MuJoCo first",
                 )
         sequence = element.get("eulerseq", self._eulerseq)
         if len(sequence) != 3 or not set(sequence.lower()) <= set("xyz"):
-            self.problems.add(
+            self.problems.at(
                 element,
                 f"has eulerseq='{sequence}', needed three letters of x, y, z",
                 "correct the value",

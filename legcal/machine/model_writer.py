@@ -18,7 +18,7 @@ import yaml
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, OutOfResources, Problem, UsageError
+from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.rotations import roll_pitch_yaw
@@ -81,13 +81,11 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     there = [str(path) for path in places if os.path.lexists(path)]
     if there:
         raise UsageError(
-            Problem(
-                f"the model '{name}' could not be written",
-                f"{' and '.join(there)} already there",
-                "new files",
-                "give another folder",
-                str(machine.yaml_path),
-            )
+            f"the model '{name}' could not be written",
+            f"{' and '.join(there)} already there",
+            "new files",
+            "give another folder",
+            machine.yaml_path,
         )
     try:
         for path in places:
@@ -261,14 +259,12 @@ def check_closes(machine: Machine) -> None:
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
     if not max(shift / machine.size, turn) <= CLOSES:
         raise DidNotConverge(
-            Problem(
-                "the mechanism does not close at home",
-                f"a pose {1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it "
-                "at its own readings",
-                f"at most {1e3 * CLOSES * machine.size:.0e} mm and {np.degrees(CLOSES):.0e} deg",
-                f"check {machine.urdf.wording.home}",
-                str(machine.yaml_path),
-            )
+            "the mechanism does not close at home",
+            f"a pose {1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it "
+            "at its own readings",
+            f"at most {1e3 * CLOSES * machine.size:.0e} mm and {np.degrees(CLOSES):.0e} deg",
+            f"check {machine.urdf.wording.home}",
+            machine.yaml_path,
         )
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass, Problem
+from legcal.errors import OutOfClass
 from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
@@ -244,13 +244,11 @@ class Handles:
         if problem is not None:
             raise problem
         raise OutOfClass(
-            Problem(
-                f"leg '{leg}' is not supported",
-                f"several welds between joint '{joint.name}' and the link '{body}'",
-                "one, which moves with the parameters of the leg",
-                "close the leg once",
-                str(self._urdf.path),
-            )
+            f"leg '{leg}' is not supported",
+            f"several welds between joint '{joint.name}' and the link '{body}'",
+            "one, which moves with the parameters of the leg",
+            "close the leg once",
+            self._urdf.path,
         )
 
     def _carrier(self, closure: int, side: int) -> UrdfJoint:

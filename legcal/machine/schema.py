@@ -116,13 +116,11 @@ def _refuse_other_text(content: bytes, path: Path) -> None:
     kind = next((kind for kind, pattern in _OTHER_TEXT.items() if pattern.match(first)), None)
     if kind is not None:
         raise ModelError(
-            Problem(
-                f"the {FILE_KIND} could not be read",
-                kind,
-                "a mechanism YAML, URDF or MJCF file",
-                f"make a model of it with: legcal new {path} -o DIR",
-                str(path),
-            )
+            f"the {FILE_KIND} could not be read",
+            kind,
+            "a mechanism YAML, URDF or MJCF file",
+            f"make a model of it with: legcal new {path} -o DIR",
+            path,
         )
 
 
@@ -130,11 +128,9 @@ def _check_kind(document: Mapping[str, Any], path: Path) -> None:
     """Refuse other YAML files of legcal, with the command for each."""
     if "legcal_table" in document:
         raise ModelError(
-            Problem(
-                f"the {FILE_KIND} could not be read: found a table of legs (legcal_table), needed "
-                f"a model; write the model of the table with: legcal new {path} -o DIR",
-                file=str(path),
-            )
+            f"the {FILE_KIND} could not be read: found a table of legs (legcal_table), needed "
+            f"a model; write the model of the table with: legcal new {path} -o DIR",
+            file=path,
         )
     if path.name == DATASET_YAML:
         raise ModelError(what_a_dataset_is_for(path))

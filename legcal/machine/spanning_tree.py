@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass, Problem
+from legcal.errors import OutOfClass
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
+from legcal.machine.chain import Closure
 from legcal.machine.schema import MechanismFile
 from legcal.machine.urdf import Urdf
 
@@ -41,6 +41,12 @@ class Source:
     base: str | None = None  # stated links of a file without a block
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
+
+    @property
+    def closures(self) -> list[Closure]:
+        """The closures in the order of the file."""
+        pairs = zip(self.file.closed_loop, self.file.type, strict=True)
+        return [Closure("3d" if kind == "3d" else "6d", *ends) for ends, kind in pairs]
 
 
 FULL_TURN = 2.0 * pi
@@ -162,13 +168,11 @@ def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Pat
     if len(closed) > 1:
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
-            Problem(
-                "the mechanism could not be read",
-                f"{len(closed)} mechanisms, which have no moving body in common (with {names})",
-                "one",
-                "write each to its own file",
-                str(path),
-            )
+            "the mechanism could not be read",
+            f"{len(closed)} mechanisms, which have no moving body in common (with {names})",
+            "one",
+            "write each to its own file",
+            path,
         )
 
 
@@ -213,48 +217,6 @@ def reference_poses(urdf: Urdf) -> dict[str, RigidTransform]:
             poses[joint.child] = poses[link] * joint.T_parent_origin
             pending.append(joint.child)
     return poses
-
-
-TRAVEL_OF_SIZE = 0.05
-
-
-def sliders_without_travel(urdf: Urdf) -> list[str]:
-    """Return the prismatic joints of a URDF without limits."""
-    joints = urdf.joints.values()
-    return [joint.name for joint in joints if joint.type == "prismatic" and joint.limits is None]
-
-
-def assumed_travel(poses: Mapping[str, RigidTransform]) -> tuple[float, float]:
-    """Return a default travel for sliders: 5 % of the mechanism to either side."""
-    points = np.array([pose.translation for pose in poses.values()])
-    size = float(np.ptp(points, axis=0).max())
-    reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
-    return -reach, reach
-
-
-def travel_note(sliders: Sequence[str], travel: tuple[float, float]) -> str:
-    """Return the note on sliders with assumed travel."""
-    names = ", ".join(f"'{name}'" for name in sliders[:6])
-    return (
-        f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[1]:g} m to either "
-        "side of the closed pose was assumed; add their limits."
-    )
-
-
-def set_travel(
-    robot: etree._Element, readings: Mapping[str, float], travel: tuple[float, float]
-) -> None:
-    """Write the travel of sliders about some readings [m] into a URDF."""
-    for element in robot:
-        name = str(element.get("name"))
-        if element.tag == "joint" and name in readings:
-            limit = element.find("limit")
-            if limit is None:
-                limit = etree.SubElement(element, "limit")
-            limit.set("lower", repr(readings[name] + travel[0]))
-            limit.set("upper", repr(readings[name] + travel[1]))
-            for key in ("effort", "velocity"):
-                limit.set(key, limit.get(key, "1000"))
 
 
 LoopKind = Literal["point", "weld", "revolute", "universal"]

@@ -33,7 +33,7 @@ from legcal.machine.classification import (
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock
-from legcal.machine.spanning_tree import reference_poses
+from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
@@ -150,23 +150,18 @@ def _paths(
     return paths
 
 
-def propose_block(
-    urdf: Urdf,
-    closures: Sequence[Closure],
-    motors: Sequence[str] | None,
-    path: Path,
-    ends: tuple[str | None, str | None] = (None, None),
-) -> LegcalBlock:
+def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
     """Return the default block ``legcal`` for a file without one.
 
-    Without *motors* all revolute joints on the base may be motors of arms. The links of base and
-    platform may be stated as *ends*.
+    Without *motors* all revolute joints on the base may be motors of arms.
 
     Raises
     ------
     OutOfClass
         If no body is the platform of separate legs of the class.
     """
+    urdf, closures, path = source.urdf, source.closures, source.path
+    ends = source.base, source.platform
     bodies = rigid_bodies(urdf, closures, None)
     root, problems = bodies.body_of[urdf.root], list[OutOfClass]()
     blocks = dict[str, LegcalBlock]()

@@ -4,7 +4,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -13,13 +13,12 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
-from legcal.errors import Code, ModelError, Problem
+from legcal.errors import Code, ModelError, Problem, Problems
 from legcal.files.schema import NAME_NEEDED, describe, is_name
 from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.files import read_file
-from legcal.machine.wording import BLOCK, Wording
 
 MAX_ELEMENTS = 50_000
 MAX_LINKS = 1000
@@ -29,33 +28,17 @@ MAX_MOVING = 200
 def parse_robot(path: Path, content: bytes) -> etree._Element:
     """Return the ``<robot>`` of a URDF, without comments, entities or the network."""
     robot = parse_xml(path, content, "URDF")
+    name, problems, line = robot.get("name", ""), Problems(path), cast("int", robot.sourceline)
+    refused = "the URDF could not be read"
     if robot.tag != "robot":
-        raise ModelError(
-            Problem(
-                f"the URDF could not be read: found <{robot.tag}> "
-                "as its root element, needed <robot>; give the URDF of the mechanism.",
-                file=str(path),
-                line=cast("int", robot.sourceline),
-            )
-        )
-    if not robot.get("name", "").isprintable():
-        raise ModelError(
-            Problem(
-                f"the URDF could not be read: found <robot> with the "
-                f"name {describe(robot.get('name'))}, needed printable characters; rename it.",
-                file=str(path),
-                line=cast("int", robot.sourceline),
-            )
-        )
-    if not robot.get("name", "").strip():
-        raise ModelError(
-            Problem(
-                "the URDF could not be read: found <robot> without "
-                "a name, needed one; write <robot name=...>.",
-                file=str(path),
-                line=cast("int", robot.sourceline),
-            )
-        )
+        element = f"<{robot.tag}> as its root element"
+        problems.add(refused, element, "<robot>", "give the URDF of the mechanism", line)
+    elif not name.isprintable():
+        stated = f"<robot> with the name {describe(name)}"
+        problems.add(refused, stated, "printable characters", "rename it", line)
+    elif not name.strip():
+        problems.add(refused, "<robot> without a name", "one", "write <robot name=...>", line)
+    problems.raise_if_any()
     return robot
 
 
@@ -68,49 +51,29 @@ def parse_xml(path: Path, content: bytes, kind: str) -> etree._Element:
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        line = error.lineno or 1
-        raise ModelError(
-            Problem(
-                f"the {kind} could not be read: found {error.msg}, needed "
-                "well-formed XML; mend that line, or copy the file again if it was cut off.",
-                file=str(path),
-                line=line,
-                code=Code.BAD_SYNTAX,
-            )
-        ) from error
-    if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
-        raise ModelError(
-            Problem(
-                f"the {kind} could not be read",
-                f"more than {MAX_ELEMENTS} elements",
-                "fewer",
-                "give the file of one mechanism",
-                str(path),
-            )
+        bad = Problem(
+            f"the {kind} could not be read",
+            str(error.msg),
+            "well-formed XML",
+            "mend that line, or copy the file again if it was cut off",
+            str(path),
+            line=error.lineno or 1,
+            code=Code.BAD_SYNTAX,
         )
+        raise ModelError(bad) from error
+    problems, refused = Problems(path), f"the {kind} could not be read"
+    if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
+        remedy = "give the file of one mechanism"
+        problems.add(refused, f"more than {MAX_ELEMENTS} elements", "fewer", remedy)
     document: Any = root.getroottree().docinfo
     if document.doctype or document.internalDTD is not None:
-        raise ModelError(
-            Problem(
-                f"the {kind} could not be read",
-                "a document type (<!DOCTYPE>), whose entities are never expanded",
-                "plain XML",
-                "remove it",
-                str(path),
-            )
-        )
+        doctype = "a document type (<!DOCTYPE>), whose entities are never expanded"
+        problems.add(refused, doctype, "plain XML", "remove it")
     try:
         content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ModelError(
-            Problem(
-                f"the {kind} could not be read",
-                "text in another encoding",
-                "UTF-8",
-                "save it as UTF-8",
-                str(path),
-            )
-        ) from error
+    except UnicodeDecodeError:
+        problems.add(refused, "text in another encoding", "UTF-8", "save it as UTF-8")
+    problems.raise_if_any()
     return root
 
 
@@ -133,38 +96,22 @@ _NUMERIC: dict[str, dict[str, tuple[int, bool]]] = {
 }
 
 
-class Problems:
-    """The problems of one URDF, collected to be raised together."""
+class XmlProblems(Problems):
+    """The problems of an XML file."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.all: list[Problem] = []
-
-    def __len__(self) -> int:
-        return len(self.all)
-
-    def add(self, element: etree._Element, mistake: str, remedy: str) -> None:
-        """Add a problem of an element of the file, with its remedy."""
+    def at(self, element: etree._Element, mistake: str, remedy: str) -> None:
+        """Add a problem of an element of the file."""
         name = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
-        self.all.append(
+        self.append(
             Problem(
                 f"{name} could not be used: it {mistake}",
                 remedy=remedy,
-                file=str(self.path),
+                file=self.file,
                 line=cast("int", element.sourceline),
                 name=name,
                 code=Code.BAD_ELEMENT,
             )
         )
-
-    def add_of_file(self, consequence: str, found: str, needed: str, remedy: str) -> None:
-        """Add a problem of the whole file."""
-        self.all.append(Problem(consequence, found, needed, remedy, str(self.path)))
-
-    def raise_if_any(self) -> None:
-        """Raise all problems as one error."""
-        if self.all:
-            raise ModelError(self.all)
 
 
 def number_list(text: str, count: int) -> list[float] | None:
@@ -176,25 +123,25 @@ def number_list(text: str, count: int) -> list[float] | None:
     return numbers if all(math.isfinite(x) and abs(x) < MAX_NUMBER for x in numbers) else None
 
 
-def check_numbers(element: etree._Element, problems: Problems) -> None:
+def check_numbers(element: etree._Element, problems: XmlProblems) -> None:
     """Check every number of a link or a joint."""
     for part in element.iter(*_NUMERIC):
         for attribute, (count, positive) in _NUMERIC[str(part.tag)].items():
             text = part.get(attribute)
             if text is None:
                 if part.tag == "cylinder":
-                    problems.add(element, f"has a <cylinder> without {attribute}", "write it [m]")
+                    problems.at(element, f"has a <cylinder> without {attribute}", "write it [m]")
                 continue
             numbers = number_list(text, count)
             if numbers is None:
                 needed = "a finite number" if count == 1 else f"{count} finite numbers"
-                problems.add(
+                problems.at(
                     element,
                     f'has <{part.tag} {attribute}="{_short(text)}">, needed {needed}',
                     "correct the value",
                 )
             elif positive and min(numbers) <= 0.0:
-                problems.add(
+                problems.at(
                     element,
                     f'has <{part.tag} {attribute}="{_short(text)}">, needed more than zero',
                     "correct the value",
@@ -202,7 +149,7 @@ def check_numbers(element: etree._Element, problems: Problems) -> None:
 
 
 def check_tree(
-    links: list[etree._Element], joints: list[etree._Element], problems: Problems
+    links: list[etree._Element], joints: list[etree._Element], problems: XmlProblems
 ) -> str:
     """Check that links and joints are one tree, and return its root link."""
     for elements in (links, joints):
@@ -216,9 +163,9 @@ def check_tree(
             end = joint.find(tag)
             link = None if end is None else end.get("link")
             if link is None:
-                problems.add(joint, f"has no <{tag} link=...>", "name the link")
+                problems.at(joint, f"has no <{tag} link=...>", "name the link")
             elif link not in names:
-                problems.add(
+                problems.at(
                     joint, f"names the {tag} link '{link}', which is not in the file",
                     "correct the name",
                 )  # fmt: skip
@@ -228,7 +175,7 @@ def check_tree(
             continue
         child = ends["child"]
         if child in parent_joint:
-            problems.add(
+            problems.at(
                 joint,
                 f"gives the link '{child}' a second parent (the first is by joint "
                 f"'{parent_joint[child]}')",
@@ -241,20 +188,20 @@ def check_tree(
     return _root(links, parent_joint, children, problems)
 
 
-def _check_names(elements: list[etree._Element], problems: Problems) -> None:
+def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
     """Check that every element has a name of its own."""
     counts = Counter(e.get("name", "") for e in elements)
     seen: set[str] = set()
     for element in elements:
         name = element.get("name", "")
         if not name.strip():
-            problems.add(element, "has no name", "name it")
+            problems.at(element, "has no name", "name it")
         elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            problems.add(
+            problems.at(
                 element, f"has a name that cannot be used, needed {NAME_NEEDED}", "rename it"
             )
         elif name in seen:
-            problems.add(
+            problems.at(
                 element, f"has a name that {counts[name]} of them share", "give each its own name"
             )
         seen.add(name)
@@ -264,12 +211,12 @@ def _root(
     links: list[etree._Element],
     parent_joint: dict[str, str],
     children: dict[str, list[str]],
-    problems: Problems,
+    problems: XmlProblems,
 ) -> str:
     """Return the one link without a parent, the root of all others."""
     roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
-        problems.add_of_file(
+        problems.add(
             "the URDF could not be used",
             "no <link>",
             "the links of a mechanism",
@@ -278,7 +225,7 @@ def _root(
         return ""
     if len(roots) > 1:
         names = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
-        problems.add_of_file(
+        problems.add(
             "the URDF could not be used",
             f"{len(roots)} links without a parent ({names})",
             "one",
@@ -295,7 +242,7 @@ def _root(
     cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
     if cyclic:
         names = ", ".join(repr(name) for name in cyclic[:6])
-        problems.add_of_file(
+        problems.add(
             f"the URDF could not be used: the links {names} hang from each other in a cycle",
             "",
             "a tree",
@@ -309,6 +256,52 @@ def _short(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+@dataclass(frozen=True)
+class Wording:
+    """Nouns for parts of a file, and clauses of remedies, by the format of the file.
+
+    A mechanism YAML with a block ``legcal`` states home, base, platform and legs; without the block
+    they follow from the tree and its drawn pose. MJCF files and URDFs with loops have no place for
+    a block: what they leave open is an option of ``legcal inspect``, which writes one.
+    """
+
+    closures: str = "closed_loop"
+    root: str = "the root of the URDF"
+    home: str = "legcal.home"
+    no_home: str = "legcal.home is not given"
+    state_home: str = "write legcal.home"
+    correct_home: str = "correct legcal.home"
+    state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
+    state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
+    correct_ends: str = "correct legcal.base or legcal.platform"
+
+
+BLOCK = Wording()
+NO_BLOCK = Wording(
+    home="the pose that the file draws",
+    no_home="the file draws no closed pose",
+    state_home="add a block legcal with home",
+    correct_home="add a block legcal with another home",
+    state_readings="add a block legcal with home and home_readings",
+    state_ends="add a block legcal with base, platform and legs",
+    correct_ends="add a block legcal with another base or platform",
+)
+_NAMED_ENDS = (
+    "name the links, with legcal inspect FILE --base LINK --platform LINK --write DIR, and use the "
+    "model in DIR"
+)
+_DRAWING = replace(
+    NO_BLOCK,
+    state_home="draw the machine nearer to closed",
+    correct_home="correct the pose that the file draws",
+    state_readings="draw the machine closed",
+    state_ends=_NAMED_ENDS,
+    correct_ends=_NAMED_ENDS,
+)
+URDF_LOOPS = replace(_DRAWING, closures="<loop_joint> or <constraint>")
+MJCF = replace(_DRAWING, closures="<equality>", root="<worldbody>")
+
+
 UrdfJointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
 LOOP_TAGS = ("loop_joint", "constraint")
@@ -318,14 +311,13 @@ LOOP_TAGS = ("loop_joint", "constraint")
 class UrdfJoint:
     """One joint of a URDF."""
 
-    name: str  # as in the file; ``parent`` and ``child`` are links
-    type: UrdfJointType  # as in the file; ``parent`` and ``child`` are links
-    parent: str  # as in the file; ``parent`` and ``child`` are links
-    child: str  # as in the file; ``parent`` and ``child`` are links
+    name: str
+    type: UrdfJointType
+    parent: str  # link
+    child: str  # link
     T_parent_origin: RigidTransform  # the joint frame in the parent link, at joint value zero [m]
     axis: Array  # (3,) unit axis in the joint frame
     limits: tuple[float, float] | None  # lower and upper limit [rad] or [m]
-    line: int  # line in the file
 
     @property
     def moves(self) -> bool:
@@ -352,6 +344,20 @@ class Urdf:
         """The XML as text."""
         return self.content.decode("utf-8-sig")
 
+    def robot(self) -> etree._Element:
+        """Return the ``<robot>`` element, which may be changed for :meth:`edited`."""
+        return parse_robot(self.path, self.content)
+
+    def edited(self, robot: etree._Element, *, travel_needed: bool = False) -> "Urdf":
+        """Return the tree of a changed ``<robot>``; messages keep their words."""
+        changed = parse_urdf(self.path, written(robot), travel_needed=travel_needed)
+        return replace(changed, wording=self.wording)
+
+
+def written(robot: etree._Element) -> bytes:
+    """Return the file of a ``<robot>``."""
+    return etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+
 
 def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
     """Return the tree of a URDF file."""
@@ -361,10 +367,10 @@ def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
 def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
     """Return the tree of a URDF from its content."""
     robot = parse_robot(path, content)
-    problems = Problems(path)
+    problems = XmlProblems(path)
     for element in robot:
         if element.tag in LOOP_TAGS:
-            problems.add(
+            problems.at(
                 element,
                 f"closes a loop with <{element.tag}>, which is not read beside a mechanism YAML",
                 "write the pair of frames in closed_loop of the mechanism YAML",
@@ -376,7 +382,7 @@ def checked_tree(
     robot: etree._Element,
     path: Path,
     content: bytes,
-    problems: Problems,
+    problems: XmlProblems,
     *,
     travel_needed: bool = True,
 ) -> Urdf:
@@ -391,13 +397,11 @@ def checked_tree(
     ):
         if number > most:
             raise ModelError(
-                Problem(
-                    "the mechanism could not be read",
-                    f"{number} {counted}",
-                    f"at most {most}",
-                    "give one mechanism, with fixed joints where nothing moves",
-                    str(path),
-                )
+                "the mechanism could not be read",
+                f"{number} {counted}",
+                f"at most {most}",
+                "give one mechanism, with fixed joints where nothing moves",
+                path,
             )
     for element in (*links, *joints):
         check_numbers(element, problems)
@@ -421,22 +425,22 @@ def checked_tree(
 
 
 def _joint(
-    element: etree._Element, origin: RigidTransform, problems: Problems, travel_needed: bool
+    element: etree._Element, origin: RigidTransform, problems: XmlProblems, travel_needed: bool
 ) -> UrdfJoint | None:
     """Return a joint, or None after noting its problems."""
     n_before = len(problems)
     for tag in ("parent", "child", "origin", "axis", "limit"):
         if len(element.findall(tag)) > 1:
-            problems.add(element, f"has more than one <{tag}>", "keep one")
+            problems.at(element, f"has more than one <{tag}>", "keep one")
     kind = element.get("type", "")
     if kind not in JOINT_TYPES:
-        problems.add(
+        problems.at(
             element,
             f"has the type '{kind}', needed one of {', '.join(JOINT_TYPES)}",
             "write a spherical or universal joint as revolutes, or cut the loop there ('3d')",
         )
     if element.find("mimic") is not None:
-        problems.add(
+        problems.at(
             element,
             "has <mimic>, which is not followed",
             "close the loop in the mechanism YAML, or make a joint beyond the legs fixed",
@@ -455,7 +459,6 @@ def _joint(
         T_parent_origin=origin,
         axis=axis,
         limits=limits,
-        line=cast("int", element.sourceline),
     )
 
 
@@ -478,18 +481,18 @@ def _vector(
     return np.array(default if numbers is None else numbers)
 
 
-def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
+def _axis(element: etree._Element, kind: str, problems: XmlProblems) -> Array:
     """Return the unit axis; the URDF default is x."""
     part = element.find("axis")
     if part is not None and part.get("xyz") is None and kind not in ("fixed", "floating"):
-        problems.add(element, "has an <axis> without xyz", "write its direction")
+        problems.at(element, "has an <axis> without xyz", "write its direction")
     axis = _vector(part, "xyz", (1.0, 0.0, 0.0))
     norm = float(np.linalg.norm(axis))
     if kind in ("revolute", "continuous", "prismatic", "planar") and norm < 1e-9:
-        problems.add(element, "has a zero axis, needed a direction", "correct <axis xyz>")
+        problems.at(element, "has a zero axis, needed a direction", "correct <axis xyz>")
         return axis
     if kind == "prismatic" and abs(norm - 1.0) > 1e-3:
-        problems.add(
+        problems.at(
             element,
             f"has an axis of length {norm:.6g}, which leaves open how far one unit of the reading "
             "moves it, needed length 1",
@@ -499,7 +502,7 @@ def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
 
 
 def _limits(
-    element: etree._Element, kind: str, problems: Problems, travel_needed: bool
+    element: etree._Element, kind: str, problems: XmlProblems, travel_needed: bool
 ) -> tuple[float, float] | None:
     """Return the limits of a revolute or prismatic joint."""
     if kind not in ("revolute", "prismatic"):
@@ -512,7 +515,7 @@ def _limits(
         "effort", "velocity")  # fmt: skip
     missing = [key for key in needed if limit is None or limit.get(key) is None]
     if missing or limit is None:
-        problems.add(
+        problems.at(
             element,
             f"lacks {', '.join(missing)} in its <limit>",
             "give the travel of the joint" if kind == "prismatic" else "give its limits",
@@ -525,9 +528,9 @@ def _limits(
         return None
     lower, upper = bounds[0][0], bounds[1][0]
     if lower > upper:
-        problems.add(element, f"has the limits {lower:g} to {upper:g}", "give the lower one first")
+        problems.at(element, f"has the limits {lower:g} to {upper:g}", "give the lower one first")
     elif kind == "prismatic" and lower == upper:
-        problems.add(
+        problems.at(
             element,
             f"has the limits {lower:g} to {upper:g}, which leave it no travel",
             "write the travel of its motor as lower and upper [m]",

@@ -221,7 +221,7 @@ def location_table(location: Location, written: Sequence[str]) -> Report:
             *(f"Note: {note}" for note in location.notes),
             _noise_line(location),
             *(
-                f"Row {row.row} was left out: {row.reason}."
+                f"Row {row.row} was left out: {row.left_out}."
                 for row in location.rows
                 if not row.used
             ),

@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from legcal.calibration.camera_calibration.adjustment import MIN_CORNERS
+from legcal.calibration.camera_calibration.consensus import MIN_CORNERS
 from legcal.calibration.camera_calibration.diagnostics import (
     MIN_IMAGES,
     coverage,
@@ -23,12 +23,13 @@ from legcal.calibration.camera_calibration.diagnostics import (
 )
 from legcal.calibration.camera_calibration.document import (
     CAMERA_FILE,
+    PICTURE_FILE,
     CameraCalibration,
     ImageResult,
     write_camera,
+    write_picture,
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
-from legcal.calibration.camera_calibration.picture import PICTURE_FILE, write_picture
 from legcal.data.measurements import few
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes

@@ -1,18 +1,18 @@
-"""The largest group of images of a board that agree on a camera, and the faults of the others.
+"""A camera fitted to the images of a board that agree on it, and the faults of the others.
 
 A single image hardly determines a camera. It contradicts a group of images by its score and
 information (``Clusters``): along all parameters of camera and sheet together, along the focal
 length, the principal point, and the sheet. The group starts as the half of the images with the
 least total cost (least trimmed squares from many random starts, on quadratic costs), grows by all
 images that do not contradict it, and is fitted again until it is stable. Images with a common
-fault, such as a third of them at another zoom, cannot move it.
+fault, such as a third of them at another zoom, cannot move it. Single corners that disagree are
+left out afterwards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ from legcal.estimation.clusters import Clusters
 from legcal.estimation.solver import COST_TOLERANCE
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.board_adjustment import (
-    LOSS,
     SHEET,
     AdjustedBoard,
     BoardImages,
@@ -42,17 +41,25 @@ _ROUNDS = 8
 _FIRST_RATIO = 3.0  # scatter of all images, relative to that of the half with the least cost
 _CLEAR = 0.6  # share of the images in a group that ends the search
 _MORE_STARTS = 4  # fits of random images if the first fit has no clear group
-_EXPLAINED = 0.6  # smallest share of the excess cost that a fault has to explain
+_EXPLAINED = 0.9  # smallest share of the excess cost that a fault has to explain
 _NEGLIGIBLE = 1e-3  # tolerance of the fits, relative to the excess cost
-_ALMOST = 0.9  # explained share of a simpler fault that is preferred, relative to the best
-_ALIKE = 0.2  # largest relative difference of two changes that are equal
-_PAIR = 2  # images with a common change by chance
+_ALIKE = 0.2  # largest relative difference of the changes of both focal lengths by a zoom
 _TWO = 0.85  # smallest share of scatter between two clusters (0.64 for a normal distribution)
 _RIVAL = 4  # smallest size of another group
+_MOST_ROUNDS = 6
+OUTLIER_SIGMAS = 6.0  # smallest residual of an outlier corner, in standard deviations
+_OUTLIER_IMAGE = 4.0  # smallest scatter of an outlier image, relative to the median image
+_MIN_OUTLIER_PX = 0.5  # smallest scatter of an outlier image [px]
+MIN_CORNERS = 6  # smallest number of corners of a used image
+# smallest noise of a corner [px]: errors that neighbours share do not show in residuals
+_MIN_NOISE_PX = 0.015
+_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+_LEAST_SCATTER_PX = 1e-4  # standard deviation of exact corners
+_MIN_INLIERS = 0.6  # smallest share of inlier corners in a used image
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class _Agreement:
     """Images that agree on a camera."""
 
     adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
@@ -60,12 +67,12 @@ class Agreement:
     rival: tuple[int, ...]  # other images that agree among themselves
 
 
-def agreeing_images(
+def _agreeing_images(
     corners: BoardImages,
     size: ImageSize,
     model: DistortionModel,
     first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
-) -> Agreement | None:
+) -> _Agreement | None:
     """Return the largest group of images that agree on a camera; None if no fit succeeds."""
     n = int(corners.image[-1]) + 1
     largest = _largest(corners, size, model, first)
@@ -74,14 +81,14 @@ def agreeing_images(
     adjusted, group = largest
     others = np.flatnonzero(~group)
     if not len(others):
-        return Agreement(adjusted, {}, ())
+        return _Agreement(adjusted, {}, ())
     rival: tuple[int, ...] = ()
     if len(others) >= _RIVAL:
         part, numbers = part_of(corners, np.isin(corners.image, others), n)
         second = _largest(part, size, model)
         if second is not None and np.count_nonzero(second[1]) >= _RIVAL:
             rival = tuple(np.array(numbers)[second[1]].tolist())
-    return Agreement(adjusted, _reasons(adjusted, corners, group), rival)
+    return _Agreement(adjusted, _reasons(adjusted, corners, group), rival)
 
 
 def _largest(
@@ -259,7 +266,6 @@ def _whole_picture(adjusted: AdjustedBoard) -> Array:
 class _Fault:
     """A possible fault of an image."""
 
-    n_unknowns: int
     gain: float  # share of the excess cost of the image that it explains
     # (2,): relative change of both focal lengths, or shift of the principal point [px]
     change: Array
@@ -268,54 +274,34 @@ class _Fault:
 def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) -> dict[int, str]:
     """Return the likeliest fault of each image outside of a group, in words."""
     usual = float(np.median(_costs(adjusted, corners)[group]))
-    candidates: dict[int, dict[str, _Fault]] = {}
-    for i in np.flatnonzero(~group).tolist():
-        faults = _faults(adjusted, corners, i, usual)
-        max_gain = max(fault.gain for fault in faults.values())
-        candidates[i] = {
-            name: fault
-            for name, fault in faults.items()
-            if fault.gain > max(_EXPLAINED, _ALMOST * max_gain)
-        }
-    # The simplest fault wins; among equally simple ones, the most frequent. A change that most
-    # images share does not count as an unknown of each.
-    names = [name for faults in candidates.values() for name in faults]
-    shared = {
-        name: _shared([f[name].change for f in candidates.values() if name in f]) for name in names
+    faults = {i: _faults(adjusted, corners, i, usual) for i in np.flatnonzero(~group).tolist()}
+    candidates = {
+        i: [name for name, fault in of_image.items() if fault.gain > _EXPLAINED]
+        for i, of_image in faults.items()
     }
-
-    def complexity(i: int, name: str) -> tuple[int, int]:
-        fault = candidates[i][name]
-        n_shared = len(fault.change) if _near(fault.change, shared[name]) else 0
-        return fault.n_unknowns - n_shared, -names.count(name)
-
-    best_names = {
-        i: min(faults, key=partial(complexity, i)) for i, faults in candidates.items() if faults
+    # The simplest fault wins; among equally simple ones, the most frequent.
+    every = [name for names in candidates.values() for name in names]
+    likeliest = {
+        i: min(names, key=lambda name: (name in _FREE, -every.count(name)), default="")
+        for i, names in candidates.items()
     }
     reasons = {}
     in_group = corners.px[group[corners.image]]
-    for i in candidates:
-        name = best_names.get(i, "")
+    for i, name in likeliest.items():
         if name in _LIKE_A_LENS and _is_outside(corners.px[corners.image == i], in_group):
             reasons[i] = (
                 "it reaches a part of the image that the others do not, where the lens model may "
                 "not hold; bring the board there in more images"
             )
             continue
-        equal = [candidates[k][name].change for k, other in best_names.items() if other == name]
+        equal = [faults[k][name].change for k, other in likeliest.items() if other == name != ""]
         if name == "zoom":
-            longer = candidates[i][name].change.mean() > 0.0
+            longer = faults[i][name].change.mean() > 0.0
             zooms = [change.mean() for change in equal if (change.mean() > 0.0) == longer]
             reasons[i] = (
                 f"another zoom or focus, with a focal length about "
                 f"{100.0 * abs(np.median(zooms)):.2g} % {'longer' if longer else 'shorter'} than "
                 "in the others"
-            )
-        elif name == "stretch":
-            wider, higher = np.median(equal, axis=0)
-            reasons[i] = (
-                f"its picture is stretched, {100.0 * abs(wider - higher):.2g} % more "
-                f"{'along x' if wider > higher else 'along y'} than those of the others"
             )
         elif name == "shift":
             x, y = np.rint(np.median(equal, axis=0)).astype(np.intp)
@@ -329,7 +315,8 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
             rms = [adjusted.rms_px(mask) for mask in (corners.image == i, group[corners.image])]
             reasons[i] = (
                 f"its corners are {rms[0]:.2f} px off (rms) before the camera of the others, whose "
-                f"own are {rms[1]:.2f} px off"
+                f"own are {rms[1]:.2f} px off: the board is bent differently, camera or board "
+                "moved, or the picture was changed"
             )
     return reasons
 
@@ -341,32 +328,12 @@ def _is_outside(px: Array, others: Array) -> bool:
     return 2 * sum(inside) < len(inside)
 
 
-def _shared(changes: Sequence[Array]) -> Array:
-    """Return the change (2,) of the majority of images; zero without a majority."""
-    middle = np.median(changes, axis=0)
-    alike = sum(_near(change, middle) for change in changes)
-    return np.asarray(middle if alike > max(_PAIR, len(changes) // 2) else np.zeros(2))
-
-
-def _near(change: Array, other: Array) -> bool:
-    """Return whether a change is about equal to another, nonzero one."""
-    return bool(np.linalg.norm(change - other) < _ALIKE * np.linalg.norm(other))
-
-
-_FREE = {
-    "zoom": ("fx", "fy"),
-    "shift": ("cx", "cy"),
-    "lens": ("k1", "k2"),
-    "crop": ("fx", "fy", "cx", "cy"),
-}
-_LIKE_A_LENS = ("", "zoom", "stretch", "lens", "crop")  # faults like those of a wrong lens model
+_FREE = {"zoom": ("fx", "fy"), "shift": ("cx", "cy"), "lens": ("k1", "k2")}
+_LIKE_A_LENS = ("", "zoom", "lens")  # faults like those of a wrong lens model
 _IN_WORDS = {
     "turned": "turned by half a turn after it was taken",
     "mirrored": "mirrored",
-    "crop": "a part of the picture that was cut out and scaled",
     "lens": "another distortion of the lens than in the others, as where a program corrects it",
-    "sheet": "the board is bent differently in it than in the others",
-    "motion": "camera or board moved during the readout of its rows, or stabilisation warped it",
 }
 
 
@@ -382,17 +349,21 @@ def _faults(
     )
     plain = adjust_board(camera, [T], image)
     if plain is None:
-        return {"motion": _Fault(0, 0.0, np.zeros(2))}
+        return {}
     excess = max(plain.cost - 0.5 * usual * max(2 * len(points) - 6, 1), 1e-300)
     tolerance = max(_NEGLIGIBLE * excess, COST_TOLERANCE)
-
-    def fault(
-        n_unknowns: int, variant: AdjustedBoard | None, change: Array | None = None
-    ) -> _Fault:
-        gain = 0.0 if variant is None else (plain.cost - variant.cost) / excess
-        return _Fault(n_unknowns, gain, np.zeros(2) if change is None else change)
-
     faults = {}
+
+    def add(name: str, variant: AdjustedBoard | None) -> None:
+        if variant is None:
+            return
+        change = variant.camera.K[:2, 2] - camera.K[:2, 2]
+        if name == "zoom":
+            change = np.diag(variant.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
+            if abs(change[0] - change[1]) > _ALIKE * abs(change.sum()):
+                return
+        faults[name] = _Fault((plain.cost - variant.cost) / excess, change)
+
     # Undo the rotation or mirroring of the image; corner numbers are those of the mirrored board.
     far = np.array([camera.width - 1.0, camera.height - 1.0])
     for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
@@ -404,39 +375,136 @@ def _faults(
         pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
         px = np.where(side[:2] < 0.0, far - image.px, image.px)
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        faults[name] = fault(0, adjust_board(camera, [pose], back, tolerance=tolerance))
+        add(name, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
-        variant = adjust_board(camera, [T], image, free, tolerance=tolerance)
-        change = np.zeros(2)
-        if variant is not None and name == "shift":
-            change = variant.camera.K[:2, 2] - camera.K[:2, 2]
-        elif variant is not None:
-            change = np.diag(variant.camera.K)[:2] / np.diag(camera.K)[:2] - 1.0
-        is_uniform = abs(change[0] - change[1]) < _ALIKE * abs(change.sum())
-        if name == "crop" and not is_uniform:
-            continue
-        faults["stretch" if name == "zoom" and not is_uniform else name] = fault(
-            len(free), variant, change
-        )
-    bent = adjust_board(camera, [T], image, (), Sheet.flat(corners.points), tolerance=tolerance)
-    faults["sheet"] = fault(4, bent)
-    faults["motion"] = _Fault(6, _gain_of_motion(plain, image) / excess, np.zeros(2))
+        add(name, adjust_board(camera, [T], image, free, tolerance=tolerance))
     return faults
 
 
-def _gain_of_motion(adjusted: AdjustedBoard, corners: BoardImages) -> float:
-    """Return the reduction of the cost of an image by a motion of the board during readout."""
-    T = adjusted.T_camera_board[0]
-    arm = T.rotation.apply(corners.points)
-    _, by_point = adjusted.camera.project_with_derivative(arm + T.translation)
-    by_pose = np.concatenate([np.cross(arm[:, None, :], by_point), by_point], axis=-1)
-    row = corners.px[:, 1] - corners.px[:, 1].mean()
-    J = np.concatenate([by_pose, by_pose * row[:, None, None]], axis=-1)
-    J = J / corners.sigma_px[:, None, None]
-    J = J / np.maximum(np.linalg.norm(J, axis=(0, 1)), 1e-300)
-    r = remaining = adjusted.residual / corners.sigma_px[:, None]
-    for _ in range(_ROUNDS):
-        _, weighted = LOSS.softened(remaining, np.concatenate([J, r[..., None]], axis=-1))
-        rows = weighted.reshape(-1, weighted.shape[-1])
-        remaining = r - J @ np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
-    return LOSS.cost(np.sum(r * r, axis=1)) - LOSS.cost(np.sum(remaining * remaining, axis=1))
+# Corners
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    """A camera fitted to the corners that agree with it."""
+
+    adjusted: AdjustedBoard  # fit to the inlier corners
+    corners: BoardImages  # inlier corners, with their images renumbered
+    images: tuple[int, ...]  # original numbers of these images
+    left_out: dict[int, str]  # outlier images and their disagreement
+    rival: tuple[int, ...]  # outlier images that agree among themselves
+    n_left_out: int  # number of outlier corners in the other images
+    # squared errors over their claims, the larger one of residuals and disagreement of images
+    ratio: float
+    all_covariance: Array  # (k + 4, k + 4): covariance of the intrinsics, then of the sheet
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (k, k) of the intrinsics."""
+        k = len(intrinsic_names(self.adjusted.camera))
+        return self.all_covariance[:k, :k]
+
+    @property
+    def sheet(self) -> Array:
+        """Numbers of the sheet, (4,)."""
+        return np.zeros(len(SHEET)) if self.adjusted.sheet is None else self.adjusted.sheet.numbers
+
+
+def robust_fit(
+    corners: BoardImages,
+    size: ImageSize,
+    model: DistortionModel,
+    first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
+) -> RobustFit | None:
+    """Return the fit of the camera without outliers; None if no adjustment succeeds."""
+    n_images = int(corners.image[-1]) + 1
+    claimed, corners = corners.sigma_px, evened(corners)
+    agreed = _agreeing_images(corners, size, model, first)
+    if agreed is None:
+        return None
+    adjusted, left_out = agreed.adjusted, dict(agreed.left_out)
+    poses = list(adjusted.T_camera_board)
+    is_kept = ~np.isin(corners.image, list(left_out))
+    for _ in range(_MOST_ROUNDS):
+        part, images = part_of(corners, is_kept, n_images)
+        readjusted = readjust(adjusted, [poses[k] for k in images], part)
+        if readjusted is None:
+            break
+        adjusted = readjusted
+        for k, T in zip(images, readjusted.T_camera_board, strict=True):
+            poses[k] = T
+        sigma = _scattered(claimed, is_kept, readjusted.residual)
+        judged = is_kept.copy()
+        judged[is_kept] = (
+            np.linalg.norm(readjusted.residual, axis=1) < OUTLIER_SIGMAS * sigma[is_kept]
+        )
+        left_out |= _outlier_images(readjusted.residual, part, images)
+        judged &= ~np.isin(corners.image, list(left_out))
+        counts = np.bincount(corners.image, minlength=n_images)
+        for k in set(images) - set(left_out):
+            n_kept = int(np.count_nonzero(judged & (corners.image == k)))
+            if n_kept < max(MIN_CORNERS, _MIN_INLIERS * counts[k]):
+                left_out[k] = f"{counts[k] - n_kept} of its {counts[k]} corners disagree"
+        judged &= ~np.isin(corners.image, list(left_out))
+        converged = bool(np.array_equal(judged, is_kept)) and np.allclose(
+            sigma, corners.sigma_px, rtol=0.02
+        )
+        if len(set(corners.image[judged].tolist())) == 0:
+            break
+        is_kept, corners = judged, replace(corners, sigma_px=sigma)
+        if converged:
+            break
+    part, images = part_of(corners, is_kept, n_images)
+    adjusted = readjust(adjusted, [poses[k] for k in images], part) or adjusted
+    others = ~np.isin(corners.image, list(left_out))
+    ratio = max(_scale(adjusted, part, len(images)), adjusted.clusters.ratio())
+    return RobustFit(
+        adjusted,
+        part,
+        images,
+        left_out,
+        agreed.rival,
+        int(np.count_nonzero(~is_kept & others)),
+        ratio,
+        adjusted.clusters.covariance(ratio),
+    )
+
+
+def evened(corners: BoardImages) -> BoardImages:
+    """Return corners of which none claims to be far better than the others."""
+    claimed = corners.sigma_px
+    return replace(corners, sigma_px=np.hypot(claimed, float(np.median(claimed))))
+
+
+def _scattered(claimed: Array, is_kept: BoolArray, residual: Array) -> Array:
+    """Return standard deviations of corners (n,), updated by the robust scatter of residuals [px].
+
+    Excess scatter is added to all in quadrature; claims that are too large are scaled.
+    """
+    share = _TO_SIGMA * float(np.median(np.abs(residual) / claimed[is_kept, None]))
+    if share < 1.0:
+        return np.maximum(share * claimed, _LEAST_SCATTER_PX)
+    scatter, usual = _TO_SIGMA * np.median(np.abs(residual)), np.median(claimed[is_kept])
+    return np.asarray(np.hypot(claimed, np.sqrt(max(scatter**2 - usual**2, 0.0))))
+
+
+def _outlier_images(residual: Array, corners: BoardImages, images: Sequence[int]) -> dict[int, str]:
+    """Return the images with far more scatter than the median image, and a description of it."""
+    scatter = [
+        float(np.sqrt(np.mean(residual[corners.image == i] ** 2))) for i in range(len(images))
+    ]
+    usual = float(np.median(scatter))
+    return {
+        k: f"its corners are {s:.2f} px off (rms), those of the others {usual:.2f} px"
+        for k, s in zip(images, scatter, strict=True)
+        if s > max(_OUTLIER_IMAGE * usual, _MIN_OUTLIER_PX)
+    }
+
+
+def _scale(adjusted: AdjustedBoard, corners: BoardImages, n_images: int) -> float:
+    """Return chi^2 of the corners over its degrees of freedom, with at least the minimum noise."""
+    chi2 = float(np.sum((adjusted.residual / corners.sigma_px[:, None]) ** 2))
+    unknowns = len(adjusted.covariance) + 6 * n_images
+    dof = max(2 * len(corners.px) - unknowns, 1)
+    noise = float(np.sqrt(np.sum(adjusted.residual**2) / dof))
+    return chi2 / dof * max(1.0, _MIN_NOISE_PX / max(noise, 1e-9)) ** 2

@@ -7,14 +7,13 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from scipy.special import fdtrc
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit
+from legcal.calibration.camera_calibration.consensus import RobustFit
 from legcal.data.measurements import few
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.perception.board_adjustment import SHEET, adjust_board
-from legcal.vision.camera import Camera, intrinsic_names
+from legcal.perception.board_adjustment import SHEET
+from legcal.vision.camera import Camera
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
 _MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # relative to the focal length
@@ -23,7 +22,6 @@ _MIN_COVERAGE = 0.5
 _MAX_RIVAL = 2.0 / 3.0  # largest size of the second group of images, relative to the first
 _LARGE_RESIDUAL_PX = 1.0
 _MANY_LEFT_OUT = 0.05  # share of corners left out that is worth a warning
-_OVERFIT = 0.01  # significance level of the gain by more coefficients
 _FOLDED_PX = 0.1
 _MAX_RATIO = 25.0  # largest ratio of squared errors to the scatter of corners
 _MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
@@ -178,7 +176,6 @@ def warnings(fit: RobustFit) -> list[str]:
             "the board moves or bends; switch these off, and lay the board on something flat."
         )
     sentences += _folding(camera)
-    sentences += _overfit(fit)
     rms = fit.adjusted.rms_px()
     if rms > _LARGE_RESIDUAL_PX:
         sentences.append(
@@ -261,27 +258,4 @@ def _folding(camera: Camera) -> list[str]:
     return [
         "The lens model folds back before the corners of the image, where no board was seen: "
         "pixels there cannot be used; bring the board into the corners, or take a simpler --model."
-    ]
-
-
-def _overfit(fit: RobustFit) -> list[str]:
-    """Return a warning if the three further coefficients of the rational model gain nothing."""
-    full = fit.adjusted
-    if full.camera.model != "rational_polynomial":
-        return []
-    simple = [name for name in intrinsic_names(full.camera) if name not in ("k4", "k5", "k6")]
-    zeroed = full.camera.distortion.copy()
-    zeroed[5:] = 0.0
-    start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
-    plain = adjust_board(start, full.T_camera_board, fit.corners, simple, full.sheet)
-    if plain is None:
-        return []
-    dof = 2 * len(fit.corners.px) - len(full.covariance) - 6 * len(fit.images)
-    gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
-    if gain > 0.0 and fdtrc(3, max(dof, 1), gain) < _OVERFIT:
-        return []
-    rms = [adjusted.rms_px() for adjusted in (full, plain)]
-    return [
-        f"The model overfits: with rational_polynomial corners are {rms[0]:.4f} px off (rms), "
-        f"with plumb_bob {rms[1]:.4f} px, which is no better than chance; take --model plumb_bob."
     ]

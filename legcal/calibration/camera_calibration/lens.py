@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, ndtr, stdtr
 
-from legcal.calibration.camera_calibration.adjustment import RobustFit, evened, robust_fit
+from legcal.calibration.camera_calibration.consensus import RobustFit, evened, robust_fit
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import AdjustedBoard, BoardImages, adjust_board

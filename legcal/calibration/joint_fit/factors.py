@@ -31,7 +31,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import LegColumns, LegKind
-from legcal.machine.rods import actuator_index
+from legcal.machine.rods import actuator_index, first_rods
 from legcal.vision.board import LINKS, FixedBoard, Link
 from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
 from legcal.vision.cylinder import EPSILON
@@ -46,7 +46,6 @@ class Observed(NamedTuple):
 
     outlines: ObservedOutlines
     readings: Readings
-    actuator_readings: ActuatorReadings
     axes: ObservedAxes
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
@@ -95,7 +94,6 @@ def observed_arrays(
     return Observed(
         observed,
         observed_readings(measurements, legs),
-        observed_actuator_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
         *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
@@ -466,13 +464,15 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """The n encoder readings of the fit."""
+    """The n encoder readings of the fit, of legs that change their length and of actuators."""
 
-    leg: IntArray  # (n,) indices
+    leg: IntArray  # (n,) indices; for an actuator the first rod on it
+    actuator: IntArray  # (n,) indices; -1 for a leg that changes its length
     pose: IntArray  # (n,) indices
-    sign: Array  # (n,) sign of the reading in the length
-    length: Array  # (n,) sign * q: the leg length without its offset [m]
-    sigma: Array  # (n,) standard deviations [m]
+    sign: Array  # (n,) sign of the reading in the length of the leg, 1 for actuators
+    # (n,) sign * q: the leg length without its offset [m], or the actuator's reading [m or rad]
+    length: Array
+    sigma: Array  # (n,) standard deviations [m or rad]
     by_zero: Array  # (n, n_own_zeros) derivative of residuals by the zeros of some images
     n_legs: int  # of the mechanism
     memory: Memory = field(default_factory=Memory, repr=False)
@@ -481,18 +481,18 @@ class Readings:
         return len(self.leg)
 
     @property
-    def by_scale(self) -> Array:
-        """Derivative (n,) of residuals by the scale of the readings [m]."""
-        return -self.length
+    def reading(self) -> Array:
+        """The readings (n,) [m or rad]."""
+        return self.sign * self.length
 
     def wrong_by(self, rows: Residuals) -> Array:
-        """Return measured minus predicted readings, (n,) [m]."""
+        """Return measured minus predicted readings, (n,) [m or rad]."""
         return -self.sign * rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
-        """Return the leg closures |AB| - sign q - q0, (n, 1) [m], with their derivatives.
+        """Return predicted minus measured readings, (n, 1) [m or rad], with their derivatives.
 
-        Of readings q less the zeros of some images.
+        Of legs, |AB| - sign q - q0; of readings q less the zeros of some images.
         """
         inputs = state.legs, state.platform_pose, state.own_zeros
         rows: Residuals = self.memory.of(lambda: self._rows(state), *inputs)
@@ -501,22 +501,27 @@ class Readings:
     def _rows(self, state: State) -> Residuals:
         arm, end = (table[:, self._end] for table in state.ends_at_poses)
         R_pose = _by_measurement(state.platform_pose.R, self.pose)
-        along = end - state.A.T[:, self.leg]
+        along, of_leg = end - state.A.T[:, self.leg], self.actuator < 0
         length = np.sqrt(np.einsum("in,in->n", along, along))
-        n_q, n_kept = state.platform_pose.q.shape[1], 7 + len(state.own_zeros)
-        slope = np.empty((n_kept, 1, len(self)))
-        np.divide(along, length, out=slope[3:6, 0])
-        slope[:3], slope[6], slope[7:, 0] = -slope[3:6], -1.0, self.by_zero.T
+        q, moving = state.platform_pose.q, np.flatnonzero(~of_leg)
+        n_q, n_kept = q.shape[1], 7 + len(state.own_zeros)
+        slope = np.zeros((n_kept + n_q, 1, len(self)))
+        np.divide(along, length, out=slope[3:6, 0], where=of_leg)
+        slope[:3], slope[6], slope[7:n_kept, 0] = -slope[3:6], -1.0 * of_leg, self.by_zero.T
+        slope[n_kept + self.actuator[moving], 0, moving] = 1.0
 
         def chain(slope: Array) -> tuple[Array, Array]:
             by_length = slope.T
             b, J = by_length[3:6], np.zeros((n_kept + 6 + n_q, *by_length.shape[1:]))
-            J[:3], J[6:n_kept], J[n_kept + 3 : n_kept + 6] = by_length[:3], by_length[6:], b
+            J[:3], J[6:n_kept], J[n_kept + 3 : n_kept + 6] = by_length[:3], by_length[6:n_kept], b
             np.einsum("jin,jqn->iqn", R_pose, b, out=J[3:6])
             J[n_kept : n_kept + 3] = _cross(arm[:, None], b)
+            J[n_kept + 6 :] = by_length[n_kept:]
             return J[:n_kept].T, J[n_kept:].T
 
-        r = length - self.length + self.by_zero @ state.own_zeros - state.lengths[self.leg]
+        predicted = length - state.lengths[self.leg]
+        predicted[moving] = q[self.pose[moving], self.actuator[moving]]
+        r = predicted - self.length + self.by_zero @ state.own_zeros
         return Residuals(r[:, None], slope.T, chain)
 
     @cached_property
@@ -526,89 +531,29 @@ class Readings:
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor; readings do not depend on intrinsics."""
         del keys
-        touches = (("legs", self.leg, slice(0, 7)), _own_zeros(self.by_zero))
+        zeros = np.tile(np.arange(self.by_zero.shape[1], dtype=np.intp), (len(self), 1))
+        touches = (("legs", self.leg, slice(0, 7)), ("own_zeros", zeros, _ONE))
         whitening = 1.0 / self.sigma[:, None, None]
         return Factor("readings", self.rows, touches, len(self), 1, self.pose, whitening)
 
 
 def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
-    """Return the encoder readings of legs with a motor, one for each leg and platform pose.
+    """Return the readings, one for each motor and platform pose.
 
     Images of a pose share the reading of the first row.
     """
-    length = legs.sign * measurements.q_of_poses
-    actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
-    leg, pose = np.nonzero((np.isfinite(length) & actuated).T)
+    on, q = np.array(actuator_index(legs.nominal)), measurements.q_of_poses
+    first = first_rods(legs.nominal)
+    is_read = [leg.kind is LegKind.ACTUATED or j in first for j, leg in enumerate(legs.nominal)]
+    leg, pose = np.nonzero((np.isfinite(q) & is_read).T)
+    sign = np.where(on < 0, legs.sign, 1)[leg].astype(np.float64)
     sigma = measurements.sigma_of(legs.nominal)[leg]
-    sign = legs.sign[leg].astype(np.float64)
-    by_zero = sign[:, None] * _in_own_zeros(measurements, legs, leg, pose)
-    return Readings(leg, pose, sign, length[pose, leg], sigma, by_zero, legs.n_legs)
-
-
-def _in_own_zeros(
-    measurements: Measurements, legs: FittedLegs, leg: IntArray, pose: IntArray
-) -> Array:
-    """Return which readings have a zero of their own, (n, n_own_zeros) zeros and ones."""
     motors = np.array([nominal.motor_label for nominal in legs.nominal], dtype=object)
     own = measurements.own_zeros
     has = [(motors == one.motor)[leg] & one.rows[measurements.first_rows][pose] for one in own]
-    return np.array(has, dtype=np.float64).reshape(len(own), len(leg)).T
-
-
-def _own_zeros(by_zero: Array) -> Touch:
-    """Return that readings depend on the zeros of some images."""
-    n, n_zeros = by_zero.shape
-    return "own_zeros", np.tile(np.arange(n_zeros, dtype=np.intp), (n, 1)), _ONE
-
-
-@dataclass(frozen=True, eq=False)
-class ActuatorReadings:
-    """The n readings of actuators of the fit."""
-
-    actuator: IntArray  # (n,) indices
-    pose: IntArray  # (n,) indices
-    reading: Array  # (n,) [m or rad]
-    sigma: Array  # (n,) standard deviations in the same unit
-    by_zero: Array  # (n, n_own_zeros) derivative of residuals by the zeros of some images
-    leg: IntArray  # (n,) indices of the first rod on each actuator
-
-    def __len__(self) -> int:
-        return len(self.pose)
-
-    @property
-    def by_scale(self) -> Array:
-        """Derivative (n,) of residuals by the scale of the readings [m or rad]."""
-        return -self.reading
-
-    def wrong_by(self, rows: Residuals) -> Array:
-        """Return measured minus predicted readings, (n,) [m or rad]."""
-        return -rows.r[:, 0]
-
-    def rows(self, state: State) -> Residuals:
-        """Return predicted minus measured readings (n, 1) with their derivatives."""
-        q = state.platform_pose.q
-        by_posture = np.zeros((len(self), 1, 6 + q.shape[1]))
-        by_posture[np.arange(len(self)), 0, 6 + self.actuator] = 1.0
-        r = q[self.pose, self.actuator] - self.reading + self.by_zero @ state.own_zeros
-        return Residuals.of(r[:, None], self.by_zero[:, None], by_posture)
-
-    def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor; readings depend on the posture, and on zeros of some images."""
-        del keys
-        whitening, touches = 1.0 / self.sigma[:, None, None], (_own_zeros(self.by_zero),)
-        return Factor("actuator_readings", self.rows, touches, len(self), 1, self.pose, whitening)
-
-
-def observed_actuator_readings(measurements: Measurements, legs: FittedLegs) -> ActuatorReadings:
-    """Return the readings of actuators, one for each actuator and platform pose."""
-    on = actuator_index(legs.nominal)
-    first = [on.index(a) for a in range(legs.n_actuators)]
-    q = measurements.q_of_poses[:, first]
-    actuator, pose = np.nonzero(np.isfinite(q).T)
-    sigma = measurements.sigma_of(legs.nominal)[first]
-    leg = np.array(first, dtype=np.intp)[actuator]
-    by_zero = _in_own_zeros(measurements, legs, leg, pose)
-    return ActuatorReadings(actuator, pose, q[pose, actuator], sigma[actuator], by_zero, leg)
+    by_zero = sign[:, None] * np.array(has, dtype=np.float64).reshape(len(own), len(leg)).T
+    length = sign * q[pose, leg]
+    return Readings(leg, on[leg], pose, sign, length, sigma, by_zero, legs.n_legs)
 
 
 @dataclass(frozen=True, eq=False)

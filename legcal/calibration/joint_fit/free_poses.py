@@ -21,7 +21,6 @@ from legcal.estimation.problem import Frames, GaussianPrior, Linearization, line
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import freedoms, pose_equations
-from legcal.machine.rods import first_rods
 from legcal.machine.solved_poses import solve_poses
 
 _SEED, _N_DRAWS = 1965, 16  # random starts of every pose, besides its present value
@@ -163,19 +162,11 @@ def _with_model_noise(problem: FitProblem, part: float, length: float) -> FitPro
     """Add *part* of the errors of a nominal model to the noise; *length* is a leg's [m]."""
     off_m = part * _MODEL_LENGTH * length
     noise = NoiseModel(1.0, part * _MODEL_PX, part * _MODEL_PX)
-    readings, of_actuators = problem.factor("readings"), problem.factor("actuator_readings")
-    sigma = np.hypot(problem.readings.sigma, off_m)
-    actuator_readings, legs = problem.observed.actuator_readings, problem.legs.nominal
-    reading_error = np.array([legs[j].reading_of(off_m) for j in first_rods(legs)])
-    sigma_of_actuators = np.hypot(
-        actuator_readings.sigma,
-        reading_error[actuator_readings.actuator] if len(actuator_readings) else 0.0,
-    )
-    softened = (
-        replace(readings, whitening=1.0 / sigma[:, None, None]),
-        replace(of_actuators, whitening=1.0 / sigma_of_actuators[:, None, None]),
-    )
-    return problem.weighted(noise).with_parts((), softened)
+    readings, legs = problem.readings, problem.legs.nominal
+    off = [legs[j].reading_of(off_m) for j in readings.leg.tolist()]
+    whitening = 1.0 / np.hypot(readings.sigma, off)[:, None, None]
+    softened = replace(problem.factor("readings"), whitening=whitening)
+    return problem.weighted(noise).with_factors(softened)
 
 
 def _loss_width(problem: FitProblem, linear: Linearization) -> float:

@@ -94,7 +94,7 @@ class Posterior:
         return covariance
 
 
-_READINGS = "readings", "actuator_readings"  # factors
+_READINGS = ("readings",)  # factors
 _ROBUST_STEPS, _MAX_STEPS = 10, 30
 _WIDTH = 3.0  # width of the robust loss, whitened
 _MAX_SIGMA = 0.03  # [rad, mean leg lengths]: largest uncertainty of a usable pose

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.calibration.joint_fit.factors import ActuatorReadings, Readings
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import few
@@ -21,14 +20,13 @@ from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, information, normal_equations
 from legcal.estimation.uncertainty import leverage, score_test
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import BoolArray
 from legcal.machine.redundancy import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 
-_FACTORS = "readings", "actuator_readings"
 _MAX_SHARE_OF_MOTOR = 0.1  # of the readings of a motor that may be outliers by accident
 _MIN_COUNT = 3  # outliers of a motor that are no accident
 _INSEPARABLE = 1e-4  # 1 - rho^2 of tests of errors that cannot be separated
-_NO_INFORMATION = 1e-12  # floor of the information on a scale
+_NO_INFORMATION = 1e-12  # floor of the information on an error
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squared residuals
 
 
@@ -69,20 +67,15 @@ def with_inflated_reading_noise(problem: FitProblem) -> FitProblem:
     """Inflate the noise of redundant readings and put them under the robust loss."""
     if not problem.legs.is_redundant:
         return problem
-    rough = []
-    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
-        factor = problem.factor(name)
-        least = np.array([problem.legs.nominal[j].reading_of(ROUGH_READING) for j in readings.leg])
-        used = np.asarray(factor.whitening)[:, 0, 0] > 0.0
-        weight = used / np.maximum(readings.sigma, least)
-        rough.append(replace(factor, whitening=weight[:, None, None], robust=True))
-    return problem.with_factors(*rough)
+    factor, readings = problem.factor("readings"), problem.readings
+    least = [problem.legs.nominal[j].reading_of(ROUGH_READING) for j in readings.leg.tolist()]
+    weight = _used(problem) / np.maximum(readings.sigma, least)
+    return problem.with_factors(replace(factor, whitening=weight[:, None, None], robust=True))
 
 
 def with_rejected_readings_of(problem: FitProblem, other: FitProblem) -> FitProblem:
     """Reject the readings that another problem rejects."""
-    used = [_used(problem, name) & _used(other, name) for name in _FACTORS]
-    return _using(problem, problem, used)
+    return _using(problem, problem, _used(problem) & _used(other))
 
 
 def reject_outlier_readings(problem: FitProblem, state: State) -> tuple[FitProblem, bool]:
@@ -94,13 +87,12 @@ def reject_outlier_readings(problem: FitProblem, state: State) -> tuple[FitProbl
     linear = linearize(problem, state)
     normal = information(problem, state, linear, problem.loss)
     tests = _tests(problem, linear, normal)
-    factor, index = _factor_and_index(problem)
-    used = [_used(problem, name) for name in _FACTORS]
-    is_changed = False
+    used, is_changed = _used(problem), False
+    index = np.flatnonzero(used)
     for pose in np.unique(tests.pose).tolist():
         suspects = _suspects_of_pose(problem, state, linear, tests, pose)
         if len(suspects) == 1 or (suspects and not _has_other_measurements(problem, pose)):
-            used[int(factor[suspects[0]])][index[suspects[0]]] = False
+            used[index[suspects[0]]] = False
             is_changed = True
     return (_using(problem, problem, used) if is_changed else problem), is_changed
 
@@ -113,17 +105,15 @@ def restore_inlier_readings(
     They were rejected when the model was still wrong. *complete* is the problem with all readings.
     The whitened residual of a rejected reading has the variance 1 + C, C that of its prediction.
     """
-    restored = problem.with_factors(*map(complete.factor, _FACTORS))
+    restored = problem.with_factors(complete.factor("readings"))
     linear = linearize(problem, state)
     normal = information(problem, state, linear, problem.loss)
     limit = problem.settings.rejection * _tests(problem, linear, normal).scale
-    linear, used, is_changed = linearize(restored, state), list[BoolArray](), False
-    for name in _FACTORS:
-        predicted = leverage(restored, linear, normal, name)[:, 0, 0]
-        agrees = linear[name].r[:, 0] ** 2 <= limit**2 * (1.0 + predicted)
-        restored_now = agrees & _used(complete, name) & ~_used(problem, name)
-        used.append(_used(problem, name) | restored_now)
-        is_changed |= bool(restored_now.any())
+    linear = linearize(restored, state)
+    predicted = leverage(restored, linear, normal, "readings")[:, 0, 0]
+    agrees = linear["readings"].r[:, 0] ** 2 <= limit**2 * (1.0 + predicted)
+    restored_now = agrees & _used(complete) & ~_used(problem)
+    used, is_changed = _used(problem) | restored_now, bool(restored_now.any())
     return (_using(problem, complete, used) if is_changed else problem), is_changed
 
 
@@ -137,33 +127,29 @@ def judged_readings(
     if not problem.legs.is_redundant:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
-    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
-        error = readings.wrong_by(problem.factor(name).rows(state))
-        for k in np.flatnonzero(~_used(problem, name)).tolist():
-            leg, pose = int(readings.leg[k]), int(readings.pose[k])
-            image, unit = _first_image(problem, pose), legs[leg].reading_unit
-            motor, alike = legs[leg].motor_label, list[str]()
-            if not _has_other_measurements(problem, pose):
-                problem_with = _with_used(problem, name, k)
-                linear_with = linearize(problem_with, state)
-                tests_with = _tests(
-                    problem_with,
-                    linear_with,
-                    information(problem_with, state, linear_with, problem_with.loss),
-                )
-                alike = [
-                    legs[int(tests_with.leg[i])].motor_label
-                    for i in _suspects_of_pose(problem_with, state, linear_with, tests_with, pose)
-                    if tests_with.leg[i] != leg
-                ]
-            wrong.append(
-                WrongReading(leg, pose, motor, *image, float(error[k]), unit, tuple(alike))
+    readings, used = problem.readings, _used(problem)
+    error = readings.wrong_by(problem.factor("readings").rows(state))
+    for k in np.flatnonzero(~used).tolist():
+        leg, pose = int(readings.leg[k]), int(readings.pose[k])
+        image, unit = _first_image(problem, pose), legs[leg].reading_unit
+        motor, alike = legs[leg].motor_label, list[str]()
+        if not _has_other_measurements(problem, pose):
+            problem_with = _with_used(problem, k)
+            linear_with = linearize(problem_with, state)
+            tests_with = _tests(
+                problem_with,
+                linear_with,
+                information(problem_with, state, linear_with, problem_with.loss),
             )
+            alike = [
+                legs[int(tests_with.leg[i])].motor_label
+                for i in _suspects_of_pose(problem_with, state, linear_with, tests_with, pose)
+                if tests_with.leg[i] != leg
+            ]
+        wrong.append(WrongReading(leg, pose, motor, *image, float(error[k]), unit, tuple(alike)))
     tests = _tests(problem, linear, normal)
-    sigma = np.concatenate([readings.sigma for readings in _readings(problem)])
-    used = np.concatenate([_used(problem, name) for name in _FACTORS])
     distance = np.array([1.0 / legs[j].reading_of(1.0) for j in tests.leg.tolist()])
-    displacements = tests.r * sigma[used] * distance
+    displacements = tests.r * readings.sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, displacements))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
     doubts = _doubts(problem, state, linear, tests, wrong)
@@ -232,11 +218,9 @@ def _doubts(
     expected_squares, squares = float(tests.redundancy.sum()), float(np.sum(tests.r**2))
     if squares > expected_squares + _SIGNIFICANT * np.sqrt(2.0 * expected_squares):
         ratio = np.sqrt(squares / max(expected_squares, 1.0))
-        plain = normal_equations(problem, state, linear)
         what = (
             f"the readings of redundant motors contradict each other and the images {ratio:.1f} "
-            f"times as much as their standard deviations allow, "
-            f"{_best_scale(problem, linear, plain)}"
+            "times as much as their standard deviations allow"
         )
         remedy = (
             "check the scale, zero and slip of the motors, or state the standard deviations of "
@@ -262,18 +246,14 @@ def _suspects_of_pose(
     suspects = tests.of_pose(pose, problem.settings.rejection, tests.scale)
     if not suspects:
         return []
-    factor, number = _factor_and_index(problem)
+    index = np.flatnonzero(_used(problem))
     readings_of_pose = [
         suspects[0],
         *(i for i in np.flatnonzero(tests.pose == pose).tolist() if i != suspects[0]),
     ]
-    columns = {
-        name: np.zeros((len(readings), 1, len(readings_of_pose)))
-        for name, readings in zip(_FACTORS, _readings(problem), strict=True)
-        if len(readings)
-    }
-    for c, i in enumerate(readings_of_pose):
-        columns[_FACTORS[int(factor[i])]][number[i], 0, c] = 1.0
+    column = np.zeros((len(problem.readings), 1, len(readings_of_pose)))
+    column[index[readings_of_pose], 0, np.arange(len(readings_of_pose))] = 1.0
+    columns = {"readings": column}
     _, K = score_test(problem, linear, normal_equations(problem, state, linear), columns)
     variance = np.maximum(np.diagonal(K), _NO_INFORMATION)
     unexplained = 1.0 - K[0] ** 2 / (variance[0] * variance)
@@ -291,77 +271,33 @@ def _has_other_measurements(problem: FitProblem, pose: int) -> bool:
     return any(
         bool(np.any(np.asarray(f.whitening)[f.element == pose] != 0.0))
         for f in problem.factors
-        if f.robust and f.name not in _FACTORS and f.element is not None and f.n
+        if f.robust and f.name != "readings" and f.element is not None and f.n
     )
 
 
-def _with_used(problem: FitProblem, name: str, number: int) -> FitProblem:
+def _with_used(problem: FitProblem, number: int) -> FitProblem:
     """Restore a rejected reading."""
-    factor = problem.factor(name)
-    readings = dict(zip(_FACTORS, _readings(problem), strict=True))[name]
+    factor = problem.factor("readings")
     whitening = np.array(factor.whitening)
-    whitening[number] = 1.0 / readings.sigma[number]
+    whitening[number] = 1.0 / problem.readings.sigma[number]
     return problem.with_factors(replace(factor, whitening=whitening))
 
 
-def _best_scale(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> str:
-    """Describe the scale error that explains most of the residuals (Rao's score test)."""
-    legs, columns = problem.legs.nominal, dict[str, Array]()
-    motors = sorted({int(j) for readings in _readings(problem) for j in readings.leg})
-    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
-        if len(readings):
-            of_motor = readings.leg[:, None] == np.array(motors)
-            by_scale = of_motor * readings.by_scale[:, None]
-            columns[name] = np.asarray(problem.factor(name).whitening) @ by_scale[:, None]
-    score, information = score_test(problem, linear, normal, columns)
-    K = np.maximum(np.diagonal(information), _NO_INFORMATION)
-    gain = score**2 / K
-    order = np.argsort(-gain)
-    equal = order[gain[order[0]] - gain[order] <= AS_LIKELY]
-    best = int(order[0])
-    labels = few([legs[motors[i]].motor_label for i in equal.tolist()])
-    if len(equal) > 1:
-        return f"and scale errors of {labels} explain it equally well"
-    return (
-        f"and a scale error of {labels} of {100 * score[best] / K[best]:+.2g} % explains most of it"
-    )
-
-
 def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> ReadingTests:
-    """Test the used readings of both factors."""
-    parts = []
-    for name, readings in zip(_FACTORS, _readings(problem), strict=True):
-        used = np.flatnonzero(_used(problem, name))
-        if not len(readings):
-            continue
-        share = leverage(problem, linear, normal, name)[used, 0, 0]
-        redundancy = np.where(1.0 - share > MIN_REDUNDANCY, 1.0 - share, 0.0)
-        r = linear[name].r[used, 0]
-        parts.append((readings.pose[used], readings.leg[used], r, redundancy))
-    return ReadingTests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    """Test the used readings."""
+    readings, used = problem.readings, np.flatnonzero(_used(problem))
+    share = leverage(problem, linear, normal, "readings")[used, 0, 0]
+    redundancy = np.where(1.0 - share > MIN_REDUNDANCY, 1.0 - share, 0.0)
+    r = linear["readings"].r[used, 0]
+    return ReadingTests(readings.pose[used], readings.leg[used], r, redundancy)
 
 
-def _factor_and_index(problem: FitProblem) -> tuple[IntArray, IntArray]:
-    """Index of the factor, and in the factor, of every used reading."""
-    used = [np.flatnonzero(_used(problem, name)) for name in _FACTORS]
-    of_factor = np.repeat(np.arange(len(used)), [len(indices) for indices in used])
-    return of_factor, np.concatenate(used)
+def _using(problem: FitProblem, complete: FitProblem, used: BoolArray) -> FitProblem:
+    """Use the readings *used*, weighted as in the *complete* problem."""
+    factor = complete.factor("readings")
+    whitening = np.where(used[:, None, None], factor.whitening, 0.0)
+    return problem.with_factors(replace(factor, whitening=whitening))
 
 
-def _using(problem: FitProblem, complete: FitProblem, used: Sequence[BoolArray]) -> FitProblem:
-    """Use the readings *used* by factor, weighted as in the *complete* problem."""
-    factors = [complete.factor(name) for name in _FACTORS]
-    return problem.with_factors(
-        *(
-            replace(factor, whitening=np.where(mask[:, None, None], factor.whitening, 0.0))
-            for factor, mask in zip(factors, used, strict=True)
-        )
-    )
-
-
-def _used(problem: FitProblem, name: str) -> BoolArray:
-    return np.asarray(np.asarray(problem.factor(name).whitening)[:, 0, 0] > 0.0)
-
-
-def _readings(problem: FitProblem) -> tuple[Readings | ActuatorReadings, ...]:
-    return problem.readings, problem.observed.actuator_readings
+def _used(problem: FitProblem) -> BoolArray:
+    return np.asarray(np.asarray(problem.factor("readings").whitening)[:, 0, 0] > 0.0)

@@ -26,7 +26,6 @@ from legcal.calibration.joint_fit.factors import (
     ObservedOutlines,
     Readings,
     measured_lengths,
-    observed_actuator_readings,
     observed_arrays,
     observed_axes,
     observed_corners,
@@ -175,10 +174,9 @@ class FitProblem(EstimationProblem[State]):
         observations = f"{len(self.outlines)} outlines"
         if len(self.axes):
             observations = f"{len(self.axes)} axes" + f", {observations}" * bool(len(self.outlines))
-        n_readings = len(self.readings) + len(self.observed.actuator_readings)
         raise NotIdentifiable(
             f"The fit is not determined: {len(self.images)} images with {observations} and "
-            f"{n_readings} readings give {equations} equations for {self.n_unknowns} "
+            f"{len(self.readings)} readings give {equations} equations for {self.n_unknowns} "
             "unknowns; add images."
         )
 
@@ -203,8 +201,9 @@ class FitProblem(EstimationProblem[State]):
         derivative where a rod is perpendicular to the motion of its joint at A.
         """
         R, t = Frames.of(T_Rb_Re)
-        q, read = readings_of_rods(legs, R, t), self.observed.actuator_readings
-        q[read.pose, read.actuator] = read.reading
+        q, read = readings_of_rods(legs, R, t), self.readings
+        of_actuators = read.actuator >= 0
+        q[read.pose[of_actuators], read.actuator[of_actuators]] = read.reading[of_actuators]
         return Postures(R, t, q)
 
     @property
@@ -213,15 +212,9 @@ class FitProblem(EstimationProblem[State]):
 
         They are s q of actuated legs [m], and q of rods on actuators [m or rad].
         """
-        legs, of_legs, of_actuators = (
-            self.legs.nominal,
-            self.readings,
-            self.observed.actuator_readings,
-        )
-        table = np.full((self.n_elements, len(legs)), np.nan)
-        table[of_legs.pose, of_legs.leg] = of_legs.length
-        table[of_actuators.pose, of_actuators.leg] = of_actuators.reading
-        return table[:, list(reading_legs(legs))]
+        table = np.full((self.n_elements, self.legs.n_legs), np.nan)
+        table[self.readings.pose, self.readings.leg] = self.readings.length
+        return table[:, list(reading_legs(self.legs.nominal))]
 
     def offsets(self, state: State) -> Array:
         """Return the offsets of both ends of outlines from predicted ones, (n, 2) [px]."""
@@ -259,7 +252,6 @@ class FitProblem(EstimationProblem[State]):
         observed = Observed(
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
-            observed_actuator_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
             *observed_corners(None, measurements, ()),
         )

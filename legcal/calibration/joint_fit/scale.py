@@ -31,7 +31,6 @@ from legcal.estimation.uncertainty import residual_changes, response, score_test
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegColumns
 from legcal.machine.parameter_id import ParameterId
-from legcal.machine.rods import actuators_of
 from legcal.vision.board import LINKS
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
@@ -113,19 +112,13 @@ def scale_witnesses(problem: FitProblem) -> list[str]:
 def _witnesses_in_images(problem: FitProblem) -> list[str]:
     """Return the measured lengths that images come with: readings, a board."""
     has_board = any(len(corners) for corners in problem.boards)
-    return [TRAVEL] * bool(_travel(problem)) + [BOARD] * has_board
+    return [TRAVEL] * bool(_travel(problem).any()) + [BOARD] * has_board
 
 
-def _travel(problem: FitProblem) -> dict[str, Array]:
-    """Return the readings of motors by factor, (n,) [m]; zero where they are angles."""
-    actuators = actuators_of(problem.legs.nominal)
-    of_actuators = problem.observed.actuator_readings
-    turns = np.array([a.turns for a in actuators], dtype=np.bool_)[of_actuators.actuator]
-    travel = {
-        "readings": -problem.readings.by_scale,
-        "actuator_readings": np.where(turns, 0.0, of_actuators.reading),
-    }
-    return {name: lengths for name, lengths in travel.items() if lengths.any()}
+def _travel(problem: FitProblem) -> Array:
+    """Return the readings of motors, (n,) [m]; zero where they are angles."""
+    is_angle = np.array([leg.reads_angle for leg in problem.legs.nominal], dtype=np.bool_)
+    return np.where(is_angle[problem.readings.leg], 0.0, problem.readings.length)
 
 
 def stated_lengths(problem: FitProblem) -> dict[str, float]:
@@ -333,12 +326,9 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
         return np.where([name in which for name in names], by_mean, 0.0)
 
     errors = list[_Error]()
-    if travel := _travel(problem):
-        of_factor = {
-            name: -np.asarray(problem.factor(name).whitening)[:, :, 0] * lengths[:, None]
-            for name, lengths in travel.items()
-        }
-        errors.append(_Error(TRAVEL, of_factor, no_prior))
+    if (travel := _travel(problem)).any():
+        whitening = np.asarray(problem.factor("readings").whitening)[:, :, 0]
+        errors.append(_Error(TRAVEL, {"readings": -whitening * travel[:, None]}, no_prior))
     boards = [board_scale(corners.link) for corners in problem.boards if len(corners)]
     if fixed := [name for name in boards if problem.choices.holds(name)]:
         size = np.array([[float(board_scale(link) in fixed)] for link in LINKS])

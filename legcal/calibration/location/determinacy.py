@@ -35,7 +35,6 @@ _PART_TOLERANCE = 0.03  # smallest component of a unit direction that messages n
 _AXIS_TOLERANCE = 0.02  # smallest spread, relative to the largest, of an independent direction
 _RESOLVED = 1e-3  # smallest motion of the tool along a unit direction that holding it fixes
 _N_POSES, _SEED = 30, 1  # random poses of the workspace
-_WEAK = 25.0  # sigma of a poorly determined direction, relative to that of one measured pose
 _BLOCKS: tuple[tuple[slice, LocatedFrame, PoseComponent], ...] = (
     (slice(0, 3), "base", "position"),
     (slice(3, 6), "base", "orientation"),
@@ -54,7 +53,6 @@ class Determinacy:
     covariance: Array
     held: tuple[OpenPart, ...]  # parts that no pose of the machine determines
     words: str  # description of the held parts; "" if everything is determined
-    weak: tuple[str, ...]  # one sentence for each poorly determined part
 
 
 def determine(
@@ -64,7 +62,7 @@ def determine(
     tool_position: Array,
     name: str,  # name of the poses in messages
 ) -> Determinacy:
-    """Split a fit into determined, poorly determined and held parts.
+    """Split a fit into determined and held parts.
 
     Raises NotIdentifiable if other poses of the machine would determine more than these, or if
     holding the tool does not fix all undetermined directions.
@@ -83,9 +81,7 @@ def determine(
     scale = pairs.scale
     unit = _covariance_with(fit.information, basis, oriented=oriented)
     covariance = unit * np.outer(scale, scale)
-    return Determinacy(
-        fit, covariance, tuple(parts), words, _weak(covariance, fit, pairs, oriented=oriented)
-    )
+    return Determinacy(fit, covariance, tuple(parts), words)
 
 
 def hold_open_part(measurements: ToolMeasurements, fit: FrameFit, tool_position: Array) -> FrameFit:
@@ -284,29 +280,6 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
         f"{' and '.join(assumptions)} there, "
         "and the base follows; where the tool is in the world does not depend on it."
     )
-
-
-def _weak(covariance: Array, fit: FrameFit, pairs: PosePairs, *, oriented: bool) -> tuple[str, ...]:
-    """Return one sentence for each poorly determined part of the frames."""
-    position, angle = fit.noise.rms.tolist()
-    position_error = max(position, angle * pairs.length if oriented else 0.0)
-    sentences = []
-    for block, frame, kind in _BLOCKS:
-        values, vectors = np.linalg.eigh(covariance[block, block])
-        sigma = float(np.sqrt(max(values[-1], 0.0)))
-        limit = _WEAK * (position_error if kind == "position" else position_error / pairs.length)
-        if sigma <= limit:
-            continue
-        v = vectors[:, -1] if frame == "tool" else fit.frames[0, :, :3].T @ vectors[:, -1]
-        part = OpenPart(frame=frame, kind=kind, directions=[direction_of(v)])
-        uncertainty = (
-            f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
-        )
-        sentences.append(
-            f"Poorly determined: {part.words}, {uncertainty} (1 sigma); poses that differ more, "
-            "above all in rotations about several axes, would determine it better."
-        )
-    return tuple(sentences)
 
 
 def _is_resolved_by_the_tool(basis: Array) -> bool:

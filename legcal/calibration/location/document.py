@@ -54,11 +54,6 @@ class RowResidual(FileSchema):
         """Whether the row was used in the fit."""
         return not self.left_out
 
-    @property
-    def reason(self) -> str:
-        """The reason for leaving the row out; "" if it was used."""
-        return self.left_out
-
 
 class MeasurementNoise(FileSchema):
     """Standard deviations of the measured poses."""
@@ -74,7 +69,7 @@ class MeasurementNoise(FileSchema):
 
 
 class OpenPart(FileSchema):
-    """An undetermined or poorly determined part of the frames."""
+    """An undetermined part of the frames."""
 
     frame: LocatedFrame
     kind: PoseComponent

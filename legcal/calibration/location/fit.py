@@ -24,10 +24,10 @@ from legcal.calibration.location.frames import (
     frames_after,
     frames_from,
     jacobian,
+    kept_rows,
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.search import kept_rows
 from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
 from legcal.estimation.problem import (
     EstimationProblem,

@@ -18,8 +18,14 @@ from legcal.calibration.location.document import (
     RowResidual,
 )
 from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit, fit_measurements
-from legcal.calibration.location.frames import jacobian, residuals, transforms
-from legcal.calibration.location.search import FrameCandidates, likely_mistake, search
+from legcal.calibration.location.frames import (
+    FrameCandidates,
+    jacobian,
+    likely_mistake,
+    residuals,
+    search,
+    transforms,
+)
 from legcal.calibration.location.tool_poses import (
     MAX_ANGLE_SIGMA,
     MIN_SIGMA,
@@ -46,7 +52,7 @@ _SAME_CHI2 = 30.0  # largest difference in chi2 of two answers that explain the 
 _SAME_COST = 25.0  # largest cost of another answer, relative to the best
 _ROUNDING = 1e-20
 _SAME_FRAMES = 0.02  # largest difference of frames that are the same [rad, machine lengths]
-_MIN_P, _MAX_P = 1e-3, 1.0 - 1e-4  # range of the probability of larger residuals without a remark
+_MIN_P = 1e-3  # least probability of larger residuals without a remark
 _FIXED_TOLERANCE = 2.5e-12  # mean leg lengths, [rad]
 _KINDS = ("positions", "orientations")
 
@@ -116,7 +122,7 @@ def locate(
     tool = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
     determined = determine(used, frame_fit, tool, name)
     _check_unique(used, determined, candidates, tool, name)
-    return _judge(measurements, name, inliers, determined, tool, is_given=tool_position is not None)
+    return _judge(measurements, name, inliers, determined, tool)
 
 
 def _sigmas_of_readings(stated: float | str, machine: Machine) -> dict[str, float]:
@@ -271,12 +277,10 @@ def _judge(
     inliers: Inliers,
     determined: Determinacy,
     held_at: Array,  # (3,): position of the tool in the platform where it is not determined [m]
-    *,
-    is_given: bool,
 ) -> Location:
     """Return the location with its verdict."""
     frame_fit = determined.fit
-    p_value, too_large, too_small = _tested(frame_fit)
+    p_value, too_large = _tested(frame_fit)
     base, tool = transforms(frame_fit.frames)
     if not measurements.is_oriented:
         tool = RigidTransform.from_translation(tool.translation)
@@ -304,29 +308,29 @@ def _judge(
         tool_angle_sigma=tool_angle,
         status=status,
         sentence=_sentence(measurements, determined, left_out, too_large),
-        notes=tuple(_notes(measurements, determined, inliers, too_small, is_given=is_given)),
+        notes=tuple(_notes(measurements, inliers)),
     )
 
 
-def _tested(frame_fit: FrameFit) -> tuple[float | None, str, str]:
-    """Return the probability of larger residuals, and phrases for too large or small scatter."""
+def _tested(frame_fit: FrameFit) -> tuple[float | None, str]:
+    """Return the probability of larger residuals, and a phrase for too large a scatter."""
     noise = frame_fit.noise
     kinds = [k for k in range(2) if noise.stated[k] and frame_fit.kind_dof[k] > 0.5]
     if not kinds:
-        return None, "", ""
+        return None, ""
     squares = (frame_fit.whitened**2).reshape(-1, 2, 3).sum(axis=(0, 2))
     if len(kinds) == 2 or frame_fit.kind_dof.min() <= 0.5:
         total, dof = frame_fit.chi2, float(frame_fit.dof)
     else:
         total, dof = float(squares[kinds[0]]), float(frame_fit.kind_dof[kinds[0]])
     p_value = float(chdtrc(dof, total))
-    large, small = list[str](), list[str]()
-    for k in kinds:
-        ratio = float(np.sqrt(squares[k] / frame_fit.kind_dof[k]))
-        words = f"{_KINDS[k]} scatter {ratio:.2g} times as much as was stated of them"
-        (large if ratio > 1.0 else small).append(words)
-    too_small = " and ".join(small) if p_value > _MAX_P else ""
-    return p_value, " and ".join(large) if p_value < _MIN_P else "", too_small
+    ratios = np.sqrt(squares / np.maximum(frame_fit.kind_dof, 1e-300))
+    large = [
+        f"{_KINDS[k]} scatter {ratios[k]:.2g} times as much as was stated of them"
+        for k in kinds
+        if ratios[k] > 1.0
+    ]
+    return p_value, " and ".join(large) if p_value < _MIN_P else ""
 
 
 def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNoise:
@@ -425,16 +429,9 @@ def _sentence(
     )
 
 
-def _notes(
-    measurements: ToolMeasurements,
-    determined: Determinacy,
-    inliers: Inliers,
-    too_small: str,
-    *,
-    is_given: bool,
-) -> list[str]:
+def _notes(measurements: ToolMeasurements, inliers: Inliers) -> list[str]:
     """Return further remarks."""
-    notes = [*measurements.poses.notes, *determined.weak]
+    notes = list(measurements.poses.notes)
     if measurements.by_model is None:
         notes.append(
             "Nothing is known of the errors of the model, which move all poses at once: the "
@@ -446,8 +443,4 @@ def _notes(
             f"A wrong row among the {measurements.fewest} poses could not have been noticed; "
             "measure more."
         )
-    if too_small:
-        notes.append(f"The stated standard deviations look too large: {too_small}.")
-    if is_given and not determined.held:
-        notes.append("The given position of the tool was not needed: the poses determine it.")
     return notes

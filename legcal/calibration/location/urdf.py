@@ -14,17 +14,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.location.document import Location
 from legcal.errors import ModelError, UsageError
-from legcal.files.folder import existing_parent, temporary_folder
 from legcal.files.schema import is_plain_name
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
 from legcal.machine.urdf import Urdf, UrdfPatch
-
-WORLD = "world"
-TOOL = "tool"
-_TOLERANCE = 2.5e-12  # rounding of the analysis [mean leg lengths]
 
 
 def write_located_model(
@@ -32,8 +26,8 @@ def write_located_model(
     location: Location,
     folder: Path,  # parent of ``models`` and ``urdf``; existing files are not replaced
     *,
-    world: str = WORLD,
-    tool: str = TOOL,
+    world: str = "world",
+    tool: str = "tool",
 ) -> tuple[Path, Path]:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` with the located frames in the URDF.
 
@@ -42,17 +36,11 @@ def write_located_model(
     Raises UsageError if files of these names are there, or the links have another meaning in the
     URDF; ModelError if the URDF does not let a link carry the machine.
     """
-    content = with_frames(machine, location, world=world, tool=tool)
-    located = replace(machine, urdf=replace(machine.urdf, content=content))
-    with temporary_folder(existing_parent(folder / "x"), "located") as temporary:
-        written, _ = write_model(located, temporary)
-        check_same(machine, load_mechanism(written))
-    return write_model(located, folder)
+    content = _with_frames(machine, location, world=world, tool=tool)
+    return write_model(replace(machine, urdf=replace(machine.urdf, content=content)), folder)
 
 
-def with_frames(
-    machine: Machine, location: Location, *, world: str = WORLD, tool: str = TOOL
-) -> bytes:
+def _with_frames(machine: Machine, location: Location, *, world: str, tool: str) -> bytes:
     """Return the URDF of a mechanism with the located frames in it."""
     for name in (world, tool):
         if not is_plain_name(name):
@@ -145,30 +133,3 @@ def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
     while joint in urdf.links or joint in urdf.joints:
         joint += "_"
     return joint
-
-
-def check_same(before: Machine, after: Machine) -> None:
-    """Check that a model with frames is the same machine.
-
-    Raises ModelError if its analysis differs by more than rounding.
-    """
-    is_same = (
-        before.leg_names == after.leg_names
-        and before.motors == after.motors
-        and before.mobility == after.mobility
-        and before.frame_legs == after.frame_legs
-        and all(
-            np.abs(a - b).max() <= _TOLERANCE * before.size
-            for a, b in (
-                (before.A_base, after.A_base),
-                (before.B_platform, after.B_platform),
-                (before.q0, after.q0),
-                (before.home.as_matrix(), after.home.as_matrix()),
-            )
-        )
-    )
-    if not is_same:
-        raise ModelError(
-            f"{before.urdf_path}: the frames could not be written: found another machine after "
-            "it, needed the same one; give other names (--world-link, --tool-link)."
-        )

@@ -1,4 +1,4 @@
-"""``legcal simulate``: a dataset of a machine with known truth."""
+"""Commands on machines whose truth is known: ``simulate``, and ``study`` (section 4.3)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,20 @@ from typing import Annotated
 import typer
 
 from legcal.cli.options import (
+    REPORT,
     ClusterOption,
     JsonOption,
     ModelArgument,
+    PageOfResult,
     QuietOption,
     WorkersOption,
+    chosen_workers,
     image_workers,
+    print_table,
     show,
+    write_page,
 )
+from legcal.processors import processors
 
 
 class _Level(StrEnum):
@@ -126,3 +132,59 @@ def simulate(
         lambda: document,
         lambda: simulation_table(document, to_measure=made.to_measure),
     )
+
+
+study = typer.Typer(
+    help="Validate the method on many simulated machines whose truth is known.",
+    no_args_is_help=True,
+)
+
+
+@study.command()
+def paper(
+    runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of all runs.")] = 0,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="Folder for the runs, the document and the figures. A study that was stopped "
+            "is continued.",
+        ),
+    ] = None,
+    radians: Annotated[
+        bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
+    ] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
+    from legcal.report.study import study_table
+    from legcal.simulation.observe import TableNoise
+    from legcal.simulation.paper import PaperStudy
+    from legcal.simulation.study import StudyResult, run_study
+
+    def make_page(study_result: StudyResult, folder: Path) -> None:
+        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.svg enlarges it."
+        title, figures = "The paper's simulation", {caption: folder / "fig4.png"}
+        write_page(folder / REPORT, title, study_table(study_result.document()), figures=figures)
+
+    noise, page = TableNoise.in_radians() if radians else TableNoise(), PageOfResult(make_page)
+    result = run_study(
+        PaperStudy(noise),
+        runs,
+        seed=seed,
+        workers=chosen_workers(cluster, workers, processors()),
+        output=output,
+        progress=not quiet,
+        beside=page,
+    )
+    page.say()
+    document = result.document()
+    show(as_json, lambda: document, lambda: study_table(document))
+    if output is not None and not as_json:
+        print_table(f"\nRuns, document and figures: {output}")

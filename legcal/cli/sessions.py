@@ -1,0 +1,442 @@
+"""Commands on sessions: camera, plan, photographs and recordings to a dataset, its examination."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from legcal.cli.options import (
+    ClusterOption,
+    DatasetArgument,
+    DatasetOutputOption,
+    ForceOption,
+    HandHeldOption,
+    JsonOption,
+    LengthsOption,
+    ModelArgument,
+    ModelOption,
+    NoiseOption,
+    QuietOption,
+    WorkersOption,
+    as_lines,
+    command_line,
+    image_workers,
+    open_browser,
+    print_json,
+    print_table,
+    show,
+)
+from legcal.errors import UsageError, printable
+from legcal.vision.distortion import CameraProgram, DistortionModel
+
+if TYPE_CHECKING:
+    from legcal.calibration.detection import Detection
+    from legcal.calibration.examination import Examination
+    from legcal.planning.session import Plan
+
+
+def camera(
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="IMAGES...",
+            help="Photographs of the board: files, folders, patterns; with --to a camera file, "
+            "with --compare two.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="The camera file to write."),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SPEC",
+            help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
+            "marker), aprilgrid:6x6:88mm:0.3 (gap as a fraction of a tag), or a YAML file with a "
+            "block board, or a target of Kalibr or Basalt.",
+        ),
+    ] = None,
+    model: Annotated[
+        DistortionModel | None,
+        typer.Option(help="Distortion model; by default chosen by the images."),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A PNG to write: corners and residuals over the field."),
+    ] = None,
+    to: Annotated[
+        CameraProgram | None,
+        typer.Option(help="Convert a camera file of any program into the form of this one."),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare two camera files over the image.")
+    ] = False,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
+    from legcal.calibration.camera_calibration.calibration import calibrate_camera
+    from legcal.calibration.camera_calibration.projection import compare_cameras
+    from legcal.report.images import camera_table, comparison_table
+    from legcal.vision.camera_export import convert_camera
+    from legcal.vision.camera_file import read_camera
+
+    if compare:
+        others = board, output, model, picture, to
+        if len(images) != 2 or any(other is not None for other in others):
+            raise UsageError(
+                "The cameras could not be compared: found other arguments than two camera files, "
+                "needed legcal camera A B --compare; leave out the others."
+            )
+        comparison = compare_cameras(*(read_camera(Path(image)) for image in images))
+        show(as_json, comparison.document, lambda: comparison_table(comparison))
+        return
+    if output is None:
+        raise UsageError(
+            "The camera could not be written: found no --output, needed the file to write; add -o "
+            "camera_info.yaml."
+        )
+    if to is not None:
+        calibrating = board is not None or model is not None or picture is not None
+        if len(images) != 1 or calibrating or as_json:
+            raise UsageError(
+                "The camera could not be converted: found photographs, --board, --model, --picture "
+                "or --json with --to, needed a single camera file; calibrate first, and convert "
+                "the result."
+            )
+        lines = convert_camera(Path(images[0]), to, output)
+        print_table(as_lines(lines))
+        return
+    if board is None:
+        raise UsageError(
+            "The camera could not be calibrated: found no --board, needed the board in the "
+            "photographs; write --board chessboard:9x6:25mm for one of 9 x 6 squares of 25 mm."
+        )
+    calibration = calibrate_camera(
+        images,
+        board,
+        model=model,
+        output=output,
+        picture=picture,
+        progress=not quiet,
+        workers=image_workers(cluster, workers),
+    )
+    show(as_json, calibration.document, lambda: camera_table(calibration, output))
+
+
+def plan(
+    model: ModelArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="SESSION", help="The folder to write.")
+    ],
+    images: Annotated[
+        int | None,
+        typer.Option(help="Total number of photographs (in identify: per view); default 45."),
+    ] = None,
+    images_per_view: Annotated[
+        int | None, typer.Option(help="Photographs of each view, in place of --images.")
+    ] = None,
+    cameras: Annotated[
+        int | None, typer.Option(help="Number of camera positions; default 3.")
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LENGTH",
+            help="Use the fewest photographs expected to reach this platform error, 0.05mm "
+            "(instead of --images).",
+        ),
+    ] = None,
+    noise: NoiseOption = None,
+    bounds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0:X1,Y0:Y1,Z0:Z1",
+            help="Where cameras may stand in the base link: -2m:2m,-2m:2m,0m:1.5m.",
+        ),
+    ] = None,
+    given: Annotated[
+        Path | None,
+        typer.Option(metavar="DATASET", help="Existing dataset to extend."),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SPEC",
+            help="A calibration board on the base in every image, as for legcal camera; the plan "
+            "states its pose.",
+        ),
+    ] = None,
+    hand_held: HandHeldOption = False,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan a session: poses and camera positions that determine a machine best."""
+    from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE
+    from legcal.files.quantity import LENGTH, parse_quantity
+    from legcal.planning import request
+    from legcal.planning.places import parse_bounds
+    from legcal.planning.session import check_session, write_session
+    from legcal.report.plan import plan_files, plan_table
+    from legcal.signals import held_back_signals, is_waiting
+
+    check_session(output)
+    with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
+        session = request.plan(
+            model,
+            images=images,
+            images_per_view=images_per_view,
+            cameras=cameras,
+            target=None if target is None else parse_quantity(target, LENGTH, "--target"),
+            noise=DEFAULT_NOISE if noise is None else noise,
+            bounds=None if bounds is None else parse_bounds(bounds),
+            given=given,
+            board=board,
+            hand_held=hand_held,
+            seed=seed,
+            workers=image_workers(cluster, workers),
+            progress=not quiet,
+            stop=is_waiting,
+        )
+        pictures = plan_files(session, _previews(session), command_line())
+        write_session(session, output, pictures=pictures)
+        if is_waiting() and sys.stderr is not None:
+            text = f"The session was written to {output}, with the best plan found before the stop."
+            sys.stderr.write(f"legcal: {printable(text)}\n")
+    show(as_json, session.document, lambda: plan_table(session, output))
+
+
+def _previews(plan: Plan) -> dict[str, bytes]:
+    """Return a small rendered photograph of each view, by its name."""
+    from legcal.simulation.session import preview
+
+    views = plan.views[:1] if plan.hand_held else plan.views
+    return {
+        view.name: preview(plan.machine, plan.camera, view.T_base_camera, view.poses, plan.board)
+        for view in views
+    }
+
+
+def init(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="The photographs, in it or in one folder for each camera position. It is not "
+            "changed.",
+        ),
+    ],
+    readings: Annotated[
+        Path,
+        typer.Option(
+            "--readings",
+            metavar="FILE",
+            help="A CSV with a column for each encoder; optional columns image, view, pose, time.",
+        ),
+    ],
+    model: ModelOption,
+    output: DatasetOutputOption,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[VIEW=]FILE",
+            help="The camera file of all views, or of one (repeat it); by default camera_info.yaml "
+            "beside the photographs, else a rough one by the focal length in their EXIF data.",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            help="Unit of the readings: m, cm, mm, um; rad, mrad, deg, us for motors that turn; by "
+            "default from the headings, else the unit that puts them in the travel."
+        ),
+    ] = None,
+    lengths: LengthsOption = False,
+    encoder_sigma: Annotated[
+        str | None,
+        typer.Option(
+            help="Sigma of a reading, 2um or 0.5deg; by default the last digit of the table, or "
+            "0.5deg for pulses of servos."
+        ),
+    ] = None,
+    force: ForceOption = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Do not show which reading each image gets.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a dataset from a folder of photographs and a table of readings."""
+    from legcal.data.new_dataset import SheetOptions, plan_new_dataset, write_new_dataset
+    from legcal.report.new_dataset import matching_table, written_lines
+
+    options = SheetOptions(
+        cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
+    )
+    dataset = plan_new_dataset(folder, readings, model, output, options)
+    if not as_json and not quiet:
+        print_table(matching_table(dataset))
+    written = write_new_dataset(dataset, force=force)
+    if as_json:
+        print_json(dataset.document(written))
+    else:
+        print_table(written_lines(output, written, dataset.machine))
+
+
+def import_(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING...",
+            help="A video, a ROS bag (.bag, .mcap, folder) or a folder of images with times for "
+            "each camera position; views are named after them. Of a bag with several cameras the "
+            "topic of one: BAG:/left/image_raw.",
+        ),
+    ],
+    model: ModelOption,
+    output: DatasetOutputOption,
+    camera: Annotated[
+        list[str],
+        typer.Option(
+            metavar="[VIEW=]FILE", help="The camera file of all views, or of one (repeat it)."
+        ),
+    ],
+    readings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--readings",
+            metavar="FILE",
+            help="A CSV with a column time and one for each encoder: for all recordings, or one "
+            "for each in their order; bags may hold joint states instead.",
+        ),
+    ] = None,
+    lengths: LengthsOption = False,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Camera clock minus reading clock; by default estimated from the motion.",
+        ),
+    ] = None,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a dataset from recordings of a machine that rests at each pose."""
+    from legcal.progress import shown_progress
+    from legcal.recordings.importing import import_recordings, plan_import
+    from legcal.report.new_dataset import import_table, written_lines
+
+    with shown_progress(not quiet) as progress:
+        plan = plan_import(
+            sources,
+            model,
+            output,
+            readings=readings or (),
+            cameras=camera,
+            lengths=lengths,
+            offset=offset,
+            progress=progress,
+        )
+    if not as_json:
+        print_table(import_table(plan))
+    with shown_progress(not quiet) as progress:
+        written = import_recordings(plan, force=force, progress=progress)
+    if as_json:
+        print_json(plan.document(written))
+    else:
+        print_table(written_lines(output, written, plan.machine))
+
+
+def doctor(
+    dataset: DatasetArgument,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a dataset for anything that would prevent calibration, including common mistakes.
+
+    Exit 0 if it is ready, 1 for problems, 2 if files cannot be used.
+    """
+    from legcal.calibration import doctor as job
+    from legcal.report.doctor import examination_table
+
+    examination = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
+    show(as_json, examination.document, lambda: examination_table(examination))
+    if not examination.is_ready:
+        raise typer.Exit(1 if examination.is_usable else 2)
+
+
+def detect(
+    dataset: DatasetArgument,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="The folder to write: observations.csv, index.html and every image with its "
+            "outlines.",
+        ),
+    ],
+    edit: Annotated[
+        bool,
+        typer.Option(
+            "--edit",
+            help="Then serve the page to the browser of this machine. It shows the legs projected "
+            "with the cameras estimated from clicked joints; clicks are saved in the dataset.",
+        ),
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The port of --edit; 0 for any that is free.")
+    ] = 0,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run doctor, and show the outlines of the legs over the images for correction.
+
+    Exit 1 if a camera could not be placed or no outline can be used.
+    """
+    from legcal.calibration import doctor as job
+    from legcal.data.dataset import load_dataset
+    from legcal.report.doctor import examination_table
+
+    if edit:
+        from legcal.viewer.address import Address, check_address
+        from legcal.viewer.click_server import HOST
+
+        check_address(Address(HOST, port))
+    examination = job.doctor(
+        load_dataset(dataset, check_clicks=False) if edit else dataset,
+        output=output,
+        progress=not quiet,
+        workers=image_workers(cluster, workers),
+    )
+    show(as_json, examination.document, lambda: examination_table(examination, output))
+    if edit and examination.detection is not None:
+        _serve_clicks(examination, examination.detection, output, port)
+    if any(view.problem for view in examination.views) or not examination.n_used:
+        raise typer.Exit(1)
+
+
+def _serve_clicks(examination: Examination, detection: Detection, folder: Path, port: int) -> None:
+    """Serve the page of a detection until it is interrupted."""
+    from legcal.viewer.click_server import ClickServer
+
+    server = ClickServer(examination, detection, folder, port)
+    typer.echo(f"Click joints at {server.address}; press Ctrl-C to stop.", err=True)
+    open_browser(str(server.address))
+    with suppress(KeyboardInterrupt):  # the way to end it
+        server.run()
