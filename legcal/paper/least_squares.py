@@ -286,7 +286,7 @@ def _solver(problem: LeastSquares) -> ca.Function:
             continue
         place = np.where(term.index < 0, n, term.index)
         local = ca.reshape(unknowns[place.ravel().tolist()], place.shape[1], len(term))
-        values = [*map(_side_by_side, term.observed)]
+        values: list[ca.MX | Array] = [*map(_side_by_side, term.observed)]
         if W.size1():
             values.insert(0, ca.reshape(W, term.n_rows, term.n_rows * len(term)))
         functions = _half_square(term.function, W.size1() > 0, problem.exact_hessian)

@@ -613,8 +613,8 @@ def _figure(summary: PaperSummary, kind: str) -> bytes:
         n_failed = sum(shown.failures.values())
         failed = f" ({n_failed} of {len(shown.scalars) + n_failed} runs failed)" * bool(n_failed)
         axis.set_title(f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed}", fontsize=10)
-        values = shown.errors, means[machine, BOUND].errors, summary.truths[machine]
-        handles = _draw(axis, *(1e3 * x for x in values), labels)
+        limit, truth = 1e3 * means[machine, BOUND].errors, 1e3 * summary.truths[machine]
+        handles = _draw(axis, 1e3 * shown.errors, limit, truth, labels)
         axis.set_ylim(limits)
     first = summary.means[0]
     n_runs = len(first.scalars) + sum(first.failures.values())
