@@ -10,9 +10,10 @@ numbers that are read back from the written lines.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,8 +42,8 @@ from legcal.version import __version__
 
 DIGITS = 7  # decimals of a number [mm, deg]
 ROUNDS, RANK, SETTLED = 30, 1e-7, 1e-9  # of Gauss-Newton steps [mm, deg]
-N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
 STEP = 1e-4  # of differences [mm, deg]
+N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
 UPRIGHT = 0.97  # least cosine of a tower to the vertical
 TURNED = 5.0  # [deg] of all towers from the nominal angles, above which the frame is turned
 _MM = 1e3
@@ -106,13 +107,7 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
         then = _mounted(subject.nominal, firmware)
         nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
         before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
-    figures = {"remaining_mm": figures_of(after)}
-    sentences = [f"{firmware.title} is off by {describe_errors(after)} over the workspace."]
-    if before is not None:
-        figures["nominal_mm"] = figures_of(before)
-        sentences.append(
-            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
-        )
+    sentences, figures = in_words(firmware.title, "over the workspace", after, before)
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
     ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
     ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
@@ -129,12 +124,7 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
         )
     sentences.append(f"To use it, {firmware.after}.")
     text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
-    picture = picture_of(firmware.title, seen.nozzle, after, before)
-    return Rendered(
-        (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
-        tuple(sentences),
-        figures,
-    )
+    return with_picture(text, firmware.title, seen.nozzle, after, before, sentences, figures)
 
 
 def number_text(value: float) -> str:
@@ -381,7 +371,37 @@ def describe_errors(errors: Array) -> str:
     return f"{figures['rms']:.3g} mm rms and {figures['max']:.3g} mm at most"
 
 
-def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
+def in_words(
+    title: str, where: str, after: Array, before: Array | None
+) -> tuple[list[str], dict[str, Any]]:
+    """Return the errors that remain, and with the nominal model: in words, and as figures."""
+    sentences = [f"{title} is off by {describe_errors(after)} {where}."]
+    figures = {"remaining_mm": figures_of(after)}
+    if before is not None:
+        figures["nominal_mm"] = figures_of(before)
+        sentences.append(
+            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
+        )
+    return sentences, figures
+
+
+def with_picture(
+    text: str,
+    title: str,
+    points: Array,  # (..., 3) of the machine [mm]
+    after: Array,  # (..., 3) errors there [mm]
+    before: Array | None,
+    sentences: Sequence[str],
+    figures: dict[str, Any],
+) -> Rendered:
+    """Return a file with the picture of its errors beside it."""
+    flat = (x if x is None else x.reshape(-1, 3) for x in (points, after, before))
+    picture = _picture(title, *flat).encode()
+    files = ExportedFile("", text.encode()), ExportedFile(".svg", picture)
+    return Rendered(files, tuple(sentences), figures)
+
+
+def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
     """Return the errors at poses of the workspace, from above, as SVG."""
     panels = [(f"{title}: what remains", after)]
     if before is not None:

@@ -15,14 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from legcal.exports.correction import poses_at_readings, stacked
 from legcal.exports.firmware import (
-    describe_errors,
-    figures_of,
     hexapod_refusal,
+    in_words,
     least_squares,
     number_text,
-    picture_of,
+    with_picture,
 )
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
+from legcal.exports.subject import ExportOptions, Rendered, Subject, comment
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.configurations import workspace
@@ -57,17 +56,12 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     rig, centre = rig_in(path, text)[:2]
     written = np.array([*(getattr(rig, side) for side in SIDES), rig.Middle, *centre])
     after = places.placed(written)
-    figures = {"remaining_mm": figures_of(after)}
-    sentences = [f"FlyPT Mover is off by {describe_errors(after)} at the joints of the platform."]
     before = None
     if subject.nominal is not None:
         there, reached = poses_at_readings(subject.nominal, readings, poses)
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
         before = places.placed(of_nominal.nearest()[:_N])
-        figures["nominal_mm"] = figures_of(before)
-        sentences.append(
-            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
-        )
+    sentences, figures = in_words("FlyPT Mover", "at the joints of the platform", after, before)
     legs = ", ".join(f"'{comment(machine.leg_names[j])}'" for j in places.order)
     sentences += [
         f"Actuators counterclockwise from the right one of the short side in front: {legs}.",
@@ -77,16 +71,8 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     ]
     head = f"FlyPT Mover rig of {comment(subject.name)}, written by legcal {__version__}."
     comments = "".join(f"# {line}\n" for line in [head, *sentences])
-    picture = picture_of(
-        "FlyPT Mover",
-        places.joints.reshape(-1, 3),
-        after.reshape(-1, 3),
-        None if before is None else before.reshape(-1, 3),
-    )
-    return Rendered(
-        (ExportedFile("", f"{comments}\n{text}".encode()), ExportedFile(".svg", picture.encode())),
-        tuple(sentences),
-        figures,
+    return with_picture(
+        f"{comments}\n{text}", "FlyPT Mover", places.joints, after, before, sentences, figures
     )
 
 

@@ -38,36 +38,11 @@ END_ERRORS = 3  # errors of the end of a leg (13): two of its direction, one of 
 
 @cache
 def joint_on_axis() -> ca.Function:
-    """Return (6) and (6'): (A_1, A_2, A_3; alpha, beta; b, u, M, E) -> (M - A) x u (2,) [m].
-
-    The joint is at A = b_1 A_1 + b_2 A_2 + b_3 A_3, the numbers b being functions of its reading:
-    1, 0, 0 for a fixed joint, 1, q, 0 on a carriage, 1, cos q, sin q on an arm.
-    """
-    local, error, b = ca.SX.sym("local", 9), ca.SX.sym("error", 4), ca.SX.sym("b", 3)
-    u, M, E = ca.SX.sym("u", 3), ca.SX.sym("M", 3), ca.SX.sym("E", 2, 3)
-    A = ca.reshape(local, 3, 3) @ b
+    """Return (6): (A; alpha, beta; u, M, E) -> (M - A) x u (2,) [m]."""
+    A, error, M = ca.SX.sym("A", 3), ca.SX.sym("error", 4), ca.SX.sym("M", 3)
+    u, E = _direction()
     residual = ca.cross(M + E.T @ error[2:] - A, u + E.T @ error[:2])
-    return ca.Function("joint_on_axis", [local, error, b, u, M, E], [E @ residual])
-
-
-@cache
-def joint_of_motion(*, turns: bool) -> ca.Function:
-    """Return the joint from the solution of (6'): (A_1..A_n; -) -> (A, w, c) (9,).
-
-    A is the joint at reading 0, w the unit axis of the actuator and c a point of it. On a carriage
-    A_1 + q A_2 is the joint; on an arm A_1 + cos q A_2 + sin q A_3, where A_2 and A_3 are replaced
-    by the nearest vectors that are orthogonal and of equal length.
-    """
-    n = 3 if turns else 2
-    local = ca.SX.sym("local", 3 * n)
-    centre, x, *more = ca.vertsplit(local, 3)
-    w, A = x / ca.norm_2(x), centre
-    if turns:
-        normal = ca.cross(x, more[0])
-        w = normal / ca.norm_2(normal)
-        A = centre + 0.5 * (x + ca.cross(more[0], w))
-    joint = ca.vertcat(A, w, centre)
-    return ca.Function("joint_of_motion", [local, ca.SX.sym("error", 0)], [joint])
+    return ca.Function("joint_on_axis", [A, error, u, M, E], [E @ residual])
 
 
 @cache
@@ -86,71 +61,58 @@ def leg_across_axis() -> ca.Function:
 
 @dataclass(frozen=True)
 class LegInView:
-    """A leg in a view, and its vectors in V (8), (8')."""
+    """A leg in a view, and its vectors in V (8)."""
 
-    places: tuple[int, ...]  # of A (3), turns of v, of w and displacements of c among the unknowns
+    places: tuple[int, ...]  # of A (3) and the turns of v among the unknowns
     has_axis: bool  # its revolute axis v is located
-    has_actuator: bool  # the axis w of the actuator of its joint at A is a vector
-    has_arm: bool  # so is the arm to its joint, from the nearest point of w
 
 
 def pairs_of_vectors(legs: Sequence[LegInView]) -> list[tuple[int, int]]:
     """Return the pairs of vectors of V that (9) multiplies: all but squares of unit vectors."""
-    n_units = sum(leg.has_axis + leg.has_actuator for leg in legs)
-    n_others = comb(len(legs), 2) + sum(leg.has_arm for leg in legs)
+    n_units, n_others = sum(leg.has_axis for leg in legs), comb(len(legs), 2)
     pairs = combinations_with_replacement(range(n_others + n_units), 2)
     return [(p, q) for p, q in pairs if p != q or p < n_others]
 
 
 @cache
 def vectors_of_view(legs: tuple[LegInView, ...]) -> ca.Function:
-    """Return (8): (-; errors; A, v, w, c of each leg) -> the vectors of V in a camera, (3 n,).
-
-    Errors are of A, v, w and c, leg by leg; c is a point of the axis w.
-    """
+    """Return (8): (-; errors of A, v of each leg; A, v of each leg) -> the vectors of V."""
     n = len(legs)
     none, error, observed = (
         ca.SX.sym("local", 0),
-        ca.SX.sym("error", 12 * n),
-        ca.SX.sym("seen", 12, n),
+        ca.SX.sym("error", 6 * n),
+        ca.SX.sym("seen", 6, n),
     )
-    shifted = observed + ca.reshape(error, 12, n)
-    of_legs = [tuple(ca.vertsplit(shifted[:, j], 3)) for j in range(n)]
+    shifted = observed + ca.reshape(error, 6, n)
+    of_legs = [(shifted[:3, j], shifted[3:, j]) for j in range(n)]
     return ca.Function("vectors", [none, error, observed], [ca.vertcat(*_vectors(legs, of_legs))])
 
 
 @cache
 def products_in_base(legs: tuple[LegInView, ...], n_unknowns: int) -> ca.Function:
-    """Return (9) and (9') of a view: (unknowns; -; ...) -> V_p . V_q in R_b minus R_c.
+    """Return (9) of a view: (unknowns; -; ...) -> V_p . V_q in R_b minus R_c.
 
-    Observed are, a column a leg, the known coordinates of A, the frames of v and of w and points of
-    w; then the products of :func:`pairs_of_vectors` in the camera, and the units of residuals.
+    Observed are, a column a leg, the known coordinates of A and the frames of v; then the products
+    of :func:`pairs_of_vectors` in the camera, and the units of residuals.
     """
     n, pairs = len(legs), pairs_of_vectors(legs)
     x, error, products, unit = (ca.SX.sym("x", m) for m in (n_unknowns, 0, len(pairs), len(pairs)))
-    observed = [ca.SX.sym(f"o{k}", 3, size * n) for k, size in enumerate((1, 3, 3, 1))]
-    known_A, frames, of_actuators, points = observed
-    padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ...]]()
+    known_A, frames = ca.SX.sym("known", 3, n), ca.SX.sym("frames", 3, 3 * n)
+    padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ca.SX]]()
     for j, leg in enumerate(legs):
-        values, columns = padded[list(leg.places)], slice(3 * j, 3 * j + 3)
-        v = turned_frame(values[3:5], frames[:, columns])[:, 0]
-        w = turned_frame(values[5:7], of_actuators[:, columns])[:, 0]
-        c = points[:, j] + of_actuators[:, columns][:, 1:] @ values[7:9]
-        of_legs.append((values[:3] + known_A[:, j], v, w, c))
+        values = padded[list(leg.places)]
+        v = turned_frame(values[3:5], frames[:, 3 * j : 3 * j + 3])[:, 0]
+        of_legs.append((values[:3] + known_A[:, j], v))
     V = _vectors(legs, of_legs)
     residuals = ca.vertcat(*[ca.dot(V[p], V[q]) for p, q in pairs]) - products
-    return ca.Function("products", [x, error, *observed, products, unit], [residuals / unit])
+    observed = [known_A, frames, products, unit]
+    return ca.Function("products", [x, error, *observed], [residuals / unit])
 
 
-def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ...]]) -> list[ca.SX]:
-    """Return V of (A, v, w, c) of each leg: between joints, arms, then the unit vectors."""
+def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ca.SX]]) -> list[ca.SX]:
+    """Return V of (A, v) of each leg: between joints, then the unit vectors."""
     V = [of_legs[g][0] - of_legs[j][0] for j, g in combinations(range(len(legs)), 2)]
-    for leg, (A, _, w, c) in zip(legs, of_legs, strict=True):
-        if leg.has_arm:
-            V.append(A - c - ca.dot(A - c, w) * w)
-    V += [v for leg, (_, v, _, _) in zip(legs, of_legs, strict=True) if leg.has_axis]
-    V += [w for leg, (_, _, w, _) in zip(legs, of_legs, strict=True) if leg.has_actuator]
-    return V
+    return V + [v for leg, (_, v) in zip(legs, of_legs, strict=True) if leg.has_axis]
 
 
 def leg_end(q0: ca.SX, leg: ca.SX, error: ca.SX) -> ca.SX:

@@ -85,7 +85,7 @@ def locate_platform_joints(
         for name, leg in zip(machine.leg_names, legs, strict=True)
         if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
     ]
-    on_rays = weighted and machine.spatial and not machine.actuators
+    on_rays = weighted and machine.spatial
     if not unposed and not on_rays:
         left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
         return replace(machine, legs=legs), left
@@ -416,7 +416,7 @@ def _build_closure(
             directions.u[rows],
             directions.basis[rows],
             seen_legs.poses.R[seen_legs.poses.pose[rows]],
-            directions.turn[rows] @ base,
+            base,
             platform,
             np.array([float(legs[j].twist or 0.0) for j in leg]),
             np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),

@@ -2,8 +2,7 @@
 
 Every step takes a :class:`NominalMachine` and returns it with its estimates. The unknowns of a
 step are joint centres and lengths [m], two rotations of each axis from the start
-(:func:`~legcal.paper.equations.gibbs_of` the angles), and changes of twists [rad]. Rods on the same
-actuator share its numbers; its gain is not an unknown of the steps.
+(:func:`~legcal.paper.equations.gibbs_of` the angles), and changes of twists [rad].
 
 Weak directions are combinations of the unknowns that an equation hardly determines. Nominal models
 are accurate to some per cent. Directions with less information in an equation keep their nominal
@@ -21,7 +20,6 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.actuator import Actuator, ActuatorColumns
 from legcal.machine.directions import SHOWN, describe_direction
 from legcal.machine.leg import (
     EquationKind,
@@ -46,7 +44,7 @@ from legcal.paper.least_squares import LeastSquares, Term
 _SIGMA_LENGTH = 0.01  # nominal standard deviation of joint centres and lengths [mean leg lengths]
 _SIGMA_AXIS = 0.03  # nominal standard deviation of axes [rad]
 _HELD = 3e-5  # standard deviation of a held direction, in units of these
-_AXES = (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS, ActuatorColumns.AXIS)
+_AXES = (LegColumns.BASE_AXIS, LegColumns.PLATFORM_AXIS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +87,6 @@ class NominalMachine:
         return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
 
     @cached_property
-    def actuators(self) -> dict[int, Actuator]:
-        """The actuators that move joints at A of legs that are rods, by leg."""
-        return {j: leg.actuator for j, leg in enumerate(self.legs) if leg.actuator is not None}
-
-    @cached_property
     def on_platform(self) -> BoolArray:
         """Mask of the legs that are fixed to the platform, (n_legs,)."""
         return np.array([leg.is_fixed_to_platform for leg in self.legs], dtype=np.bool_)
@@ -133,11 +126,10 @@ class Unknowns:
 
     @classmethod
     def of_base(cls, machine: NominalMachine) -> Unknowns:
-        """Return the unknowns of step 2: base joints, revolute axes at the base, and actuators."""
+        """Return the unknowns of step 2: base joints and revolute axes at the base."""
         columns = np.zeros((machine.n_legs, LegColumns.COUNT), dtype=np.bool_)
         columns[:, LegColumns.A] = True
         columns[:, LegColumns.BASE_AXIS] = machine.revolute[:, None]
-        columns[:, ActuatorColumns.AXIS] = columns[:, ActuatorColumns.POINT] = True
         return cls._among(machine, columns)
 
     @classmethod
@@ -206,19 +198,11 @@ class Unknowns:
 
         Zero for legs without an axis.
         """
-        return _frames([leg.base_axis for leg in self.start])
-
-    @cached_property
-    def actuator_frames(self) -> Array:
-        """The same of the axes of actuators."""
-        return _frames([None if leg.actuator is None else leg.actuator.axis for leg in self.start])
-
-    @cached_property
-    def actuator_points(self) -> Array:
-        """The reference points of these axes, (n_legs, 3) [m]."""
-        return np.array(
-            [np.zeros(3) if leg.actuator is None else leg.actuator.point for leg in self.start]
-        )
+        frames = np.zeros((len(self.start), 3, 3))
+        for j, leg in enumerate(self.start):
+            if leg.base_axis is not None:
+                frames[j] = axis_frames(leg.base_axis[None])[0]
+        return frames
 
     def vector(self, legs: Sequence[Leg]) -> Array:
         """Return the unknowns of legs, (n,)."""
@@ -237,14 +221,6 @@ class Unknowns:
             local[:, columns] = angles_of(local[:, columns])
         local[:, LegColumns.TWIST] += [leg.twist or 0.0 for leg in self.start]
         return with_numbers(legs, self.start, local, self.place >= 0)
-
-
-def _frames(axes: Sequence[Array | None]) -> Array:
-    frames = np.zeros((len(axes), 3, 3))
-    for j, axis in enumerate(axes):
-        if axis is not None:
-            frames[j] = axis_frames(axis[None])[0]
-    return frames
 
 
 # Weak directions
