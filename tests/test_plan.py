@@ -446,11 +446,8 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
             legcal.plan(**(of | asked))
 
     away = [Place(RigidTransform.from_translation([0.0, 0.0, 3.0]), "a")]
-    for listed, remedy in (
-        (tripods(a=[0.0, 90.0, 90.0]), "move a nearer"),
-        (tripods(a=[0.0, 0.0, 0.2]), "move a further away"),
-        (away, "0 of 1 camera positions .* point a at the machine"),
-    ):
+    for listed in (tripods(a=[0.0, 90.0, 90.0]), tripods(a=[0.0, 0.0, 0.2]), away):
+        remedy = "0 of 1 camera positions .* point a at the machine, .* near enough .* far enough"
         refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
     refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
