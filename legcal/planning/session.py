@@ -18,11 +18,11 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.closeness import PLAN_NAME, POSES_NAME
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
 from legcal.calibration.quantities import mm_deg
+from legcal.calibration.verdict import PLAN_NAME, POSES_NAME
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
@@ -49,7 +49,7 @@ from legcal.planning.poses import HOME
 from legcal.version import __version__
 from legcal.vision.board_file import board_document
 from legcal.vision.camera import Camera
-from legcal.vision.camera_file import camera_info
+from legcal.vision.camera_export import camera_info
 from legcal.vision.sight import Seen
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.calibration.closeness import PLAN_NAME
+from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.axes import write_axis_table
 from legcal.data.corners import write_corners
 from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME
@@ -52,7 +52,7 @@ from legcal.simulation.session import (
 from legcal.simulation.settings import Level, SimulationSettings, joint_distance
 from legcal.simulation.truth import write_true_model
 from legcal.version import __version__
-from legcal.vision.camera_file import camera_info
+from legcal.vision.camera_export import camera_info
 from legcal.workers import Workers, is_number
 
 

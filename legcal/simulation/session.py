@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.closeness import PLAN_NAME
+from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.corners import Corners
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements, View
