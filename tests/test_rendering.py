@@ -19,8 +19,7 @@ from legcal.data.outlines import Outlines, read_observations
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.simulation.dataset import simulate
-from legcal.simulation.rendering.appearance import Appearance, Light
-from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.rendering.appearance import CAMERAS, Appearance, Light
 from legcal.simulation.rendering.scene import develop, prepare_view
 from legcal.simulation.settings import Level
 from legcal.simulation.solids import (
