@@ -11,8 +11,8 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
+from legcal.data.dataset_file import overrides_of_call
 from legcal.data.measurements import View
-from legcal.data.overrides import overrides_of_call
 from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 511.0], [0.0, 1285.0, 380.0], [0.0, 0.0, 1.0]])

@@ -15,7 +15,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
-from legcal.data.overrides import overrides_of_call
+from legcal.data.dataset_file import overrides_of_call
 from legcal.errors import UsageError
 from legcal.machine.parameters import parametrization_of
 
