@@ -241,6 +241,7 @@ def test_images_choose_the_lens_model() -> None:
     assert residual_px < chosen.validated_px < 1.5 * residual_px
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     "model", ["equidistant", pytest.param("rational_polynomial", marks=pytest.mark.slow)]
 )
@@ -288,7 +289,7 @@ def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     values, names = intrinsic_values(camera), intrinsic_names(camera)
     rng = np.random.default_rng(0)
     off = []
-    for drawn in rng.multivariate_normal(values, fit.covariance, 200):
+    for drawn in rng.multivariate_normal(values, fit.covariance, 80):
         other = with_intrinsics(camera, dict(zip(names, drawn.tolist(), strict=True)))
         comparison = compare_cameras(camera, other)
         assert comparison.sigma_px is not None

@@ -374,6 +374,3 @@ def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
     assert best.values[0] == pytest.approx(1e-4, rel=1e-3)
     assert len(movement.explanations) == 1
     assert {c.what for c in single} >= {f"length of {name}" for name in machine.leg_names}
-
-
-# Rates of the whole check.

@@ -119,7 +119,10 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
             *(_left_handed, "the model appears mirrored", "the outlines appear to be mirrored"),
             marks=pytest.mark.system,
         ),
-        (_renumbered, "the platform joints of the model appear to be numbered", ""),
+        pytest.param(
+            *(_renumbered, "the platform joints of the model appear to be numbered", ""),
+            marks=pytest.mark.system,
+        ),
         (_thick, "the radii of the legs in the model appear to be diameters", ""),
     ],
 )
@@ -143,6 +146,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
 
+@pytest.mark.system
 def test_arms_of_a_delta_that_are_turned_against_its_platform_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -301,6 +305,7 @@ def test_a_diagnosis_names_each_kind_of_mistake_that_images_do_not_tell_from_it(
     assert "or 2 similar mistakes" in told
 
 
+@pytest.mark.system
 def test_a_row_from_which_on_readings_are_late_is_named(
     of_symmetric_machine: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

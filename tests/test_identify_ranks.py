@@ -162,7 +162,7 @@ def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> No
     alone, together = (Analysis(s).full.rank for s in (planned, shared_poses(planned)))
     assert (alone, together) == (3 * (6 + 8) - 3 * (6 + 6), (6 + 3 * 8) - (6 + 3 * 6))
     for seen, most in ((1, 0), (3, 6), (4, 10)):
-        full = report("hexapod", (tuple(range(seen)),), 1).full
+        full = Analysis(planned_session(model("hexapod"), (tuple(range(seen)),), 1)).full
         assert full.rank == most
         assert full.rank + len(full.weak) == full.of
 
@@ -213,7 +213,7 @@ def test_what_does_not_move_the_platform_is_harmless(
     assert not any(direction.harmless for direction in one.full.weak)
 
 
-@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-rpr", "3-upu", "tricept"]))
+@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-upu"]))
 def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str) -> None:
     found = identifiability(model(name))
     assert found.recommendation
@@ -238,9 +238,10 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
         with_board = boards.recommendation[0].platform_sigma
         assert boards.platform_sigma is not None
         assert with_board is not None
-        gain = boards.platform_sigma.dX_m / found.platform_sigma.dX_m  # of the views recommended
-        assert with_board.dX_m / first.platform_sigma.dX_m == pytest.approx(gain, rel=0.1)
-        assert gain < 0.9
+        # The best of several places of a camera, with the board as without.
+        assert first.platform_sigma.dX_m <= found.platform_sigma.dX_m
+        assert with_board.dX_m <= boards.platform_sigma.dX_m
+        assert with_board.dX_m < 0.95 * first.platform_sigma.dX_m
 
 
 def test_remedies_were_tried_and_are_true() -> None:
@@ -251,9 +252,7 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert all(r.enough and r.full_rank == 30 for r in found.remedies)
     assert "take 15 images a view instead of 2" in text
     assert report("hexapod", HALVES).full.rank == 30
-    assert "show legs 1, 2 and 3 together in view 1" in text
-    assert report("hexapod", ((0, 1, 2), HALVES[1]), 2).full.rank == 30
-    assert "add a third camera position (legs 2, 3 and 4)" in text
+    assert "add a camera position (legs 2, 3 and 4)" in text
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
 
 

@@ -196,6 +196,7 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("answered_signals", "drawn_once")
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,

@@ -23,8 +23,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
-from legcal.machine.feasibility import feasible_poses
+from legcal.machine.configurations import feasible_poses, random_configurations
 from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,
@@ -112,7 +111,9 @@ def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> N
     assert machine.mobility == MOBILITY.get(name, machine.mobility)
 
 
-@pytest.mark.parametrize("name", ["7-UPS", "2-RPS + 2-SPS + rod"])
+@pytest.mark.parametrize(
+    "name", ["7-UPS", pytest.param("2-RPS + 2-SPS + rod", marks=pytest.mark.system)]
+)
 def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     legs = fitted_legs(machine)

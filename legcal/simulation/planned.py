@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.closeness import PLAN_NAME
+from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.errors import DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
-from legcal.machine.feasibility import poses_at
+from legcal.machine.configurations import Configurations, poses_at
 from legcal.machine.kinematics import follow_each
 from legcal.machine.model import Machine
 from legcal.planning.places import Setting
