@@ -23,8 +23,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
-from legcal.machine.feasibility import feasible_poses
+from legcal.machine.configurations import feasible_poses, random_configurations
 from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,
