@@ -115,7 +115,7 @@ CASES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("name", "which"), thinned(CASES, [CASES[2], CASES[4]]))
 def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     name: str, which: Callable[[MachineSession, np.random.Generator], BoolArray]
