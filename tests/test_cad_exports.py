@@ -19,8 +19,8 @@ from cad_exports import (
 
 from legcal import load_mechanism, plan
 from legcal.errors import ModelError
+from legcal.machine.cylinders import cylinder_about_z
 from legcal.machine.home import home_of_legs
-from legcal.machine.mesh_cylinders import cylinder_about_z
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
 from legcal.machine.parameters import (

@@ -24,7 +24,7 @@ from legcal.calibration.change_detection import (
     possible_changes,
 )
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array

@@ -31,7 +31,7 @@ from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
@@ -176,7 +176,7 @@ def test_all_problems_of_views_are_refused_at_once() -> None:
     with pytest.raises(UsageError) as refused:
         legcal.identifiability(loaded("hexapod"), views, images=-1)
     assert len(refused.value.problems) == 6
-    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found 2", "'leg1'")
+    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found '2'", "'leg1'")
     assert all(word in problem for word, problem in zip(named, refused.value.problems, strict=True))
 
 

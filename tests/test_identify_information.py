@@ -13,9 +13,7 @@ from thinned import thinned
 from uncertainty import compared
 
 import legcal
-from legcal.calibration.identify.intrinsics import expected_intrinsics
-from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.scale import is_scale_open
+from legcal.calibration.identify.ranks import Analysis, expected_intrinsics, is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.estimation.square_root import compress, eliminate

@@ -252,9 +252,7 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert all(r.enough and r.full_rank == 30 for r in found.remedies)
     assert "take 15 images a view instead of 2" in text
     assert report("hexapod", HALVES).full.rank == 30
-    assert "show legs 1, 2 and 3 together in view 1" in text
-    assert report("hexapod", ((0, 1, 2), HALVES[1]), 2).full.rank == 30
-    assert "add a third camera position (legs 2, 3 and 4)" in text
+    assert "add a camera position (legs 2, 3 and 4)" in text
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
 
 

@@ -18,8 +18,7 @@ from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.gammas import GammaTrials, loses_outlines
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.data.image_causes import image_notes
-from legcal.data.measurements import few
+from legcal.data.measurements import few, image_notes
 from legcal.data.outlines import Outlines, no_outlines, polished_parts, through_cameras
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.calibration.closeness import PLAN_NAME
+from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.axes import write_axis_table
 from legcal.data.corners import write_corners
 from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME
