@@ -20,8 +20,7 @@ from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor, load_dataset
-from legcal.calibration.detection import Detection
-from legcal.calibration.examination import Examination
+from legcal.calibration.detection import Detection, Examination
 from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError

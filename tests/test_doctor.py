@@ -15,8 +15,8 @@ from photograph_files import exif, jpeg, undecodable_png
 from simulated import simulated
 
 from legcal import doctor
+from legcal.calibration.detection import CHECKS, Examination, Finding
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.examination import CHECKS, Examination, Finding
 from legcal.simulation.settings import Level
 
 pytestmark = pytest.mark.usefixtures("without_remedies")

@@ -136,7 +136,6 @@ PUBLIC: dict[str, set[str]] = {
         "doctor",
         "documents",
         "evaluation",
-        "examination",
         "identify.identifiability",
         "identify.report",
         "joint_fit.factors",

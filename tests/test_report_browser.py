@@ -18,8 +18,7 @@ from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
 
 import legcal
-from legcal.calibration.detection import Detection
-from legcal.calibration.examination import Examination
+from legcal.calibration.detection import Detection, Examination
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.motions import pose_distance
 from legcal.viewer.click_server import ClickServer

@@ -1,22 +1,28 @@
-"""Detection of the legs in the images of a dataset, before any fit.
+"""What ``legcal doctor`` and ``legcal detect`` find: the legs in the images, and an examination.
 
-Cameras are placed and outlines measured as in the first stage of :func:`legcal.calibrate`.
+Nothing is fitted: cameras are placed and outlines measured as in the first stage of
+:func:`legcal.calibrate`. An examination has the figures, and findings with remedies.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
+from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import DiagnosisBlock, LeftOut, Overlay, left_out_blocks
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
@@ -24,7 +30,7 @@ from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import few_views, image_notes
+from legcal.data.measurements import few_views, image_notes, row_names
 from legcal.data.outlines import (
     Outlines,
     are_of_arms,
@@ -34,7 +40,8 @@ from legcal.data.outlines import (
     reject_unused_legs,
 )
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, printable
+from legcal.files.schema import Document
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Cylinder
@@ -60,51 +67,35 @@ from legcal.vision.visibility import PredictedLeg
 OVERLAYS, PHOTOGRAPHS = "overlays", "photographs"  # the subfolders of pictures
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # characters not allowed in file names
 _MAX_NAME = 80  # largest length of a file name
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+CHECKS = ("files", "readings", "camera", "photographs", "legs", "parameters", "mistakes")
 
 
 @brief
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Legs detected in the images of a dataset, in the order of the files.
+    """Legs detected in the images of a dataset, in the order of the files."""
 
-    Attributes
-    ----------
-    dataset : Dataset
-        The searched dataset.
-    outlines : Outlines
-        All outlines: detected, given and edited.
-    A_base, B_base : (n_rows, n_legs, 3) array
-        Joint centres at every row as used for the view, in the base link [m].
-    cylinders : sequence, for each leg a sequence of Cylinder
-        Visible parts of the legs, with the radii used in the search.
-    T_base_camera : tuple of RigidTransform or None
-        The camera of every view; None if it is unknown.
-    rows : (n,) array of int
-        The rows that have an image.
-    unplaced : dict
-        Reasons why cameras could not be placed, by name of the view; these cameras keep their
-        expected pose, and only given outlines of their views are included.
-    image_notes : tuple of str
-        Warnings about images, views and radii.
-    leg_notes : tuple of str
-        Remarks on the search for the legs.
-    corners : Corners or None
-        The corners of calibration boards in all images; None without a board.
-    arms : mapping
-        Expected arms with visible cylinders, by the leg that has them as parts.
-    """
-
-    dataset: Dataset
-    outlines: Outlines
+    dataset: Dataset  # the searched dataset
+    outlines: Outlines  # all outlines: detected, given and edited
+    # A_base, B_base: (n_rows, n_legs, 3): joint centres at every row as used for the view, in the
+    # base link [m]
     A_base: Array
     B_base: Array
+    # visible parts of the legs, with the radii used in the search
     cylinders: Sequence[Sequence[Cylinder]]
+    # the camera of every view; None if it is unknown
     T_base_camera: tuple[RigidTransform | None, ...]
-    rows: IntArray
+    rows: IntArray  # (n,): the rows that have an image
+    # reasons why cameras could not be placed, by name of the view; these cameras keep their
+    # expected pose, and only given outlines of their views are included
     unplaced: dict[str, NotPlaced]
-    image_notes: tuple[str, ...]
-    leg_notes: tuple[str, ...]
+    image_notes: tuple[str, ...]  # warnings about images, views and radii
+    leg_notes: tuple[str, ...]  # remarks on the search for the legs
+    # the corners of calibration boards in all images; None without a board
     corners: Corners | None = None
+    # expected arms with visible cylinders, by the leg that has them as parts
     arms: Mapping[int, PlacedArm] = field(default_factory=dict)
 
     @property
@@ -180,16 +171,22 @@ def unique_names(names: Iterable[str]) -> list[str]:
 
 
 def rows_with_image(dataset: Dataset) -> IntArray:
-    """Return the rows that have an image file; refuse a dataset without any."""
+    """Return the rows that have an image file."""
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
-    if dataset.axes is not None or not rows:
+    return np.array(rows, dtype=np.intp)
+
+
+def require_images(dataset: Dataset) -> IntArray:
+    """Return the rows that have an image file; refuse a dataset without any."""
+    rows = rows_with_image(dataset)
+    if dataset.axes is not None or not len(rows):
         content = "a table of axes" if dataset.axes is not None else "no image"
         raise DatasetError(
             f"{dataset.table_path}: the images could not be searched: found {content}, needed "
             "images of the legs; name them in the table of measurements."
         )
-    return np.array(rows, dtype=np.intp)
+    return rows
 
 
 def detected(data: OrderedDataset, images: IntArray) -> Detection:
@@ -333,3 +330,151 @@ def _gamma_notes(data: OrderedDataset) -> list[str]:
         "camera that encodes light lie off by up to half of the blur; write gamma of the views in "
         "dataset.yaml, or let legcal calibrate estimate it."
     ]
+
+
+# The examination
+
+
+class Finding(Document):
+    """A problem or remark about the dataset."""
+
+    check: str  # one of CHECKS
+    severity: Severity  # an error prevents calibration, a warning makes the result worse
+    what: str  # one sentence, with the remedy
+    images: tuple[str, ...] = ()  # affected images
+
+
+class EncoderUse(Document):
+    """The range of the readings of an encoder."""
+
+    column: str
+    unit: Literal["m", "rad"]  # unit of the following values
+    least: float
+    greatest: float
+    travel: tuple[float, float] | None  # None if the model has no limits
+    used: float | None  # share of the travel
+
+
+class ViewCondition(Document):
+    """Condition of the photographs of a view, and the outlines in them.
+
+    Legs are counted in each image in which they are visible: neither outside nor hidden. A leg is
+    found if one of its outlines is used. Fields of outlines are None if none were searched.
+    """
+
+    view: str
+    images: int
+    camera: str  # camera file
+    blur_px: float | None  # median blur of sharp edges; None without any
+    clipped: float | None  # median share of saturated pixels
+    jpeg_quality: int | None  # lowest quality; None for lossless files
+    legs_found: int | None = None  # number in all images
+    legs_visible: int | None = None
+    outlines: int | None = None
+    outlines_used: int | None = None
+    edited: int | None = None
+    contrast: float | None = None  # median of the used outlines [grey levels]
+    length: float | None = None  # median of the used outlines [px]
+    residual: float | None = None  # median of the used outlines [px]
+    rejected: dict[str, int] = Field(default_factory=dict)  # by code of the reason, most first
+    problem: str | None = None  # reason why the camera could not be placed
+
+
+class CheckState(Document):
+    """Summary of a check and the severity of its worst finding."""
+
+    name: str
+    state: Severity | Literal["ok"]
+    found: str
+
+
+class ExaminationDocument(Document):
+    """The output of ``legcal doctor --json`` and ``legcal detect --json``."""
+
+    legcal_doctor: int
+    dataset: str
+    mechanism: str
+    ready: bool
+    usable: bool
+    checks: list[CheckState]
+    findings: list[Finding]
+    encoders: list[EncoderUse]
+    views: list[ViewCondition]
+    images: int
+    outlines: int
+    used: int
+    left_out: list[LeftOut]
+    overlays: list[Overlay]  # files relative to the output folder
+    diagnosis: list[DiagnosisBlock]
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """The result of :func:`legcal.doctor`."""
+
+    dataset: str  # dataset, mechanism: folder of the dataset and name of the machine
+    mechanism: str
+    checks: tuple[CheckState, ...]  # summaries of the checks that could be made
+    findings: tuple[Finding, ...]  # findings, the most severe first
+    encoders: tuple[EncoderUse, ...]  # range of the readings of each encoder
+    views: tuple[ViewCondition, ...]  # condition of the photographs of each view
+    # mistakes that explain contradicting images, the likeliest first
+    diagnosis: tuple[Diagnosis, ...]
+    is_usable: bool  # whether all files can be used
+    # the outlines of the legs in the images; None if the images could not be searched
+    detection: Detection | None = None
+    is_written: bool = False  # whether the outlines were written with pictures and a page
+
+    def count(self, severity: Severity) -> int:
+        """Return the number of findings of a severity."""
+        return sum(finding.severity == severity for finding in self.findings)
+
+    @property
+    def n_used(self) -> int:
+        """Number of usable outlines."""
+        return sum(view.outlines_used or 0 for view in self.views)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there are no errors."""
+        return not self.count("error")
+
+    @property
+    def sentence(self) -> str:
+        """The verdict with the next command."""
+        n_errors, n_warnings = self.count("error"), self.count("warning")
+        warnings = f", {n_warnings} warning{'s' * (n_warnings != 1)}" * (n_warnings > 0)
+        if n_errors:
+            return f"{n_errors} error{'s' * (n_errors != 1)} to fix before calibrating{warnings}."
+        folder = shlex.quote(printable(self.dataset))
+        return f"Ready to calibrate{warnings}: legcal calibrate {folder} -o OUT"
+
+    def document(self) -> dict[str, Any]:
+        """Return the output of ``legcal doctor --json``."""
+        detection, overlays, left_out = self.detection, list[Overlay](), list[LeftOut]()
+        if detection is not None:
+            m = detection.dataset.measurements
+            names, left_out = row_names(m), left_out_blocks(m, detection.left_out)
+            files = detection.overlay_files if self.is_written else {}
+            overlays = [
+                Overlay(view=detection.view_of(row), image=names[row], file=file)
+                for row, file in files.items()
+            ]
+        return ExaminationDocument(
+            legcal_doctor=1,
+            dataset=self.dataset,
+            mechanism=self.mechanism,
+            ready=self.is_ready,
+            usable=self.is_usable,
+            checks=list(self.checks),
+            findings=list(self.findings),
+            encoders=list(self.encoders),
+            views=list(self.views),
+            images=sum(view.images for view in self.views),
+            outlines=sum(view.outlines or 0 for view in self.views),
+            used=self.n_used,
+            left_out=left_out,
+            overlays=overlays,
+            diagnosis=[diagnosis.document() for diagnosis in self.diagnosis],
+        ).document()

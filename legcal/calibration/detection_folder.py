@@ -20,8 +20,14 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.detection import OVERLAYS, PHOTOGRAPHS, Detection, unique_names
-from legcal.calibration.examination import Examination, ViewCondition
+from legcal.calibration.detection import (
+    OVERLAYS,
+    PHOTOGRAPHS,
+    Detection,
+    Examination,
+    ViewCondition,
+    unique_names,
+)
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, ImageReader
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names

@@ -19,9 +19,17 @@ from typing import Any, Literal
 import numpy as np
 
 from legcal.calibration.detection import (
+    CHECKS,
+    SEVERITIES,
+    CheckState,
     Detection,
+    EncoderUse,
+    Examination,
+    Finding,
+    Severity,
+    ViewCondition,
     detected,
-    rows_with_image,
+    require_images,
     unsearched,
     views_to_click,
 )
@@ -32,16 +40,6 @@ from legcal.calibration.detection_folder import (
 )
 from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside
 from legcal.calibration.estimate import unseen_legs
-from legcal.calibration.examination import (
-    CHECKS,
-    SEVERITIES,
-    CheckState,
-    EncoderUse,
-    Examination,
-    Finding,
-    Severity,
-    ViewCondition,
-)
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.ordered_dataset import (
@@ -120,7 +118,7 @@ def doctor(
     writes = output is not None
     dataset = source if isinstance(source, Dataset) else load_dataset(source, check_images=writes)
     if writes:
-        rows_with_image(dataset)
+        require_images(dataset)
     dataset, problems = inspect_files(dataset)
     checklist, choices = _Checklist(dataset, writes), chosen_parameters(dataset, ())
     usable = _look_at_files(checklist, problems)
@@ -190,7 +188,7 @@ def detect(
         if written is not None:
             return written
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    images = rows_with_image(dataset)
+    images = require_images(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         return detected(order_dataset(dataset, pool, report), images)
 

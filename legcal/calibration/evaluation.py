@@ -44,43 +44,28 @@ FIRST_POSES = 10  # poses of the first draw; the only one if the reference reach
 @brief
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The distance of a model from a reference.
+    """The distance of a model from a reference."""
 
-    Attributes
-    ----------
-    displacement : (n_poses,) array
-        Delta X of eq (20) at every pose [m].
-    rotation : (n_poses,) array
-        Delta E of eq (20), the angle of the rotation between both platforms [rad].
-    names, units : tuple of str
-        Names of the parameters, and ``m`` or ``rad``.
-    values, references : (n_parameters,) array
-        The parameters of the model and of the reference. Axes are turns of the reference's axis,
-        so that the reference has zero there.
-    links : dict
-        By ``base`` and ``platform`` the joint centres in the links of the model, with R_b and R_e
-        of both models aligned [m], and the original distance of the frames.
-    n_left_out : int
-        Number of poses of the dataset left out, since one of the models does not reach them.
-    unreached : tuple of UnreachedRow
-        The rows of the dataset with these poses, and the models that do not reach them.
-    redundant_readings : dict or None
-        By ``model`` and ``reference`` the residuals of redundant readings at the compared poses;
-        None without a dataset or without redundant readings.
-    joints_move : bool
-        Whether motors move joints of the base; these are compared at zero readings.
-    """
-
-    displacement: Array
+    displacement: Array  # (n_poses,): Delta X of eq (20) at every pose [m]
+    # (n_poses,): Delta E of eq (20), the angle of the rotation between both platforms [rad]
     rotation: Array
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # names, units: names of the parameters, and ``m`` or ``rad``
     units: tuple[str, ...]
+    # values, references: (n_parameters,): the parameters of the model and of the reference. Axes
+    # are turns of the reference's axis, so that the reference has zero there
     values: Array
     references: Array
+    # by ``base`` and ``platform`` the joint centres in the links of the model, with R_b and R_e of
+    # both models aligned [m], and the original distance of the frames
     links: dict[Link, ComparedLink]
+    # number of poses of the dataset left out, since one of the models does not reach them
     n_left_out: int = 0
+    # the rows of the dataset with these poses, and the models that do not reach them
     unreached: tuple[UnreachedRow, ...] = ()
+    # by ``model`` and ``reference`` the residuals of redundant readings at the compared poses; None
+    # without a dataset or without redundant readings
     redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
+    # whether motors move joints of the base; these are compared at zero readings
     joints_move: bool = False
 
     def document(self) -> dict[str, Any]:

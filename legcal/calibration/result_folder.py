@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.detection import OVERLAYS, Detection
+from legcal.calibration.detection import OVERLAYS, Detection, rows_with_image
 from legcal.calibration.detection_folder import draw_images, is_overlay
 from legcal.calibration.documents import (
     ParameterRow,
@@ -421,8 +421,7 @@ def check_overlays(dataset: Dataset, destination: Path | None) -> None:
     start = f"{dataset.table_path}: the overlays could not be drawn: found"
     if destination is None:
         raise UsageError(f"{start} no output folder, needed one to write them into; give one.")
-    rows = _rows_with_image(dataset)
-    if not rows:
+    if not len(rows_with_image(dataset)):
         raise UsageError(
             f"{start} no photograph, needed those of the outlines; leave the overlays out."
         )
@@ -446,11 +445,6 @@ def earlier_overlays(destination: Path) -> list[Path]:
     ]
 
 
-def _rows_with_image(dataset: Dataset) -> list[int]:
-    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    return [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
-
-
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines, legs and cameras of a fit as a detection."""
     machine, measurements = dataset.machine, dataset.measurements
@@ -468,7 +462,7 @@ def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
         B_base=B[measurements.pose],
         cylinders=cylinders,
         T_base_camera=solution.cameras_in_base(machine.T_base_Rb),
-        rows=np.array(_rows_with_image(dataset), dtype=np.intp),
+        rows=rows_with_image(dataset),
         unplaced={},
         image_notes=(),
         leg_notes=(),

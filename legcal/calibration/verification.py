@@ -63,31 +63,17 @@ PRIOR_SIGMA = 0.009  # [rad, mean leg lengths]; below the limit for directions h
 @brief
 @dataclass(frozen=True, eq=False)
 class Check:
-    """The result of :func:`legcal.check`.
+    """The result of :func:`legcal.check`."""
 
-    Attributes
-    ----------
-    dataset : Dataset
-        The new images; its ``machine`` is the calibrated model of the earlier result.
-    earlier : EarlierResult
-        The tested result.
-    solution : Solution
-        The fit of the new images alone.
-    movement : Movement
-        The test; ``movement.moved`` is its answer.
-    at_platform : MovedPlatform
-        Difference of the platform between new images and earlier result, root mean square over
-        the poses, and its standard deviation if nothing moved.
-    notes : tuple of str
-        Further remarks.
-    """
-
+    # the new images; its ``machine`` is the calibrated model of the earlier result
     dataset: Dataset
-    earlier: EarlierResult
-    solution: Solution
-    movement: Movement
+    earlier: EarlierResult  # the tested result
+    solution: Solution  # the fit of the new images alone
+    movement: Movement  # the test; ``movement.moved`` is its answer
+    # difference of the platform between new images and earlier result, root mean square over the
+    # poses, and its standard deviation if nothing moved
     at_platform: MovedPlatform
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # further remarks
 
     @property
     def sentence(self) -> str:

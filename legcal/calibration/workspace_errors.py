@@ -35,20 +35,15 @@ _CLOSED = 2.5e-6  # largest difference of a point and the pose by its readings [
 
 @dataclass(frozen=True, eq=False)
 class PlatformMap:
-    """Displacements of the platform at places of the workspace.
+    """Displacements of the platform at places of the workspace."""
 
-    Attributes
-    ----------
-    x, y, z : (n_x,), (n_y,), (n_z,) arrays
-        The grid of origins of the platform link in the base link [m].
-    change, sigma : (n_z, n_y, n_x) arrays
-        Change from the nominal to the calibrated model at the same readings, and predicted error of
-        the calibrated model, one standard deviation [m]; NaN out of reach.
-    """
-
+    # x, y, z: (n_x,), (n_y,), (n_z,): the grid of origins of the platform link in the base link [m]
     x: Array
     y: Array
     z: Array
+    # change, sigma: (n_z, n_y, n_x): change from the nominal to the calibrated model at the same
+    # readings, and predicted error of the calibrated model, one standard deviation [m]; NaN out of
+    # reach
     change: Array
     sigma: Array
 

@@ -34,8 +34,7 @@ from legcal.errors import UsageError, printable
 from legcal.vision.distortion import CameraProgram, DistortionModel
 
 if TYPE_CHECKING:
-    from legcal.calibration.detection import Detection
-    from legcal.calibration.examination import Examination
+    from legcal.calibration.detection import Detection, Examination
     from legcal.planning.session import Plan
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from rich.text import Text
 
+from legcal.calibration.detection import Examination
 from legcal.calibration.detection_folder import DETECTION_PAGE, tables_of
-from legcal.calibration.examination import Examination
 from legcal.data.new_dataset import NewDataset
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN

@@ -61,57 +61,28 @@ class BoardImage(Document):
 @brief
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """The result of :func:`legcal.calibrate_camera`.
-
-    Attributes
-    ----------
-    camera : Camera
-        The camera.
-    covariance : (k, k) array
-        Covariance of its intrinsics, in the order of ``names`` [px, and without unit].
-    board : Board
-        The calibration board.
-    images : tuple of BoardImage
-        All images in the given order.
-    rms_px : float
-        Root mean square of the residuals, both coordinates together [px].
-    noise_px : float
-        Scatter of either coordinate of a corner, one standard deviation [px].
-    coverage : float
-        Share of the image inside the convex hull of all corners.
-    warnings : tuple of str
-        Warnings, one sentence each.
-    sheet : (4,) array
-        Bending of the board along x and y and its twist [m], relative excess width of the print.
-    sheet_covariance : (4, 4) array
-        Covariance of ``sheet``.
-    error_ratio : float
-        Ratio of the errors, by residuals or by disagreement of images, to the claimed sigmas.
-    lens : str
-        The lens model, and the reason for choosing it.
-    validated_px : float or None
-        Root mean square of the residuals of held-out images in cross-validation [px]; None with
-        fewer than four images.
-    corners : (n, 4) array
-        Pixels and residuals of the used corners [px].
-    photographs : mapping
-        Metadata of the used image files: distinct values by key of the camera file.
-    """
+    """The result of :func:`legcal.calibrate_camera`."""
 
     camera: Camera
+    # (k, k): covariance of its intrinsics, in the order of ``names`` [px, and without unit]
     covariance: Array
     board: Board
-    images: tuple[BoardImage, ...]
-    rms_px: float
-    noise_px: float
-    coverage: float
-    warnings: tuple[str, ...]
+    images: tuple[BoardImage, ...]  # all images in the given order
+    rms_px: float  # root mean square of the residuals, both coordinates together [px]
+    noise_px: float  # scatter of either coordinate of a corner, one standard deviation [px]
+    coverage: float  # share of the image inside the convex hull of all corners
+    warnings: tuple[str, ...]  # warnings, one sentence each
+    # (4,): bending of the board along x and y and its twist [m], relative excess width of the print
     sheet: Array
-    sheet_covariance: Array
+    sheet_covariance: Array  # (4, 4): covariance of ``sheet``
+    # ratio of the errors, by residuals or by disagreement of images, to the claimed sigmas
     error_ratio: float
-    lens: str
+    lens: str  # the lens model, and the reason for choosing it
+    # root mean square of the residuals of held-out images in cross-validation [px]; None with fewer
+    # than four images
     validated_px: float | None
-    corners: Array
+    corners: Array  # (n, 4): pixels and residuals of the used corners [px]
+    # metadata of the used image files: distinct values by key of the camera file
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
     @property

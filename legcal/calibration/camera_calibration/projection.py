@@ -72,30 +72,16 @@ def _by_turn(rays: Array, by_ray: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class CameraComparison:
-    """The difference of two calibrations of a camera over the image.
+    """The difference of two calibrations of a camera over the image."""
 
-    Attributes
-    ----------
-    pixels : (n, 2) array
-        Places in the image of the first camera.
-    off_px : (n, 2) array
-        Pixels of the second camera less those of the first, after the best turn [px].
-    off : (n,) array
-        The same as a length beside the ray, relative to the distance of a point.
-    sigma_px : (n,) array or None
-        Standard deviation of the difference by the covariances of both; None without these.
-    turn : float
-        Angle of the turn [rad].
-    reached : float
-        Part of the image that is compared: of the rest the first camera has no rays.
-    """
-
-    pixels: Array
+    pixels: Array  # (n, 2): places in the image of the first camera
+    # (n, 2): pixels of the second camera less those of the first, after the best turn [px]
     off_px: Array
-    off: Array
+    off: Array  # (n,): the same as a length beside the ray, relative to the distance of a point
+    # (n,): standard deviation of the difference by the covariances of both; None without these
     sigma_px: Array | None
-    turn: float
-    reached: float
+    turn: float  # angle of the turn [rad]
+    reached: float  # part of the image that is compared: of the rest the first camera has no rays
 
     @property
     def px(self) -> Array:

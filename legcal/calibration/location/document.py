@@ -105,65 +105,36 @@ class OpenPart(FileSchema):
 @brief
 @dataclass(frozen=True, eq=False)
 class Location:
-    """The result of :func:`legcal.locate`.
+    """The result of :func:`legcal.locate`."""
 
-    Attributes
-    ----------
-    model, poses : str
-        The files it comes from.
-    T_world_base : RigidTransform
-        The base link in the world [m].
-    T_platform_tool : RigidTransform
-        The tool in the platform link [m]; its rotation is the identity where the orientation of
-        the tool was not measured.
-    has_tool_orientation : bool
-        Whether the orientation of the tool in the platform is known.
-    covariance : (12, 12) array
-        Covariance of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about
-        world axes and of the tool about platform axes, T_true = (exp r, t + x) applied from the
-        left. Zero along held directions and for an orientation that was not measured.
-    held : tuple of OpenPart
-        The directions that no pose of this machine determines.
-    held_at : tuple of float
-        Position of the tool in the platform, used where it is not determined [m].
-    held_words : str
-        Description of the held directions; "" if everything is determined.
-    noise : MeasurementNoise
-        Standard deviations of the measurement.
-    rows : tuple of RowResidual
-        In the order of the file.
-    chi2, dof, p_value : float, int, float or None
-        Sum of squared residuals in standard deviations, degrees of freedom, and the probability of
-        a larger sum; None if all standard deviations come from the residuals.
-    tool_position_sigma, tool_angle_sigma : float, float or None
-        Standard deviation of the tool pose in the world from both frames at the measured poses,
-        of the vector, rms over the poses [m], [rad].
-    status : {"located", "located in part", "doubtful"}
-        The verdict in a word.
-    sentence : str
-        The verdict.
-    notes : tuple of str
-        Further remarks.
-    """
-
-    model: str
+    model: str  # model, poses: the files it comes from
     poses: str
-    T_world_base: RigidTransform
+    T_world_base: RigidTransform  # the base link in the world [m]
+    # the tool in the platform link [m]; its rotation is the identity where the orientation of the
+    # tool was not measured
     T_platform_tool: RigidTransform
-    has_tool_orientation: bool
+    has_tool_orientation: bool  # whether the orientation of the tool in the platform is known
+    # (12, 12): covariance of ``NAMES``: displacements [m] and rotation vectors [rad] of the base
+    # about world axes and of the tool about platform axes, T_true = (exp r, t + x) applied from the
+    # left. Zero along held directions and for an orientation that was not measured
     covariance: Array
-    held: tuple[OpenPart, ...]
+    held: tuple[OpenPart, ...]  # the directions that no pose of this machine determines
+    # position of the tool in the platform, used where it is not determined [m]
     held_at: tuple[float, float, float]
-    held_words: str
-    noise: MeasurementNoise
-    rows: tuple[RowResidual, ...]
+    held_words: str  # description of the held directions; "" if everything is determined
+    noise: MeasurementNoise  # standard deviations of the measurement
+    rows: tuple[RowResidual, ...]  # in the order of the file
+    # chi2, dof, p_value: sum of squared residuals in standard deviations, degrees of freedom, and
+    # the probability of a larger sum; None if all standard deviations come from the residuals
     chi2: float
     dof: int
     p_value: float | None
+    # tool_position_sigma, tool_angle_sigma: standard deviation of the tool pose in the world from
+    # both frames at the measured poses, of the vector, rms over the poses [m], [rad]
     tool_position_sigma: float
     tool_angle_sigma: float | None
-    status: LocationStatus
-    sentence: str
+    status: LocationStatus  # the verdict in a word
+    sentence: str  # the verdict
     notes: tuple[str, ...]
 
     @property
