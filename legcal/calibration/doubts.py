@@ -288,7 +288,7 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
 
 def _cameras(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
     """Return cameras that the measurements contradict, with what their files do to the platform."""
-    views = solution.camera_doubts.views
+    views = list(dict.fromkeys(wrong.view for wrong in solution.camera_doubts))
     if not views:
         return []
     effects = () if platform is None else platform.effects

@@ -215,6 +215,6 @@ def not_found_again(first: Estimate, again: Estimate) -> list[str]:
     before, outlines = first.outliers, again.solution.outlines
     gone = hardly_shown(outlines, [row for row in before if row not in again.outliers])
     few_found = outlines.used.sum() < MIN_FOUND_AGAIN * first.solution.outlines.used.sum()
-    cameras = first.solution.camera_doubts.notes if few_found else ()
+    cameras = map(str, first.solution.camera_doubts if few_found else ())
     notes = image_notes(first.fitted.measurements, {row: before[row] for row in gone})
     return [*cameras, *notes]

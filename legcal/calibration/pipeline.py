@@ -307,12 +307,9 @@ def _estimate(
         estimate = first if diagnosis else measure_again(data, first, seen, board, options)
     except (NotVisible, NotIdentifiable, DidNotConverge) as error:
         # A fit with a wrong camera may lead away from outlines that were found before it.
-        if not first.solution.camera_doubts.notes:
+        if not (wrong := first.solution.camera_doubts):
             raise
-        cameras = (
-            *first.solution.camera_doubts.notes,
-            *_camera_notes(data.dataset, first.solution),
-        )
+        cameras = (*map(str, wrong), *_camera_notes(data.dataset, first.solution))
         raise type(error)([*cameras, *error.facts]) from error
     return replace(
         estimate,
@@ -459,7 +456,7 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     names = [view.name for view in dataset.measurements.views]
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
-        for view in solution.camera_doubts.views
+        for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
     ]
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, ndtr
+from scipy.special import chdtrc
 
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
@@ -43,7 +43,6 @@ _WIDE_SIGMA = 0.05  # mean leg lengths or rad: the wide prior in place of a fixe
 _WIDE_RADIUS = 0.2  # relative, of a radius
 _MAX_VARIANCE_SHARE = 0.5  # posterior over prior variance, for a test
 _NOMINAL_SIGMA = 0.01  # mean leg lengths: error of a nominal model along held directions
-_MIN_SHARE = 0.01  # of the variance in a camera file, which measurements must remove for a test
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 # An arm that is no cylinder: its median outline error over that of rods (at most 1.8 for 204
@@ -378,63 +377,6 @@ class Scatter:
         squares = self.squares[self.used & of]
         chance = float(chdtrc(2.0 * len(squares), 2.0 * squares.sum())) if len(squares) else 1.0
         return n_groups * chance < _SCATTER_BY_CHANCE
-
-
-@dataclass(frozen=True)
-class DoubtedCamera:
-    """A camera whose fitted intrinsics contradict the covariance of its file."""
-
-    view: str  # the first one by name if several have the camera
-    key: str  # of the intrinsic with the largest change over its standard deviation
-    given: float  # in the camera file
-    sigma: float  # in the camera file
-    found: float  # by the fit
-    apart: float  # change in standard deviations
-
-    def __str__(self) -> str:
-        unit = f" {intrinsic_unit(self.key)}".rstrip()
-        return (
-            f"The camera of {self.view} does not agree with its covariance: the fit moves "
-            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to "
-            f"{self.found:.6g}{unit}, {self.apart:.0f} times the expected change; the stated "
-            "uncertainty does not include this error; calibrate the camera again at the same focus "
-            "and zoom."
-        )
-
-
-def doubted_cameras(
-    problem: FitProblem, state: State, covariance: Array
-) -> tuple[DoubtedCamera, ...]:
-    """Return the cameras whose fitted intrinsics contradict the covariances of their files.
-
-    Whitened by the covariance of the file, a change of intrinsics has the covariance 1 - P for the
-    posterior covariance P. *covariance* is of the kept unknowns.
-    """
-    block, values = problem.block("cameras"), problem.coordinates(state)
-    prior, first = block.prior, int(problem.where("cameras")[0]) if block.n_unknowns else 0
-    from_file = np.isin(first + prior.unknown, problem.calibrated)
-    views = np.array([ParameterId.parse(block.labels[i]).owner for i in prior.unknown.tolist()])
-    doubted = []
-    for view in dict.fromkeys(views[from_file].tolist()):
-        rows = np.flatnonzero(from_file & (views == view))
-        unknowns, sigma = first + prior.unknown[rows], prior.sigma[rows]
-        whitening = np.eye(len(prior.mean)) if prior.whitening is None else prior.whitening
-        T = whitening[np.ix_(rows, rows)] / sigma
-        moved, posterior = (
-            values[unknowns] - prior.mean[rows],
-            covariance[np.ix_(unknowns, unknowns)],
-        )
-        reduction, vector = np.linalg.eigh(np.eye(len(rows)) - T @ posterior @ T.T)
-        tested = reduction > _MIN_SHARE
-        squared = float(np.sum((vector[:, tested].T @ T @ moved) ** 2 / reduction[tested]))
-        if squared <= chdtri(max(int(tested.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
-            continue
-        spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(posterior), _MIN_SHARE * sigma**2))
-        k = int(np.argmax(np.abs(moved) / spread))
-        key = ParameterId.parse(problem.named[unknowns[k]]).kind
-        numbers = prior.mean[rows[k]], sigma[k], values[unknowns[k]], abs(moved[k]) / spread[k]
-        doubted.append(DoubtedCamera(view, key, *map(float, numbers)))
-    return tuple(doubted)
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
