@@ -42,7 +42,7 @@ from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_da
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, write_result
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
-from legcal.calibration.verdict import judge
+from legcal.calibration.verdict import camera_file_notes, judge
 from legcal.data.cache import (
     fingerprint,
     note_on_missing_photographs,
@@ -200,7 +200,6 @@ def calibrate(
         *Note.about(Topic.IMAGES, [f"Left out, as asked: {leave_out}."] if leave_out else ()),
         *Note.about(Topic.BOARDS, board_notes(dataset, found.solution, found.corners)),
         *found.solution.notes,
-        *Note.about(Topic.CAMERAS, _camera_notes(dataset, found.solution)),
         *Note.about(Topic.CAMERAS, exact_cameras(dataset, choices)),
     ]
     calibration = judge(
@@ -309,7 +308,7 @@ def _estimate(
         # A fit with a wrong camera may lead away from outlines that were found before it.
         if not (wrong := first.solution.camera_doubts):
             raise
-        cameras = (*map(str, wrong), *_camera_notes(data.dataset, first.solution))
+        cameras = (*map(str, wrong), *camera_file_notes(data.dataset, first.solution))
         raise type(error)([*cameras, *error.facts]) from error
     return replace(
         estimate,
@@ -440,24 +439,21 @@ def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
     """Return a note on each zero that an encoder had in some images."""
     posterior, notes = solution.posterior, list[str]()
     sigma = np.sqrt(np.diagonal(posterior.covariance)[posterior.problem.where("own_zeros")])
-    zeros = dataset.measurements.own_zeros, posterior.state.own_zeros.tolist(), sigma.tolist()
+    values, errors = posterior.state.own_zeros.tolist(), sigma.tolist()
     unit_of = {leg.motor_label: leg.reading_unit for leg in dataset.machine.legs}
-    for of, value, error in zip(*zeros, strict=True):
+    for k, of in enumerate(dataset.measurements.own_zeros):
         scale, unit = SHOWN_IN[unit_of[of.motor]]
+        if not posterior.problem.readings.by_zero[:, k].any():
+            notes.append(
+                f"In {of.images} the zero of the encoder of {of.motor} is not known: all of them "
+                "are kept aside; keep others aside (--holdout)."
+            )
+            continue
         notes.append(
-            f"In {of.images} the zero of the encoder of {of.motor} is {scale * value:+.4f} ± "
-            f"{scale * error:.4f} {unit} from that of the other images, which the model has."
+            f"In {of.images} the zero of the encoder of {of.motor} is {scale * values[k]:+.4f} ± "
+            f"{scale * errors[k]:.4f} {unit} from that of the other images, which the model has."
         )
     return notes
-
-
-def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return a note on the file of each camera that the measurements contradict."""
-    names = [view.name for view in dataset.measurements.views]
-    return [
-        f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
-        for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
-    ]
 
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:

@@ -28,6 +28,7 @@ from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.image_choice import images_in_words
 from legcal.data.measurements import Measurements, few_views, row_names
 from legcal.estimation.problem import Linearization, linearize
@@ -42,7 +43,6 @@ from legcal.estimation.uncertainty import (
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 
-SIGNIFICANCE = 1e-4  # largest probability of a finding by chance, times the number of tests
 MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
 MIN_IMAGES = 3  # on each side of a change
@@ -272,7 +272,7 @@ def session_tests(
     if not hypotheses:
         return SessionTests()
     scores = _Scores.of(problem, linear, normal, hypotheses)
-    least = math.sqrt(chdtri(1.0, SIGNIFICANCE / max(len(tests), 1)))
+    least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for test, number in zip(tests, solved, strict=True):
         hypothesis = hypotheses[test.hypothesis]
@@ -342,7 +342,7 @@ def _forward_selection(
     lacking = list[tuple[_Test, _Solved]]()
     while tests and len(lacking) < MAX_FINDINGS:
         best = min(range(len(tests)), key=lambda i: (solved[i].p_value, -solved[i].square))
-        if solved[best].p_value * n_tests > SIGNIFICANCE:
+        if solved[best].p_value * n_tests > DOUBT_BY_CHANCE:
             break
         lacking.append((tests[best], solved[best]))
         scores = scores.given(solved[best])
@@ -798,7 +798,7 @@ def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatt
         for subject, group in groups.items()
     ]
     best = max(tests, key=lambda test: test.gain, default=None)
-    if best is None or best.p_value > SIGNIFICANCE or best.ratio < MOST_SCATTER:
+    if best is None or best.p_value > DOUBT_BY_CHANCE or best.ratio < MOST_SCATTER:
         return None
     return best
 

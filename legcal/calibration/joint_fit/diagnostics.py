@@ -22,6 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
@@ -50,7 +51,6 @@ _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 MOST_SCATTER = 2.0  # of outlines, over the standard deviations that they came with
-_SCATTER_BY_CHANCE = 1e-3
 RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
@@ -376,7 +376,7 @@ class Scatter:
         """Return whether outlines scatter more than one of so many groups does by chance."""
         squares = self.squares[self.used & of]
         chance = float(chdtrc(2.0 * len(squares), 2.0 * squares.sum())) if len(squares) else 1.0
-        return n_groups * chance < _SCATTER_BY_CHANCE
+        return n_groups * chance < DOUBT_BY_CHANCE
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
