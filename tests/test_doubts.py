@@ -29,7 +29,7 @@ from legcal import (
 )
 from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
-from legcal.calibration.joint_fit.cross_validation import cross_validate
+from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind

@@ -19,7 +19,7 @@ from legcal.calibration.identify.scale import is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import DidNotConverge
-from legcal.estimation.square_root import compress, eliminate
+from legcal.estimation.uncertainty import compress, eliminate
 from legcal.geometry.motions import motion_of
 from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.equations import leg_equations as linearize_leg

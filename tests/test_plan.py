@@ -21,11 +21,12 @@ from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
+    WHITE,
     Contributions,
     Predictor,
     predicted_outlines,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at

@@ -17,9 +17,8 @@ from scipy.special import ndtri, stdtrit
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import DoubtBlock
-from legcal.calibration.joint_fit.cross_validation import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
-from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.held_out import CrossValidation, HeldOut, cross_validate
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,

@@ -41,10 +41,9 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
-from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.solution import OutlineResiduals, Solution, outline_residuals
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
 from legcal.calibration.plots import plot_residuals
-from legcal.calibration.residuals import OutlineResiduals, outline_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.platform import PlatformError
-from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
+from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
 from legcal.files.motions import Pose
 from legcal.files.schema import Document, Number, Version

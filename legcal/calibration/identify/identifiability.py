@@ -36,7 +36,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
-from legcal.calibration.joint_fit.predicted_noise import (
+from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
     PredictedNoise,

@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import CameraIntrinsics
-from legcal.estimation.square_root import marginal_rows
+from legcal.estimation.uncertainty import marginal_rows
 from legcal.vision.camera import shared_cameras
 
 INTRINSICS = ("fx", "fy", "cx", "cy")

@@ -10,10 +10,9 @@ import numpy as np
 from legcal.calibration.identify.report import Ranks, RmsMotion, WeakDirection
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
-from legcal.calibration.joint_fit.predicted import Contributions
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
+from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Contributions, PredictedNoise
 from legcal.errors import NotIdentifiable
-from legcal.estimation.square_root import compress, marginal_rows
+from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.geometry.types import Array
 from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity

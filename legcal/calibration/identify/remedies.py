@@ -30,7 +30,7 @@ from legcal.calibration.identify.session import (
     planned_session,
     ring_distance,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
+from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, PredictedNoise
 from legcal.geometry.types import Array
 from legcal.machine.directions import legs_in_words, list_in_words
 from legcal.machine.leg import JointType

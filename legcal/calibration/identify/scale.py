@@ -14,7 +14,7 @@ import numpy as np
 
 from legcal.calibration.identify.ranks import Analysis, undetermined
 from legcal.calibration.identify.report import ScaleSource
-from legcal.calibration.joint_fit.predicted_noise import WHITE
+from legcal.calibration.joint_fit.predicted import WHITE
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array

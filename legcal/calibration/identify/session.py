@@ -18,12 +18,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
     Contributions,
+    PredictedNoise,
     information_of_images,
     predicted_outlines,
     readings_at,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
 from legcal.calibration.joint_fit.variables import FittedLegs, Start
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.corners import found_corners

@@ -15,10 +15,9 @@ from itertools import combinations
 import numpy as np
 from scipy.special import ndtri
 
-from legcal.calibration.joint_fit.cross_validation import with_weights
 from legcal.calibration.joint_fit.diagnostics import stated_parameters
 from legcal.calibration.joint_fit.factors import measured_lengths
-from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.held_out import Posterior, with_weights
 from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_of_length
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
