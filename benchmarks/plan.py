@@ -34,7 +34,7 @@ from legcal.data.reading_units import sigmas_of
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry.lines import direction_above
 from legcal.geometry.types import Array
-from legcal.machine.feasibility import feasible_poses, poses_at
+from legcal.machine.configurations import feasible_poses, poses_at
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.goals import workspace_of

@@ -87,7 +87,7 @@ def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
         ("weak joint", 15, (30, 30), ()),
         ("halves", 15, (30, 30), ("eq12",)),
         ("paper", 15, (30, 30), ()),
-        ("paper", 1, (26, 30), ("two_directions", "full")),
+        ("weak joint", 1, (26, 30), ("full",)),
     ],
 )
 def test_a_board_does_what_the_report_says(
@@ -245,10 +245,10 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert rank(vague) == alone
 
 
-@pytest.mark.parametrize(("name", "noted"), [("3-rps", True), ("hexapod", False)])
-def test_directions_that_a_fit_would_refuse_are_noted(name: str, noted: bool) -> None:
+@pytest.mark.parametrize(("name", "images", "noted"), [("3-rps", 3, True), ("hexapod", 4, False)])
+def test_directions_that_a_fit_would_refuse_are_noted(name: str, images: int, noted: bool) -> None:
     machine = legcal.load_mechanism(name)
-    report = legcal.identifiability(machine, [machine.leg_names], 4)
+    report = legcal.identifiability(machine, [machine.leg_names], images)
     assert report.identifiable
     assert report.platform_sigma is not None
     assert (report.platform_sigma.dX_m > 0.02) == noted

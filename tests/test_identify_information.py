@@ -18,16 +18,13 @@ from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.scale import is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.errors import DidNotConverge
 from legcal.estimation.uncertainty import compress, eliminate
 from legcal.geometry.motions import motion_of
-from legcal.machine.configurations import random_postures_of_legs
 from legcal.machine.equations import leg_equations as linearize_leg
 from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
-from legcal.machine.parameters import geometries
 
 FAST = settings(deadline=None, max_examples=4)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -143,22 +140,6 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             T_Rb_Re = machine.T_base_Rb.inv() * T * machine.T_platform_Re
             np.testing.assert_allclose(T_Rb_Re.translation, t, atol=1e-4)
             np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
-
-
-def test_poses_out_of_reach_are_refused_and_rare_ones_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    machine, rng = legcal.load_mechanism("hexapod"), np.random.default_rng(1)
-    home = machine.home_of_frames
-    away = np.tile([5.0, 5.0], (6, 1))
-    away[0] = [0.01, 0.01]
-    with pytest.raises(DidNotConverge, match="0 of 3 random poses"):
-        random_postures_of_legs(geometries(machine), machine.frame_legs, home, away, 3, rng)
-    monkeypatch.setattr(
-        "legcal.machine.configurations._Drive.is_regular",
-        lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
-    )
-    assert len(planned_session(machine, [range(6)], 60).t) == 60
 
 
 @pytest.mark.parametrize("name", ["planar", "revolute"])

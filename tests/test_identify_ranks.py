@@ -238,9 +238,10 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
         with_board = boards.recommendation[0].platform_sigma
         assert boards.platform_sigma is not None
         assert with_board is not None
-        gain = boards.platform_sigma.dX_m / found.platform_sigma.dX_m  # of the views recommended
-        assert with_board.dX_m / first.platform_sigma.dX_m == pytest.approx(gain, rel=0.1)
-        assert gain < 0.9
+        # The best of several places of a camera, with the board as without.
+        assert first.platform_sigma.dX_m <= found.platform_sigma.dX_m
+        assert with_board.dX_m <= boards.platform_sigma.dX_m
+        assert with_board.dX_m < 0.95 * first.platform_sigma.dX_m
 
 
 def test_remedies_were_tried_and_are_true() -> None:

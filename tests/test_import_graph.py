@@ -44,7 +44,6 @@ PUBLIC: dict[str, set[str]] = {
         "drawing",
         "equations",
         "family",
-        "feasibility",
         "files",
         "firmware",
         "firmware_files",

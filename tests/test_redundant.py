@@ -26,8 +26,7 @@ from legcal.data.image_order import image_sequences
 from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
-from legcal.machine.feasibility import feasible_poses
+from legcal.machine.configurations import feasible_poses, random_configurations
 from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,

@@ -14,8 +14,7 @@ from thinned import thinned
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.configurations import MIN_SINGULARITY, Configurations
-from legcal.machine.feasibility import JITTER, Feasibility
+from legcal.machine.configurations import JITTER, MIN_SINGULARITY, Configurations, Feasibility
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.machine.feasibility import JITTER
+from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine

@@ -1,63 +1,63 @@
-"""Random closed configurations within the travel, in the assembly mode of home.
+"""Random and given poses: closed configurations within the travel, in the assembly mode of home.
 
 If the motors determine the pose, their readings are drawn and followed from home. Not all legs can
 be at the ends of a long travel at the same time: readings that are not reached are drawn again,
-nearer to home after two failures. If motors do not determine the pose, configurations come from a
-random walk on the manifold of closed configurations.
+nearer to home. If motors do not determine the pose, configurations come from a random walk on the
+manifold of closed configurations. :func:`random_poses` samples the workspace, many poses at once;
+:func:`feasible_poses` is for poses that a machine takes: inside the limits of all joints, without
+collisions, and away from singularities on the way, too (:class:`Feasibility`).
 """
 
-from collections.abc import Iterator, Sequence
-from copy import deepcopy
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from enum import StrEnum
 from functools import lru_cache
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, Problem
-from legcal.geometry.motions import motions_of
-from legcal.geometry.types import Array, BoolArray
-from legcal.machine.equations import PoseEquations, equations_at_readings, freedoms, pose_equations
+from legcal.errors import DidNotConverge, ModelError, Problem
+from legcal.geometry.lines import segment_distance
+from legcal.geometry.motions import motion_of
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.kinematics import follow, follow_poses
-from legcal.machine.leg import Leg
 from legcal.machine.mobility import free_motions, project, singularities, singularity
 from legcal.machine.model import (
+    B_at,
     Machine,
     joint_values,
     platform_pose,
     readings_at_poses,
     slider_columns,
+    vectors_A_to_B,
 )
 from legcal.machine.redundancy import determining_readings
-from legcal.machine.rods import actuator_index, readings_of_rods
-from legcal.machine.solved_poses import solve_poses
-from legcal.machine.solver import RANK, poses_after
+from legcal.progress import Report, no_progress
 
 MAX_DRAWS = 40  # draws per configuration
-SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # share of the travel for each draw, at most 1
+SHARES = np.minimum(1.3 * 0.8 ** np.arange(MAX_DRAWS), 1.0)  # share of the travel for each draw
+LOOSE = 0.01  # singularity measure of home below which motors hardly hold the platform
 MIN_SINGULARITY = 0.1  # least singularity measure, relative to home: nobody works nearer to one
 MIN_STEP = 1.0 / 16.0  # least step, relative to the way from home; harder draws are repeated
 WALK = 6  # steps of the random walk between two configurations
-ON_THE_CHAIN = 7  # draws out of eight that are followed on the chain, where that is quick
-MAX_FAILED = 20  # failures before the first configuration
 STRIDE = 0.15  # size of a step of the random walk [rad], and relative to the leg length
 TRAVEL_TOLERANCE = 1e-11  # tolerance of travel limits, relative to the larger one
 WORKSPACE_POSES = 100  # sample of the workspace, for all reported errors over it
 WORKSPACE_SEED = 20020721
 
-# Random poses of legs without a chain, many at once.
-PARTS = 5  # steps from home to a pose, so that no pose jumps to another assembly mode
-STEPS, LAST_STEPS = 3, 9  # solver iterations per step, and in the last step
-CLOSED = 1e-9  # residual of a closed pose, relative to the mean leg length
-NEARLY_CLOSED = 1e-5  # the same for overdetermined readings, whose residual does not vanish
-DEPENDENT = 1e-4  # singular value of equations below which they are dependent
-SINGULAR = 0.05  # least smallest singular value, relative to home
-FREE = 0.05  # motion along freedoms that no motor holds, relative to the mean leg length
-ATTEMPTS = 12
-SHRINKING = 0.6  # share of the travel of each attempt, relative to the one before
-MIN_SHARE = 0.078  # least share of the travel
-LOOSE = 0.01  # least hold of the platform by motors and joints, dimensionless
+JITTER = 0.12  # largest distance of extreme readings from an end, relative to the travel
+
+_ANGLE_ROUNDING = 1e-9  # tolerance of joint limits [rad]
+
+_MAX_DRAWS = 60  # draws per pose
+_FULL_EXTREME, _FULL = 12, 2  # draws over the whole travel; the next ones are nearer to home
+_NEARER = 0.85  # distance from home of a further draw, relative to the one before
+_BEFORE_LAST = 6  # a pose starts so many draws before the last successful one (extremes at 0)
+_WAY = (0.25, 0.5, 0.75, 1.0)  # fractions of the way from home checked for feasibility
+_SHORTEST = 0.25  # least step within a fraction of the way; harder poses are dropped
+_MAX_FAILED_POSES = 5  # consecutive failures before giving up
 
 
 class Configurations(NamedTuple):
@@ -106,26 +106,32 @@ def random_configurations(
     DidNotConverge
         If too few configurations are reached.
     """
-    generator = np.random.default_rng(rng)
-    draw = _drawn if mechanism.is_determined else _wandered
-    configurations = list(draw(mechanism, count, generator))
+    generator, configurations = np.random.default_rng(rng), list[Array]()
+    if mechanism.is_determined:
+        for share in SHARES:
+            if len(configurations) == count:
+                break
+            for q, _, _ in _usable(mechanism, generator, count - len(configurations), share):
+                try:
+                    configurations.append(follow(mechanism, mechanism.home_configuration, q))
+                except DidNotConverge:  # joints of the chain do not turn so far
+                    continue
+    else:
+        walk = _walk(mechanism, generator, lambda c: not beyond_travel(mechanism, c).any())
+        for configuration in islice(walk, count):
+            if configuration is None:
+                break
+            configurations.append(configuration)
     _require(mechanism, count, len(configurations))
-    return Configurations(
-        np.array(configurations).reshape(count, mechanism.chain.nq),
-        np.array([joint_values(mechanism, c) for c in configurations]).reshape(
-            count, mechanism.n_legs
-        ),
-        [platform_pose(mechanism, c) for c in configurations],
-    )
+    return poses_at(mechanism, configurations)
 
 
 def random_poses(
     machine: Machine, count: int, rng: np.random.Generator | int
 ) -> tuple[Array, list[RigidTransform]]:
-    """Return the readings and poses of :func:`random_configurations`, at a tenth of the time.
+    """Return readings and poses as of :func:`random_configurations`, at a tenth of the time.
 
-    If the motors determine the pose it is followed for many draws at once; the chain is closed only
-    in doubtful cases.
+    If the motors determine the pose the chain is not closed.
 
     Raises
     ------
@@ -135,25 +141,36 @@ def random_poses(
     if not machine.is_determined:
         drawn = random_configurations(machine, count, rng)
         return drawn.readings, drawn.poses
-    pairs = list(_drawn_poses(machine, count, np.random.default_rng(rng)))
-    _require(machine, count, len(pairs))
-    if not pairs:
-        return np.zeros((0, machine.n_legs)), []
-    readings, poses = (np.array(part) for part in zip(*pairs, strict=True))
-    return readings, list(motions_of(poses[:, :, :3], poses[:, :, 3]))
+    generator, readings, poses = np.random.default_rng(rng), list[Array](), list[RigidTransform]()
+    for share in SHARES:
+        if len(poses) == count:
+            break
+        for _, row, T in _usable(machine, generator, count - len(poses), share):
+            readings.append(row)
+            poses.append(motion_of(T[:, :3], T[:, 3]))
+    _require(machine, count, len(poses))
+    return np.array(readings).reshape(count, machine.n_legs), poses
 
 
-def _require(machine: Machine, count: int, n_found: int) -> None:
-    if n_found < count:
-        raise DidNotConverge(
-            Problem(
-                "random poses could not be drawn",
-                f"{n_found} of {count} inside the travel in {MAX_DRAWS} tries for each",
-                "all",
-                f"check {machine.urdf.wording.home} and the limits of the sliders",
-                str(machine.yaml_path),
-            )
+def _require(machine: Machine, count: int, n_reached: int) -> None:
+    """Raise DidNotConverge if too few poses are reached."""
+    if n_reached == count:
+        return
+    remedy = f"check {machine.urdf.wording.home} and the limits of the sliders"
+    if machine.is_determined and singularity(machine, machine.home) < LOOSE:
+        remedy = (
+            "choose a home further from a singular pose, or joints that do not make the same "
+            "figure on base and platform"
         )
+    raise DidNotConverge(
+        Problem(
+            "random poses could not be drawn",
+            f"{n_reached} of {count} inside the travel in {MAX_DRAWS} tries for each",
+            "all",
+            remedy,
+            str(machine.yaml_path),
+        )
+    )
 
 
 @lru_cache(maxsize=2)  # shared by verdict and report of a calibration
@@ -174,97 +191,19 @@ def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
     return readings[:, [names.index(name) for name in machine.leg_names]], poses
 
 
-def _drawn(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
-    """Yield configurations at random readings of the motors, followed from home."""
-    drawn = 0
-    for turn in range(count):
-        if turn == MAX_FAILED and not drawn:
-            return
-        for tries, share in enumerate(SHARES):
-            (q,) = _random_readings(machine, generator, [share])
-            reached = _reached_on_the_chain(machine, q, tries)
-            if reached is not None:
-                drawn += 1
-                yield reached
-                break
+def _usable(
+    machine: Machine, generator: np.random.Generator, count: int, share: float
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield readings of motors and of all legs, and poses (3, 4), of usable ones of some draws.
 
-
-def _drawn_poses(
-    machine: Machine, count: int, generator: np.random.Generator
-) -> Iterator[tuple[Array, Array]]:
-    """Yield readings (n_legs,) and pose (3, 4) of the configurations of :func:`_drawn`.
-
-    Draws are followed together as if none failed, which holds for most machines. With redundant
-    motors many fail, because dependent motors leave their travel: then the draws of one share of
-    the travel are followed together.
+    Readings of motors are in a share of the travel about home.
     """
-    drawn = 0
-    if machine.is_redundant:
-        for share in SHARES:
-            if drawn == count:
-                return
-            q = _random_readings(machine, generator, np.full(count - drawn, share))
-            for readings, pose, is_reached in _reached(machine, q):
-                drawn += is_reached
-                if is_reached:
-                    yield readings, pose
-        return
-    ahead = list[tuple[Array, Array, bool]]()
-    for turn in range(count):
-        if turn == MAX_FAILED and not drawn:
-            return
-        for tries, share in enumerate(SHARES):
-            if not ahead:
-                ahead += _reached(
-                    machine, _random_readings(machine, deepcopy(generator), np.ones(count - turn))
-                )
-            (q,) = _random_readings(machine, generator, [share])
-            readings, pose, is_reached = ahead.pop(0)
-            if share < 1.0 or not is_reached:
-                configuration = _reached_on_the_chain(machine, q, tries)
-                if configuration is None:
-                    continue
-                readings = joint_values(machine, configuration)
-                pose = platform_pose(machine, configuration).as_matrix()[:3]
-            drawn += 1
-            yield readings, pose
-            break
-
-
-def _random_readings(
-    machine: Machine, generator: np.random.Generator, shares: Sequence[float] | Array
-) -> Array:
-    """Return random readings of the motors, each in a share of the travel about home."""
     motors = list(machine.motors)
-    lower, upper = np.array([machine.legs[j].travel for j in motors]).T
+    lower, upper = motor_travel(machine)
     home = machine.home_configuration[slider_columns(machine, motors)[0]]
-    q = determining_readings(machine, generator.uniform(lower, upper, (len(shares), len(motors))))
-    share = np.asarray(shares)[:, None]
-    return np.where(share < 1.0, np.clip(home + share * (q - home), lower, upper), q)
-
-
-def _reached_on_the_chain(machine: Machine, q: Array, tries: int) -> Array | None:
-    """Return the configuration at readings of the motors, None if it is not usable."""
-    try:
-        reached = follow(
-            machine,
-            machine.home_configuration,
-            q,
-            min_step=MIN_STEP,
-            on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
-        )
-    except DidNotConverge:  # the legs cannot have these lengths at the same time
-        return None
-    if beyond_travel(machine, reached).any():
-        return None
-    least = MIN_SINGULARITY * singularity(machine, machine.home)
-    return reached if singularity(machine, platform_pose(machine, reached)) >= least else None
-
-
-def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
-    """Yield readings of all legs, pose, and whether it is usable, at readings of the motors."""
-    motors = list(machine.motors)
-    home = machine.home_configuration[slider_columns(machine, motors)[0]]
+    q = determining_readings(machine, generator.uniform(lower, upper, (count, len(motors))))
+    if share < 1.0:
+        q = np.clip(home + share * (q - home), lower, upper)
     poses, part = follow_poses(machine, machine.home, home, q, MIN_STEP)
     readings = readings_at_poses(machine, poses)
     readings[:, [not leg.has_value for leg in machine.legs]] = 0.0
@@ -274,18 +213,26 @@ def _reached(machine: Machine, q: Array) -> Iterator[tuple[Array, Array, bool]]:
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least
-    return zip(readings, poses, usable.tolist(), strict=True)
+    for k in np.flatnonzero(usable):
+        yield q[k], readings[k], poses[k]
 
 
-def _wandered(machine: Machine, count: int, generator: np.random.Generator) -> Iterator[Array]:
-    """Yield configurations of a random walk, every few steps, with sliders within their travel."""
+def _walk(
+    machine: Machine, generator: np.random.Generator, is_usable: Callable[[Array], bool]
+) -> Iterator[Array | None]:
+    """Yield usable configurations of a random walk on the closed chain; None after many others."""
     here = machine.home_configuration
-    for _ in range(count):
+    while True:
         for _ in range(MAX_DRAWS):
-            here = random_walk(machine, here, generator)
-            if not beyond_travel(machine, here).any():
-                yield here
+            there = random_walk(machine, here, generator)
+            usable = is_usable(there)
+            if usable or beyond_travel(machine, there).any():
+                here = there  # walks never lead further outside the travel
+            if usable:
+                yield there
                 break
+        else:
+            yield None
 
 
 def random_walk(machine: Machine, here: Array, generator: np.random.Generator) -> Array:
@@ -314,172 +261,263 @@ def _outside(machine: Machine, values: Array) -> BoolArray:
     return np.asarray(outside | (machine.lengths_at(values) <= 0.0))
 
 
-def random_postures_of_legs(
-    legs: Sequence[Leg],
-    frame_legs: Sequence[int],
-    home: RigidTransform,
-    travel: Array,
-    count: int,
+class Cause(StrEnum):
+    """The kinds of obstacles between a machine and a pose."""
+
+    LIMITS = "the limits of joints"
+    LENGTHS = "legs that cannot have such lengths at the same time"
+    SINGULARITY = "the mechanism near a singularity"
+    COLLISION = "collisions of legs"
+
+
+Obstacle = tuple[Cause, str]
+"""A cause and its details in words."""
+
+_REMEDIES = {
+    Cause.LIMITS: "check legcal.home and the limits of the joints",
+    Cause.LENGTHS: "check legcal.home and the travel of the motors",
+    Cause.SINGULARITY: "check legcal.home, and choose one away from singularities",
+    Cause.COLLISION: "check radii and ends of the cylinders of the legs in the model",
+}
+
+
+def near_ends(end: IntArray, draws: Array) -> Array:
+    """Return positions in the travel near given ends of it; 0 is the shortest, 1 the longest."""
+    return np.asarray(np.abs(end - JITTER * draws))
+
+
+def motor_travel(machine: Machine) -> tuple[Array, Array]:
+    """Return the lowest and the highest reading of the motors, (n_motors,) [m]."""
+    lower, upper = np.array([machine.legs[j].travel for j in machine.motors]).reshape(-1, 2).T
+    return lower, upper
+
+
+def feasible_poses(
+    machine: Machine,
+    n_poses: int,
     rng: np.random.Generator,
-) -> tuple[Array, Array]:
-    """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
+    *,
+    extreme: bool,  # every motor near an end of its travel
+    progress: Report = no_progress,
+) -> Configurations:
+    """Return random feasible poses, each followed from home.
 
-    The legs are in R_b and R_e and need no file and no chain. *home* is T_Rb_Re near a closed pose
-    of the assembly mode, *travel* (n_legs, 2) the shortest and longest length of each leg [m],
-    equal for legs of constant length, or for rods on actuators the lowest and highest reading [m or
-    rad].
-
-    Raises
-    ------
-    DidNotConverge
-        If the machine cannot move inside its travel.
+    Raises DidNotConverge if there are too few, and ModelError if home is beyond a limit.
     """
-    start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
-    drive = _Drive(legs, frame_legs, start.R, start.t)
-    at_home = drive.values(start.R, start.t)[0]
-    rounding = NEARLY_CLOSED * float(drive.lengths(start.R, start.t).mean())
-    slack = rounding + 0.05 * (travel[:, 1] - travel[:, 0])
-    low = np.minimum(travel[:, 0], at_home) - slack  # home counts as inside
-    high = np.maximum(travel[:, 1], at_home) + slack
-    postures = start.R[:0], start.t[:0]
-    share, tried, near_singular = 1.0, 0, 0
-    for _ in range(ATTEMPTS):
-        n = 2 * (count - len(postures[1])) + 10
-        wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))[:, drive.first]
-        wanted = at_home + share * (wanted - at_home)
-        R, t = drive.wandered(n, share, rng)
-        first, good = drive.values(R, t), np.ones(n, dtype=np.bool_)
-        for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
-            R, t = drive.closed(R, t, first + part * (wanted - first), STEPS)
-            good &= drive.is_regular(R, t)
-        tried, near_singular = tried + n, near_singular + int(np.sum(~good))
-        R, t = drive.closed(R, t, wanted, LAST_STEPS)
-        values = drive.values(R, t)
-        good &= drive.is_closed(R, t, wanted) & np.all((values >= low) & (values <= high), axis=1)
-        postures = np.concatenate([postures[0], R[good]]), np.concatenate([postures[1], t[good]])
-        if len(postures[1]) >= count:
-            return postures[0][:count], postures[1][:count]
-        share = max(SHRINKING * share, MIN_SHARE)
-    reached = f"found {len(postures[1])} of {count} random poses inside the travel"
-    if 2 * near_singular > tried and drive.hold() < LOOSE:
-        raise DidNotConverge(
-            f"The observations could not be predicted: {reached}, needed all; most ways there come "
-            "near a singular pose, in which motors and joints do not hold the platform: choose a "
-            "home further from it, or joints that do not make the same figure on base and platform."
-        )
-    raise DidNotConverge(
-        f"The observations could not be predicted: {reached}, needed all; check the travel (limit "
-        "lower, upper) and the home pose of the model."
+    obstacles: Counter[Obstacle] = Counter()
+    feasibility = Feasibility(machine)
+
+    def is_feasible(configuration: Array) -> bool:
+        obstacle = feasibility.obstacle(configuration)
+        if obstacle is not None:
+            obstacles[obstacle] += 1
+        return obstacle is None
+
+    draws = (
+        _followed(machine, rng, feasibility, obstacles, extreme=extreme)
+        if machine.is_determined
+        else _walk(machine, rng, is_feasible)
     )
-
-
-class _Drive:
-    """Legs whose motors draw their values at many poses; of redundant motors an independent subset.
-
-    The subset determines best the freedoms that the constraints leave. The value of a leg is its
-    length, or for a rod on an actuator the reading of the actuator.
-    """
-
-    def __init__(self, legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array) -> None:
-        self.legs, self.frame_legs, self.R, self.t = tuple(legs), frame_legs, R, t
-        self.columns = list(freedoms(frame_legs))
-        self.on = np.array(actuator_index(legs), dtype=np.intp)
-        each = np.arange(len(legs))
-        # The leg that holds the value: for rods on one actuator the first.
-        self.first = np.array(
-            [j if a < 0 else int(np.argmax(self.on == a)) for j, a in enumerate(self.on.tolist())]
-        )
-        self.zero = np.where(self.on < 0, [leg.q0 for leg in legs], 0.0)
-        motors = [j for j in each.tolist() if legs[j].is_motor and self.first[j] == j]
-        self.driven = np.array([], dtype=np.intp)
-        constrained = self.slopes(R, t)[0]
-        self.driven = np.array(motors, dtype=np.intp)
-        unconstrained = self.slopes(R, t)[0]
-        rank_all, rank_constrained = (
-            int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0
-            for J in (unconstrained, constrained)
-        )
-        count = rank_all - rank_constrained
-        if count < len(motors):
-            size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
-            equations = pose_equations(legs, R, t, by_local=False)
-            rows = equations.by_pose[0][equations.measured][:, self.columns] / size
-            left = np.eye(len(size)) - np.linalg.pinv(constrained / size, rcond=RANK) @ (
-                constrained / size
+    configurations: list[Array] = []
+    failed = 0
+    progress("Poses", 0, n_poses)
+    while len(configurations) < n_poses and failed < _MAX_FAILED_POSES:
+        configuration = next(draws)
+        if configuration is None:
+            failed += 1
+        else:
+            failed = 0
+            configurations.append(configuration)
+            progress("Poses", len(configurations), n_poses)
+    if len(configurations) < n_poses:
+        causes: Counter[Cause] = Counter()
+        for (cause, _), count in obstacles.items():
+            causes[cause] += count
+        (main, _), *_others = causes.most_common()
+        excluded = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
+        raise DidNotConverge(
+            Problem(
+                f"{n_poses} poses could not be drawn",
+                f"{len(configurations)} that the machine reaches in "
+                f"{obstacles.total() + len(configurations)} draws, others excluded {excluded}",
+                "all",
+                _REMEDIES[main],
+                str(machine.yaml_path),
             )
-            order = qr((rows @ left).T, mode="r", pivoting=True)[1]
-            self.driven = np.array([motors[k] for k in order[:count]], dtype=np.intp)
-
-    def lengths(self, R: Array, t: Array) -> Array:
-        """Return the leg lengths, (k, n_legs) [m]."""
-        A, B = np.array([leg.A for leg in self.legs]), np.array([leg.B for leg in self.legs])
-        lengths = np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2)
-        return np.asarray(np.where(self.on < 0, lengths, [leg.q0 for leg in self.legs]))
-
-    def values(self, R: Array, t: Array) -> Array:
-        """Return the values of legs, (k, n_legs) [m or rad]."""
-        values = self.lengths(R, t)
-        if self.on.max(initial=-1) >= 0:
-            carried = self.on >= 0
-            values[:, carried] = readings_of_rods(self.legs, R, t)[:, self.on[carried]]
-        return values
-
-    def lengthening(self, wanted: Array) -> Array:
-        """Return s q, or q of actuators, at target values (k, n_legs) of driven motors, or NaN."""
-        driven = np.isin(self.first, self.driven)
-        return np.asarray(np.where(driven, wanted - self.zero, np.nan))
-
-    def equations(self, R: Array, t: Array) -> PoseEquations:
-        """Return the equations of poses: the constraints, and the lengths of driven motors."""
-        equations = pose_equations(self.legs, R, t, by_local=False)
-        return equations.of(~equations.measured | np.isin(equations.leg, self.driven))
-
-    def slopes(self, R: Array, t: Array) -> Array:
-        """Return the derivatives (k, m, f) of these equations by the possible motions."""
-        return self.equations(R, t).by_pose[:, :, self.columns]
-
-    def hold(self) -> float:
-        """Return the hold of the platform by motors and joints at home; 0 if singular."""
-        scale = np.where(np.array(self.columns) < 3, 1.0 / self.lengths(self.R, self.t).mean(), 1.0)
-        slopes = self.slopes(self.R, self.t)[0] * scale
-        return float(np.linalg.svd(slopes, compute_uv=False)[-1]) if slopes.size else 0.0
-
-    def closed(self, R: Array, t: Array, wanted: Array, steps: int) -> tuple[Array, Array]:
-        """Return poses nearer to target values (k, n_legs) of driven motors."""
-        lengthening = self.lengthening(wanted)
-        solution = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
-        return solution.R, solution.t
-
-    def wandered(self, n: int, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return n poses near home, moved along the freedoms that no motor holds."""
-        J = self.slopes(self.R, self.t)[0]
-        left = np.eye(len(self.columns))
-        if len(J):
-            left -= np.linalg.pinv(J, rcond=1e-6) @ J
-        scale = np.where(np.array(self.columns) < 3, 1.0, self.lengths(self.R, self.t).mean())
-        step = np.zeros((n, 6))
-        step[:, self.columns] = scale * (
-            rng.normal(size=(n, len(self.columns))) * share * FREE @ left.T
         )
-        pose = np.concatenate([self.R, self.t[..., None]], axis=2)
-        poses = poses_after(np.repeat(pose, n, axis=0), step)
-        return poses[:, :, :3], poses[:, :, 3]
+    return poses_at(machine, configurations)
 
-    def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
-        """Return at which poses the equations of legs hold with the target values."""
-        redundant = len(self.equations(R[:1], t[:1]).leg) > len(self.columns)
-        limit = (NEARLY_CLOSED if redundant else CLOSED) * self.lengths(R, t).mean(axis=1)
-        missed = equations_at_readings(self.legs, R, t, self.lengthening(wanted)).values
-        return np.asarray(np.abs(missed).max(axis=1, initial=0.0) <= limit)
 
-    def is_regular(self, R: Array, t: Array) -> BoolArray:
-        """Return which poses are less singular than a share of home, and on the same side."""
-        J, J0 = self.slopes(R, t), self.slopes(self.R, self.t)
-        if J.shape[1] == 0:
-            return np.ones(len(t), dtype=np.bool_)
-        s, s0 = np.linalg.svd(J, compute_uv=False), np.linalg.svd(J0, compute_uv=False)[0]
-        last = int(np.sum(s0 > 1e-6 * s0[0])) - 1
-        good = s[:, last] > SINGULAR * s0[last]
-        if J.shape[1] == J.shape[2]:
-            good &= np.linalg.det(J) * np.linalg.det(J0) >= 0.0
-        return np.asarray(good)
+def _counted(cause: Cause, n: int, obstacles: Counter[Obstacle]) -> str:
+    """Return the number of draws that a cause excluded, with its most frequent details."""
+    most = max((count, detail) for (reason, detail), count in obstacles.items() if reason is cause)
+    detail = f" ({most[0]} times {most[1]})" if most[1] != cause else ""
+    return f"{n} times by {cause}{detail}"
+
+
+class Feasibility:
+    """The feasibility of closed configurations: limits, singularities, collisions."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        limited = [
+            (joint, joint.limits)
+            for joint in machine.urdf.joints.values()
+            if joint.type == "revolute" and joint.limits is not None
+        ]
+        self._revolutes = [joint.name for joint, _ in limited]
+        self._columns = [machine.chain.q_index(name) for name in self._revolutes]
+        self._limits = np.array([limits for _, limits in limited]).reshape(-1, 2)
+        self._min_singularity = MIN_SINGULARITY * singularity(machine, machine.home)
+        cylinders = [(j, c) for j, leg in enumerate(machine.legs) for c in leg.cylinders]
+        self._leg = np.array([j for j, _ in cylinders], dtype=np.intp)
+        self._ends = np.array([(c.start, c.end) for _, c in cylinders]).reshape(-1, 2)
+        self._on_platform = np.array([c.side == "platform" for _, c in cylinders], dtype=np.bool_)
+        radius = np.array([c.radius for _, c in cylinders])
+        pairs = np.stack(np.triu_indices(len(cylinders), 1))
+        self._pairs = pairs[:, self._leg[pairs[0]] != self._leg[pairs[1]]]
+        self._clearance = radius[self._pairs].sum(axis=0)
+        apart = ~self._touching(machine.home)  # cylinders that touch at home do so by design
+        self._pairs, self._clearance = self._pairs[:, apart], self._clearance[apart]
+        problem = self._beyond_limits(machine.home_configuration)
+        if problem is not None:
+            raise ModelError(
+                Problem(
+                    "no pose could be drawn",
+                    f"{problem} at home",
+                    "every joint inside its limits there",
+                    f"correct the limits, or {machine.urdf.wording.correct_home}",
+                    str(machine.yaml_path),
+                )
+            )
+
+    def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:
+        """Return the obstacle of an infeasible closed configuration in words, None if feasible.
+
+        The travel of motors is checked only if *of_motors*.
+        """
+        obstacle = self.obstacle(configuration, of_motors=of_motors)
+        return None if obstacle is None else obstacle[1]
+
+    def obstacle(self, configuration: Array, *, of_motors: bool = True) -> Obstacle | None:
+        """Return the obstacle of a closed configuration with its cause, None if feasible."""
+        machine = self._machine
+        outside = beyond_travel(machine, configuration)
+        if not of_motors:
+            outside[[leg.is_motor for leg in machine.legs]] = False
+        beyond = np.flatnonzero(outside)
+        if len(beyond):
+            return Cause.LIMITS, f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
+        problem = self._beyond_limits(configuration)
+        if problem is not None:
+            return Cause.LIMITS, problem
+        T = platform_pose(machine, configuration)
+        if singularity(machine, T) < self._min_singularity:
+            return Cause.SINGULARITY, Cause.SINGULARITY.value
+        collision = self.collision(T)
+        if collision is not None:
+            first, second = collision
+            return Cause.COLLISION, f"legs '{first}' and '{second}' collide"
+        return None
+
+    def led(
+        self, here: Array, readings: Array, parts: Sequence[float], *, on_the_chain: bool = False
+    ) -> Array | Obstacle:
+        """Return the configuration at readings (n_motors,) after a straight path, or its obstacle.
+
+        Feasibility is checked at the fractions *parts* of the path from configuration *here* (the
+        last is 1); *on_the_chain* as in :func:`follow`.
+        """
+        first = here[slider_columns(self._machine, self._machine.motors)[0]]
+        for part in parts:
+            q = readings if part == 1.0 else first + part * (readings - first)
+            try:
+                here = follow(self._machine, here, q, min_step=_SHORTEST, on_the_chain=on_the_chain)
+            except DidNotConverge:
+                return Cause.LENGTHS, Cause.LENGTHS.value
+            obstacle = self.obstacle(here, of_motors=part == 1.0)
+            if obstacle is not None:
+                return obstacle
+        return here
+
+    def collision(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
+        """Return the names of the first two colliding legs at a pose, None if none collide."""
+        touching = np.flatnonzero(self._touching(T_base_platform))
+        if not len(touching):
+            return None
+        first, second = self._leg[self._pairs[:, touching[0]]]
+        return self._machine.leg_names[first], self._machine.leg_names[second]
+
+    def _touching(self, T_base_platform: RigidTransform) -> BoolArray:
+        """Return which pairs of cylinders are closer than the sum of their radii."""
+        vectors = vectors_A_to_B(self._machine, T_base_platform)
+        lengths = np.linalg.norm(vectors, axis=1)
+        u = (vectors / lengths[:, None])[self._leg]
+        along = self._ends + np.where(self._on_platform, lengths[self._leg], 0.0)[:, None]
+        B = B_at(self._machine, T_base_platform.as_matrix()[None])[0]
+        start = (B - vectors)[self._leg] + along[:, :1] * u
+        first, second = self._pairs
+        span = np.diff(along, axis=1) * u
+        distance = segment_distance(start[first], span[first], start[second], span[second])
+        return np.asarray(distance < self._clearance)
+
+    def _beyond_limits(self, configuration: Array) -> str | None:
+        """Return the revolute joint outside its limits (modulo full turns) in words, or None."""
+        lower, upper = self._limits.T
+        angles = configuration[self._columns]
+        above = np.mod(angles - lower + _ANGLE_ROUNDING, 2.0 * np.pi) - _ANGLE_ROUNDING
+        beyond = np.flatnonzero(above > upper - lower + _ANGLE_ROUNDING)
+        if not len(beyond):
+            return None
+        i = int(beyond[0])
+        limits = f"{np.degrees(lower[i]):.1f} to {np.degrees(upper[i]):.1f} deg"
+        return f"joint '{self._revolutes[i]}' outside its limits of {limits}"
+
+
+def _followed(
+    machine: Machine,
+    rng: np.random.Generator,
+    feasibility: Feasibility,
+    obstacles: Counter[Obstacle],
+    *,
+    extreme: bool,
+) -> Iterator[Array | None]:
+    """Yield configurations followed from home to drawn readings; None after many failures.
+
+    Each failed draw brings the next one nearer to home; the next pose begins a few draws before the
+    last successful one.
+    """
+    home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+    lower, upper = motor_travel(machine)
+    last = 0  # the draw of the last successful pose
+
+    def drawn(shrink: float) -> Array:
+        part = rng.random(len(home))
+        if extreme:
+            part = near_ends(rng.integers(0, 2, len(home)), part)
+        q = determining_readings(machine, (lower + part * (upper - lower))[None])[0]
+        return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
+
+    while True:
+        first = 0 if extreme else max(0, last - _BEFORE_LAST)
+        for draw in range(first, first + _MAX_DRAWS):
+            full = _FULL_EXTREME if extreme else _FULL
+            readings = drawn(_NEARER ** max(0, draw + 1 - full))
+            start = machine.home_configuration
+            result = feasibility.led(start, readings, _WAY, on_the_chain=True)
+            if not isinstance(result, tuple):
+                last = draw
+                yield result
+                break
+            obstacles[result] += 1
+        else:
+            yield None
+
+
+def poses_at(machine: Machine, configurations: Sequence[Array]) -> Configurations:
+    """Return closed configurations with their readings and poses."""
+    return Configurations(
+        np.array(configurations).reshape(-1, machine.chain.nq),
+        np.array([joint_values(machine, c) for c in configurations]).reshape(-1, machine.n_legs),
+        [platform_pose(machine, c) for c in configurations],
+    )

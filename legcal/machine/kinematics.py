@@ -221,41 +221,53 @@ def followed_poses(
     Arguments and other exceptions as in :func:`forward_kinematics_many`.
     """
     readings = _readings(machine, _numbers(q))
-    reached = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
     if not on_the_chain:
-        poses, part = follow_poses(machine, machine.home, reached[0], readings, LONG_STEP)
+        first = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+        poses, part = follow_poses(machine, machine.home, first, readings, LONG_STEP)
         if np.all(part == 1.0):
-            followed = motions_of(poses[:, :, :3], poses[:, :, 3])
-            for i, (T, row) in enumerate(zip(followed, readings, strict=True)):
+            motions = motions_of(poses[:, :, :3], poses[:, :, 3])
+            for i, (T, row) in enumerate(zip(motions, readings, strict=True)):
                 yield T, _disagreement(machine, T, row, f" of row {i + 1}")
             return
-    configurations = [machine.home_configuration]
+    for configuration, failure in followed(machine, readings):
+        yield platform_pose(machine, configuration), failure
+
+
+def followed(
+    machine: Machine, readings: Array, *, must_agree: bool = True
+) -> Iterator[tuple[Array, DidNotConverge | None]]:
+    """Yield the closed configuration at each row of readings (n, n_motors), with its failure.
+
+    Each is followed from the nearest one reached before, or from home, and stays there if the row
+    is not reached. Readings of redundant motors *must_agree*, if so wanted.
+    """
+    columns, reached = slider_columns(machine, machine.motors)[0], [machine.home_configuration]
     for i, row in enumerate(readings):
-        nearest = configurations[int(np.argmin(np.abs(np.array(reached) - row).max(axis=1)))]
+        which, failure = f" of row {i + 1}", None
+        far = [float(np.abs(configuration[columns] - row).max()) for configuration in reached]
+        configuration = reached[int(np.argmin(far))]
         try:
-            configuration = follow(machine, nearest, row, f" of row {i + 1}")
-        except DidNotConverge as failure:
-            yield platform_pose(machine, nearest), failure
-            continue
-        T = platform_pose(machine, configuration)
-        contradicted = _disagreement(machine, T, row, f" of row {i + 1}")
-        if contradicted is None:
-            reached.append(row)
-            configurations.append(configuration)
-        yield T, contradicted
+            configuration = follow(machine, configuration, row, which)
+        except DidNotConverge as error:
+            failure = error
+        else:
+            if must_agree:
+                T = platform_pose(machine, configuration)
+                failure = _disagreement(machine, T, row, which)
+            if failure is None:
+                reached.append(configuration)
+        yield configuration, failure
 
 
 def follow_each(machine: Machine, readings: Array) -> Iterator[Array]:
-    """Yield the closed configurations at readings (n, n_motors).
+    """Yield the closed configurations at readings (n, n_motors), as :func:`followed`.
 
-    Each is followed from the nearest one reached before, or from home. Raises DidNotConverge at the
-    first that is not reached.
+    Raises DidNotConverge at the first that is not reached.
     """
-    columns, reached = slider_columns(machine, machine.motors)[0], [machine.home_configuration]
-    for row in readings:
-        far = [float(np.abs(c[columns] - row).max()) for c in reached]
-        reached.append(follow(machine, reached[int(np.argmin(far))], row))
-        yield reached[-1]
+    for configuration, failure in followed(machine, readings, must_agree=False):
+        if failure is not None:
+            raise failure
+        yield configuration
 
 
 def inverse_kinematics(mechanism: Machine, T_base_platform: Pose) -> Array:

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
-from legcal.machine.feasibility import Feasibility, motor_travel
+from legcal.machine.configurations import Configurations, Feasibility, motor_travel
 from legcal.machine.model import Machine, platform_pose, slider_columns
 
 HOME = "home"

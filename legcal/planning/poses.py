@@ -12,13 +12,19 @@ from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.configurations import Configurations
-from legcal.machine.feasibility import Feasibility, feasible_poses, motor_travel, poses_at
+from legcal.machine.configurations import (
+    Configurations,
+    Feasibility,
+    feasible_poses,
+    motor_travel,
+    poses_at,
+)
 from legcal.machine.kinematics import follow, platforms_in_base
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine, slider_columns
 from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, moved_legs
+from legcal.machine.rods import ends_at_poses, first_rods
 from legcal.planning.places import USUAL_LENGTH, Setting
 from legcal.progress import Report, no_progress
 
@@ -82,28 +88,20 @@ def surely_reached(
         for j, leg in enumerate(machine.legs)
         if leg.kind is not LegKind.PASSIVE and not (machine.is_redundant and leg.is_motor)
     ]
+    carried = [leg.actuator is not None for leg in machine.legs]
+    lengthening = np.where(carried, 0.0, machine.sign * poses.readings)
     t_nearby = Frames.of(nearby).t
     wider = replace(setting, length=_WIDER * setting.length, angle=_WIDER * setting.angle)
     for _ in range(N_REACHING):
         drawn = drawn_legs(legs, wider, rng)
         R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
-        ends = np.swapaxes(R @ np.array([leg.B for leg in drawn]).T, 1, 2) + t[:, None]
-        A, target_length = _at_readings(drawn, poses.readings)
-        length = np.linalg.norm(ends - A, axis=2)
+        A, B = ends_at_poses(drawn, R, t, poses.readings[:, first_rods(drawn)])
+        length = np.linalg.norm(B - A, axis=2)
+        target_length = lengthening + [leg.q0 for leg in drawn]
         residual = np.abs(length - target_length)[:, measured].max(axis=1, initial=0.0)
         moved = np.linalg.norm(t - t_nearby, axis=1)
         reached &= (residual < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
     return reached
-
-
-def _at_readings(legs: Sequence[Leg], q: Array) -> tuple[Array, Array]:
-    """Joints at A (k, n_legs, 3) and leg lengths (k, n_legs) [m] at readings q."""
-    A = np.tile([leg.A for leg in legs], (len(q), 1, 1))
-    lengths = q * [leg.sign for leg in legs] + [leg.q0 for leg in legs]
-    for j, leg in enumerate(legs):
-        if leg.actuator is not None:
-            A[:, j], lengths[:, j] = leg.actuator.at(leg.A, q[:, j]), leg.q0
-    return A, lengths
 
 
 def drawn_legs(legs: FittedLegs, setting: Setting, rng: np.random.Generator) -> tuple[Leg, ...]:

@@ -19,7 +19,7 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.feasibility import poses_at
+from legcal.machine.configurations import poses_at
 from legcal.machine.kinematics import follow_each
 from legcal.machine.leg import SIGMA_LENGTH, SIGMA_READING
 from legcal.machine.loader import load_mechanism

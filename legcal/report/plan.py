@@ -15,8 +15,8 @@ from legcal.errors import printable
 from legcal.figures import new_figure, plain
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
+from legcal.machine.configurations import poses_at
 from legcal.machine.drawing import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
-from legcal.machine.feasibility import poses_at
 from legcal.machine.model import vectors_A_to_B
 from legcal.pages.document import Drawing, Items, Picture, Row
 from legcal.pages.html import page_html

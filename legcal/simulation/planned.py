@@ -15,8 +15,7 @@ from legcal.errors import DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
-from legcal.machine.feasibility import poses_at
+from legcal.machine.configurations import Configurations, poses_at
 from legcal.machine.kinematics import follow_each
 from legcal.machine.model import Machine
 from legcal.planning.places import Setting

@@ -1,6 +1,6 @@
 """Poses that a controller could command: both the true machine and its nominal model reach them.
 
-They are drawn (:func:`legcal.machine.feasibility.feasible_poses`) or given by their readings.
+They are drawn (:func:`legcal.machine.configurations.feasible_poses`) or given by their readings.
 """
 
 from __future__ import annotations
@@ -13,11 +13,19 @@ from legcal.data.measurements import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.files.table import read_table
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.configurations import TRAVEL_TOLERANCE, Configurations
-from legcal.machine.feasibility import JITTER, Feasibility, feasible_poses, motor_travel, poses_at
-from legcal.machine.kinematics import follow, followed_poses, platform_in_base
+from legcal.machine.configurations import (
+    JITTER,
+    TRAVEL_TOLERANCE,
+    Cause,
+    Configurations,
+    Feasibility,
+    feasible_poses,
+    motor_travel,
+    poses_at,
+)
+from legcal.machine.kinematics import followed, followed_poses, platform_in_base
 from legcal.machine.mobility import singularities, singularity
-from legcal.machine.model import Machine, platform_pose, slider_columns
+from legcal.machine.model import Machine, platform_pose
 from legcal.machine.redundancy import contradictions
 from legcal.progress import Report, no_progress
 from legcal.simulation.settings import Sampling
@@ -70,35 +78,27 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
     )
     readings, _ = readings_in(table, machine.legs)  # (n_poses, n_motors) [m]
     table.check()
-    feasibility, problems = Feasibility(machine), []
-    reached_readings = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
-    reached = [machine.home_configuration]
-    for place, row in zip(table.where, readings, strict=True):
-        nearest = int(np.argmin(np.abs(np.array(reached_readings) - row).max(axis=1)))
-        problem = _outside_travel(machine, row)
-        if problem is None:
-            try:
-                configuration = follow(machine, reached[nearest], row)
-            except DidNotConverge:
-                problem = "legs that cannot have these lengths at the same time"
-            else:
-                T = platform_in_base(machine, platform_pose(machine, configuration))
-                off = contradictions(machine, [T], row[None])
-                problem = (
-                    str(off[0].cause(machine))
-                    if off
-                    else feasibility.problem(configuration, of_motors=False)
-                )
-                reached_readings.append(row)
-                reached.append(configuration)
-        if problem is not None:
-            problems.append(
-                f"{place}: the pose could not be used: found {problem} there, needed a pose that "
-                "the machine reaches from home; correct or remove the row."
-            )
-    if problems:
+    feasibility, reached = Feasibility(machine), list[Array]()
+    obstacles = [_outside_travel(machine, row) for row in readings]
+    inside = [k for k, obstacle in enumerate(obstacles) if obstacle is None]
+    chains = followed(machine, readings[inside], must_agree=False)
+    for k, (configuration, failure) in zip(inside, chains, strict=True):
+        reached.append(configuration)
+        T = platform_in_base(machine, platform_pose(machine, configuration))
+        if failure is not None:
+            obstacles[k] = Cause.LENGTHS
+        elif off := contradictions(machine, [T], readings[[k]]):
+            obstacles[k] = str(off[0].cause(machine))
+        else:
+            obstacles[k] = feasibility.problem(configuration, of_motors=False)
+    if problems := [
+        f"{place}: the pose could not be used: found {obstacle} there, needed a pose that the "
+        "machine reaches from home; correct or remove the row."
+        for place, obstacle in zip(table.where, obstacles, strict=True)
+        if obstacle is not None
+    ]:
         raise DatasetError(problems)
-    return poses_at(machine, reached[1:])
+    return poses_at(machine, reached)
 
 
 def commanded_poses(

@@ -48,8 +48,7 @@ from legcal.files.schema import closest
 from legcal.machine.diagnostics import singularity_note
 from legcal.machine.directions import legs_in_words
 from legcal.machine.files import DATASET_YAML
-from legcal.machine.home import legs_outside
-from legcal.machine.leg import TRAVEL_MARGIN, JointType
+from legcal.machine.leg import JointType
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, is_held_by_default
@@ -353,15 +352,6 @@ def _machine_notes(machine: Machine) -> list[str]:
         notes.append(
             f"The model has no <visual> cylinder along {which}: visible cylinders with a radius of "
             f"{100 * THIN:g} % of the mean leg length are assumed; add one to each."
-        )
-    outside = list(legs_outside(machine, TRAVEL_MARGIN))
-    if outside:
-        which = legs_in_words(outside, machine.leg_names)
-        stand = "are outside their" if len(outside) > 1 else "is outside its"
-        notes.append(
-            f"At home {which} {stand} travel by more than {100 * TRAVEL_MARGIN:g} % of it: "
-            "poses between home and the joint limits are included, which the machine may not "
-            "reach; correct legcal.home or the limits."
         )
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]

@@ -36,7 +36,8 @@ from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
-from legcal.machine.configurations import random_postures_of_legs
+from legcal.machine.configurations import random_poses
+from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
@@ -53,6 +54,7 @@ from legcal.machine.rods import (
     joints_at,
     readings_of_rods,
 )
+from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.vision.board import Board, FixedBoard, Link, facing_board
 from legcal.vision.camera import sample_camera
@@ -363,11 +365,17 @@ def _random_sessions(
 ) -> tuple[tuple[tuple[Leg, ...], np.random.Generator], tuple[Array, Array]]:
     """Return :func:`perturbed_machine`, and random poses and readings."""
     legs, rng = perturbed_machine(machine)
-    travel = travel_of(machine)
-    postures = random_postures_of_legs(
-        legs, machine.frame_legs, machine.home_of_frames, travel, n_poses, rng
-    )
-    return (legs, rng), postures
+    return (legs, rng), random_postures(machine, legs, n_poses)
+
+
+def random_postures(machine: Machine, legs: Sequence[Leg], count: int) -> tuple[Array, Array]:
+    """Return random poses of R_e in R_b inside the travel, where the constraints of legs hold.
+
+    The legs are nearly those of the machine.
+    """
+    R, t = components(platforms_in_base(machine, random_poses(machine, count, _SEED)[1]))
+    solved = solve_poses(legs, machine.frame_legs, R, t)
+    return solved.R, solved.t
 
 
 def recorded_session(
@@ -389,14 +397,11 @@ def recorded_session(
     if machine.is_determined:
         R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
-        travel = travel_of(machine)
-        R, t = random_postures_of_legs(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+        R, t = random_postures(machine, legs, m.n_poses)
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
-        more = random_postures_of_legs(
-            legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
-        )
+        more = random_postures(machine, legs, REACHED - len(t))
         R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
@@ -513,22 +518,6 @@ def ends_at_pose(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
     """Return the joint centres A and B (n_legs, 3) at a pose, in R_b."""
     A, B = ends_at_poses(legs, *components([T]))
     return A[0], B[0]
-
-
-def travel_of(machine: Machine) -> Array:
-    """Return shortest and longest length of each leg, (n_legs, 2) [m].
-
-    Of rods on actuators it is the travel of these [m or rad].
-    """
-    travels = []
-    for leg in machine.legs:
-        if leg.actuator is not None:
-            travels.append(list(leg.actuator.travel))
-        elif leg.kind is LegKind.CONSTANT:
-            travels.append([leg.q0, leg.q0])
-        else:
-            travels.append(sorted(leg.length_at(q) for q in leg.travel))
-    return np.array(travels)
 
 
 def _showing(dataset: Dataset, link: Link) -> BoolArray:
