@@ -6,7 +6,7 @@ a second fit with the parameter free.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from legcal.machine.directions import list_in_words
 from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import actuators_of
-from legcal.vision.board import LINKS, Link
+from legcal.vision.board import LINKS
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -67,21 +67,14 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     """
     if not problem.settings.judges_stated_values:
         return
-    priors, problems = problem.priors, []
-    for i, mean, sigma in zip(
-        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
-    ):
-        if problem.named[i] not in problem.choices.priors:
-            continue
-        estimate = estimate_without_prior(problem, state, normal, i, mean, sigma)
-        if estimate is not None and estimate.apart > _SIGNIFICANT:
-            unit = problem.units[i]
-            problems.append(
-                f"The prior of {problem.named[i]} contradicts the measurements: prior {mean:.6g} "
-                f"+- {sigma:.2g} {unit}, measurements about {estimate.value:.4g} {unit}, "
-                f"{estimate.apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct "
-                "or remove the prior."
-            )
+    names = problem.choices.priors.keys()
+    problems = [
+        f"The prior of {name} contradicts the measurements: prior {mean:.6g} +- {sigma:.2g} "
+        f"{problem.units[problem.named.index(name)]}, measurements about {estimate.value:.4g} "
+        f"{problem.units[problem.named.index(name)]}, {estimate.apart:.0f} standard deviations "
+        f"apart (limit {_SIGNIFICANT:g}); correct or remove the prior."
+        for name, mean, sigma, estimate in _contradicted(problem, state, normal, names)
+    ]
     if problems:
         raise DidNotConverge(problems)
 
@@ -92,40 +85,19 @@ def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalE
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
     *normal* is the information at *state*, a first minimum.
     """
-    for link in LINKS:
-        name = board_scale(link)
-        if name in problem.named and name not in problem.choices.priors:
-            _refuse_other_size(problem, state, normal, link)
-
-
-def _refuse_other_size(
-    problem: FitProblem,
-    state: State,
-    normal: NormalEquations,
-    link: Link,
-) -> None:
-    """Refuse the calibration board on a link if its dimensions in the dataset are wrong."""
-    name = board_scale(link)
-    number, priors = problem.named.index(name), problem.priors
-    for i in np.flatnonzero(priors.unknown == number).tolist():
-        mean, sigma = float(priors.mean[i]), float(priors.sigma[i])
-        estimate = estimate_without_prior(problem, state, normal, number, mean, sigma)
-        if estimate is None or estimate.sigma > _MAX_SCALE_SIGMA or estimate.apart <= _SIGNIFICANT:
-            continue
-        choices = replace(problem.choices, free=problem.choices.free | {name})
-        try:
-            refitted = first_minimum(problem.with_choices(choices), state)
-            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times the size"
-        except (DidNotConverge, NotIdentifiable):
-            size = "not of the size"
-        board = "" if link == "base" else f" on the {link}"
-        raise DidNotConverge(
-            f"The dimensions of the calibration board{board} contradict the readings and the legs: "
-            f"the board is {size} stated in the dataset ({estimate.apart:.0f} standard deviations; "
-            f"assumed accuracy {1e2 * sigma:.2g} %); measure the board and correct its dimensions "
-            "in dataset.yaml, or the scale of the readings if the board is right, or estimate the "
-            f"size of the board (--set {name}=free)."
-        )
+    board_of = {board_scale(link): "" if link == "base" else f" on the {link}" for link in LINKS}
+    names = board_of.keys() - problem.choices.priors.keys()
+    problems = [
+        f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
+        f"legs: the board is {estimate.value:.4g} times the size stated in the dataset "
+        f"({estimate.apart:.0f} standard deviations; assumed accuracy {1e2 * sigma:.2g} %); "
+        "measure the board and correct its dimensions in dataset.yaml, or the scale of the "
+        f"readings if the board is right, or estimate the size of the board (--set {name}=free)."
+        for name, _, sigma, estimate in _contradicted(problem, state, normal, names)
+        if estimate.sigma <= _MAX_SCALE_SIGMA
+    ]
+    if problems:
+        raise DidNotConverge(problems)
 
 
 @dataclass(frozen=True)
@@ -137,22 +109,34 @@ class EstimateWithoutPrior:
     apart: float  # distance from the prior, in standard deviations
 
 
-def estimate_without_prior(
-    problem: FitProblem, state: State, normal: NormalEquations, i: int, mean: float, sigma: float
-) -> EstimateWithoutPrior | None:
-    """Estimate named unknown *i* without its prior; None if the measurements do not depend on it.
+def _contradicted(
+    problem: FitProblem,
+    state: State,
+    normal: NormalEquations,
+    names: Collection[str],
+    most: float = _SIGNIFICANT,
+) -> Iterator[tuple[str, float, float, EstimateWithoutPrior]]:
+    """Yield priors of named unknowns that the measurements contradict: name, mean, sigma, estimate.
 
+    The unknown is estimated without its prior; measurements that hardly depend on it say nothing.
     For the information I of the measurements, an estimate at a distance d from the prior mean moves
     to d (1 + 1 / (I sigma^2)) without the prior. The difference has the variance sigma^2 + 1 / I.
     """
+    priors, coordinates = problem.priors, problem.coordinates(state)
     information_of_named = named_information(problem, state, normal)
-    measured = float(marginal(information_of_named, np.array([i]))[0, 0]) - 1.0 / sigma**2
-    if measured < _MIN_INFORMATION / sigma**2:
-        return None
-    offset = (float(problem.coordinates(state)[i]) - mean) * (1.0 + 1.0 / (measured * sigma**2))
-    variance = 1.0 / measured
-    apart = abs(offset) / float(np.sqrt(sigma**2 + variance))
-    return EstimateWithoutPrior(mean + offset, float(np.sqrt(variance)), apart)
+    for i, mean, sigma in zip(
+        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
+    ):
+        if problem.named[i] not in names:
+            continue
+        measured = float(marginal(information_of_named, np.array([i]))[0, 0]) - 1.0 / sigma**2
+        if measured < _MIN_INFORMATION / sigma**2:
+            continue
+        offset = (float(coordinates[i]) - mean) * (1.0 + 1.0 / (measured * sigma**2))
+        apart = abs(offset) / float(np.sqrt(sigma**2 + 1.0 / measured))
+        if apart > most:
+            estimate = EstimateWithoutPrior(mean + offset, float(measured**-0.5), apart)
+            yield problem.named[i], mean, sigma, estimate
 
 
 @dataclass(frozen=True)
@@ -515,19 +499,14 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     *normal* is the information at *state*.
     """
     radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
-    priors, contradictions = problem.priors, []
-    for i, mean, sigma in zip(
-        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
-    ):
-        name = problem.named[i]
-        if name not in radii or name in problem.choices.priors:
-            continue
-        estimate = estimate_without_prior(problem, state, normal, i, mean, sigma)
-        if estimate is not None and estimate.apart > RADIUS_SIGMAS:
-            contradictions.append(
-                f"{name} {1e3 * estimate.value:.2f} mm against {1e3 * mean:.2f} +- "
-                f"{1e3 * sigma:.2f} mm ({estimate.apart:.0f} standard deviations)"
-            )
+    names = radii - problem.choices.priors.keys()
+    contradictions = [
+        f"{name} {1e3 * estimate.value:.2f} mm against {1e3 * mean:.2f} +- {1e3 * sigma:.2f} mm "
+        f"({estimate.apart:.0f} standard deviations)"
+        for name, mean, sigma, estimate in _contradicted(
+            problem, state, normal, names, RADIUS_SIGMAS
+        )
+    ]
     if not contradictions:
         return []
     return [
