@@ -139,7 +139,6 @@ PUBLIC: dict[str, set[str]] = {
         "camera_calibration.document",
         "camera_calibration.projection",
         "change_detection",
-        "closeness",
         "detection",
         "doctor",
         "documents",

@@ -24,6 +24,15 @@ from fit_sessions import (
 )
 from thinned import thinned
 
+from legcal.calibration.estimate import (
+    GAMMA_RANGE,
+    GAMMA_STEP,
+    GAMMA_TOLERANCE,
+    MAX_GAMMA_TRIALS,
+    GammaTrials,
+    most_likely,
+    next_trial,
+)
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import (
@@ -43,15 +52,6 @@ from legcal.calibration.joint_fit.rounds import (
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
-from legcal.calibration.near_fit import (
-    GAMMA_RANGE,
-    GAMMA_STEP,
-    GAMMA_TOLERANCE,
-    MAX_GAMMA_TRIALS,
-    GammaTrials,
-    most_likely,
-    next_trial,
-)
 from legcal.calibration.tuning import LIMB_GAMMA_SIGMA
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, no_outlines

@@ -14,11 +14,11 @@ from csv_rows import read_rows, write_rows
 from simulated import simulated
 
 from legcal import calibrate, evaluate, load_dataset, load_mechanism
-from legcal.calibration.closeness import commanded
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, Kind, session_tests
+from legcal.calibration.verdict import commanded
 from legcal.data.dataset import Dataset
 from legcal.data.holdout import dataset_at
 from legcal.data.image_choice import chosen_images, own_zeros

@@ -28,7 +28,14 @@ import numpy as np
 from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
-from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
+from legcal.calibration.estimate import (
+    TRIAL,
+    Estimate,
+    fit_outlines,
+    measure_again,
+    not_found_again,
+    shown_near,
+)
 from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
@@ -36,7 +43,6 @@ from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
 from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.calibration.closeness import PLAN_NAME, POSES_NAME
+from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.closeness import PLAN_NAME
-from legcal.data.dataset import load_dataset
+from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements
 from legcal.errors import DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
